@@ -1,14 +1,13 @@
-"""Two arms under hard limits: the design beside Fourier series with the same seconds on the same
-cores, as a table.
+"""Two arms under hard limits: the design beside Fourier series with equal time, as a table.
 
     python -m scripts.benchmarks arms_table FOLDER [--seconds 600] [--arms panda so_arm100]
-    [--horizons 5 10] python -m scripts.benchmarks arms_table FOLDER --show        # the table of
-    what was run so far
+    [--horizons 5 10]
+    python -m scripts.benchmarks arms_table FOLDER --show        # the results in FOLDER
 
 Every case is run by `mjfim.compare` and kept in FOLDER as JSON; cases that are there already are
-left alone. The experiments are those of arms: from home, rest to rest, limits of position,
-velocity, force, control rate and distance. Among the design's own starts is a Fourier series of 15
-harmonics; all methods use all cores, in as many processes.
+not run again. The experiments are those of arms: from home, rest to rest, limits of position,
+velocity, force, control rate and distance. One start of the design is a Fourier series of 15
+harmonics. All methods use all cores, in as many processes.
 """
 
 from __future__ import annotations
@@ -28,18 +27,34 @@ from mjfim.parallel import cores
 from mjfim.records.comparison import Comparison, MethodResult
 from scripts.benchmarks import arms
 
+# Methods with five and with fifteen harmonics.
 FEW, MANY = ("fourier5", "fourier5-mjfim"), ("fourier15-mjfim",)
-PITCH = 0.2  # [Hz] of the series that is among the design's starts
-WANTED = 0.1  # least gain over five harmonics
+
+# Frequency of the series that is one start of the design [Hz].
+FUNDAMENTAL = 0.2
+
+# Smallest wanted gain over five harmonics.
+WANTED = 0.1
 
 
 @dataclass(frozen=True)
 class Case:
-    """One comparison. few, many, design: worst relative sigma, infinite where nothing keeps the
-    limits
+    """One comparison.
 
-    tightest, share: kind of the design's worst margin, and that over half of its range;  kept:
-    whether all are, everywhere seconds: of the design;  budget: of every method
+    Attributes:
+        arm: Name of the arm.
+        horizon: Duration [s].
+        dry: Whether the joints have dry friction.
+        parameters: Number of unknowns.
+        few: Worst relative sigma with five harmonics, infinite where no control keeps the limits.
+        many: Worst relative sigma with fifteen harmonics.
+        design: Worst relative sigma of the design.
+        tightest: Kind of limit with the smallest margin of the design.
+        share: This margin as a share of half the range.
+        kept: Whether the design keeps all limits.
+        seconds: Time of the design [s].
+        budget: Time of every method [s].
+        found_by: Start from which the design was found.
     """
 
     arm: str
@@ -58,101 +73,127 @@ class Case:
 
     @property
     def gain(self) -> float:
-        """By what share sigma is smaller than that of five harmonics."""
+        """Share by which sigma is smaller than that of five harmonics."""
         return 1.0 - self.design / self.few
 
     @property
     def met(self) -> bool:
-        """Feasible, clearly better than five harmonics, never worse than fifteen."""
-        return self.kept and self.gain >= WANTED and self.design <= self.many * (1.0 + 1e-3)
+        """Whether the design is feasible, better than five harmonics and not worse than fifteen."""
+        is_not_worse = self.design <= self.many * (1.0 + 1e-3)
+        return self.kept and self.gain >= WANTED and is_not_worse
 
 
 def run(
     arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: Console
 ) -> Case | None:
-    """Compare on one arm; None where the comparison was interrupted before the design."""
+    """Compare the methods on one arm.
+
+    Args:
+        arm: Name of the arm.
+        horizon: Duration [s].
+        dry: Whether the joints have dry friction.
+        args: Options of the command line.
+        console: Receives one line for each method.
+
+    Returns:
+        The case; None if the comparison was interrupted before the design.
+    """
     stated = arms.experiment(arm, horizon, dry, args.folder / "models")
-    experiment = stated.replace(descent={"fourier": [PITCH], "max_iterations": 100_000})
+    experiment = stated.replace(descent={"fourier": [FUNDAMENTAL], "max_iterations": 100_000})
     with mjfim.Pool() as executor:
         found = mjfim.compare(
             experiment, seconds=args.seconds, methods=args.methods, executor=executor
         )
+
     for row in found.rows:
-        console.print(
-            f"  {row.title}: {row.worst_relative_std:.4g}, {row.outcome.value}, {row.seconds:.0f} "
-            f"s, {row.found_by}"
-        )
-    ours = found.design
-    if ours is None:
+        result = f"{row.worst_relative_std:.4g}, {row.outcome.value}"
+        console.print(f"  {row.title}: {result}, {row.seconds:.0f} s, {row.found_by}")
+
+    design = found.design
+    if design is None:
         return None
-    kind, share = ours.tightest
+
+    kind, share = design.tightest
     return Case(
-        arm,
-        horizon,
-        dry,
-        len(found.parameters),
-        best(found, FEW),
-        best(found, MANY),
-        ours.worst_relative_std if ours.sound else float("inf"),
-        kind,
-        share,
-        ours.sound,
-        ours.seconds,
-        args.seconds,
-        ours.found_by,
+        arm=arm,
+        horizon=horizon,
+        dry=dry,
+        parameters=len(found.parameters),
+        few=best(found, FEW),
+        many=best(found, MANY),
+        design=sound_sigma(design),
+        tightest=kind,
+        share=share,
+        kept=design.sound,
+        seconds=design.seconds,
+        budget=args.seconds,
+        found_by=design.found_by,
     )
 
 
+def sound_sigma(row: MethodResult) -> float:
+    """Return the worst relative sigma of a method, infinite if its control violates a limit."""
+    return row.worst_relative_std if row.sound else float("inf")
+
+
 def best(found: Comparison, methods: tuple[str, ...]) -> float:
-    """Smallest worst relative sigma of some methods."""
-
-    def worth(row: MethodResult) -> float:
-        return row.worst_relative_std if row.sound else float("inf")
-
-    return min((worth(row) for row in found.rows if row.method in methods), default=float("inf"))
+    """Return the smallest worst relative sigma of some methods."""
+    sigmas = [sound_sigma(row) for row in found.rows if row.method in methods]
+    return min(sigmas, default=float("inf"))
 
 
 def markdown(cases: list[Case]) -> str:
-    """A table per arm, for the README."""
+    """Write one table for each arm as Markdown."""
     lines = [
         f"Worst relative σ; every method with {cases[0].budget:g} s on {cores()} cores. 'Inside': "
-        "the design keeps all limits at every engine step of the untouched model, by at least so "
-        "much of half of the range.",
+        "the design keeps all limits at every engine step of the unchanged model, with at least "
+        "this share of half the range as margin.",
     ]
-    for arm in dict.fromkeys(c.arm for c in cases):
+
+    for arm in dict.fromkeys(case.arm for case in cases):
         lines += [
             "",
             f"| {arm} | horizon | unknowns | Fourier, 5 harmonics | 15 harmonics | mjfim | "
             "smaller than 5 by | inside |",
             "|---|---|---|---|---|---|---|---|",
         ]
-        for c in cases:
-            if c.arm == arm:
-                inside = (
-                    f"{100 * c.share:.2g} % ({c.tightest.replace('_', ' ')})" if c.kept else "no"
-                )
-                lines.append(
-                    f"| {'dry' if c.dry else 'smooth'} | {c.horizon:g} s | {c.parameters} | "
-                    f"{c.few:.3g} | {c.many:.3g} | **{c.design:.3g}** | {100 * c.gain:.0f} % | "
-                    f"{inside} |"
-                )
+        lines += [markdown_row(case) for case in cases if case.arm == arm]
+
     return "\n".join(lines)
 
 
+def markdown_row(case: Case) -> str:
+    """Write the row of a case as Markdown."""
+    margin = f"{100 * case.share:.2g} % ({case.tightest.replace('_', ' ')})"
+    cells = [
+        "dry" if case.dry else "smooth",
+        f"{case.horizon:g} s",
+        str(case.parameters),
+        f"{case.few:.3g}",
+        f"{case.many:.3g}",
+        f"**{case.design:.3g}**",
+        f"{100 * case.gain:.0f} %",
+        margin if case.kept else "no",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
 def main() -> None:
-    """Run what is missing and print."""
+    """Run the cases that are missing and print the table; exit code 1 if a case fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--seconds", type=float, default=600.0, help="of every method")
+    parser.add_argument("--seconds", type=float, default=600.0, help="time of every method")
     parser.add_argument("--arms", nargs="+", choices=list(arms.ARMS), default=list(arms.ARMS))
     parser.add_argument("--horizons", nargs="+", type=float, default=[5.0, 10.0])
     parser.add_argument("--joints", nargs="+", choices=["smooth", "dry"], default=["smooth", "dry"])
     parser.add_argument("--methods", nargs="+", choices=[*FEW, *MANY], default=[*FEW, *MANY])
-    parser.add_argument("--show", action="store_true", help="only print what was run so far")
+    parser.add_argument("--show", action="store_true", help="only print the results in the folder")
     args = parser.parse_args()
-    console, cases = Console(highlight=False, width=150), []
+
+    console = Console(highlight=False, width=150)
+    cases = []
     with stop_on_interrupt() as stop:
         for arm, joints, horizon in itertools.product(args.arms, args.joints, args.horizons):
             file = args.folder / f"{arm}_{joints}_{horizon:g}s.json"

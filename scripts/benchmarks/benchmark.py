@@ -1,18 +1,22 @@
-"""Where the time goes, as ratios inside one run: mjfim against the engine, against CasADi, against
-its own metric descent.
+"""Where the time of a design goes: mjfim beside the engine, CasADi and its own metric descent.
 
     python -m scripts.benchmarks benchmark                  # all tables, some minutes
     python -m scripts.benchmarks benchmark --quick          # case a only, few trials
-    python -m scripts.benchmarks benchmark --markdown FILE  # the same tables for the README
+    python -m scripts.benchmarks benchmark --markdown FILE  # also writes the tables as Markdown
 
-(a) wall time of a design over MuJoCo steps taken x time of one `mj_step` in C / threads
+All comparisons are made within one run:
+
+(a) wall time of a design, divided by the time that the engine needs for its MuJoCo steps
 (b) time until J is within 1e-6 (relative) of the best J of all solvers, beside CasADi on the
-hand-derived model (c) iterations and time beside the paper's metric descent, to the same J
+    hand-derived model
+(c) iterations and time to an equal J, beside the metric descent of the paper
 (d) 1500 Monte-Carlo trials at 100 Hz
-(e) seconds per iteration by number of parameters on a seven-joint arm, where its model is at hand
-(benchmark_arm) (f) the hard-limited design beside CasADi + IPOPT with many starts, the same seconds
-for both (benchmark_limits) (g) an hour of two joints at 1 kHz read and fitted, over bare engine
-time (benchmark_hour)
+(e) seconds per iteration by number of parameters on a seven-joint arm, if its model is installed
+    (benchmark_arm)
+(f) the design under hard limits, beside CasADi + IPOPT with many starts and equal time
+    (benchmark_limits)
+(g) time to read and fit an hour of two joints at 1 kHz, beside the time of the engine
+    (benchmark_hour)
 """
 
 from __future__ import annotations
@@ -39,21 +43,40 @@ from mjfim.records.design import Design
 from scripts.benchmarks import benchmark_arm, benchmark_hour, benchmark_limits
 from scripts.benchmarks.run_in_subprocess import run_in_subprocess
 
+# Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]
+
+# Experiment of the study.
 EXPERIMENT = ROOT / "models" / "cart_pendulum.toml"
+
+# Code of the process that runs the peers: the number of repeats, then the letters of the cases.
 PEERS = """
 from scripts.benchmarks import casadi_peer as p
+repeats, cases = int(sys.argv[1]), sys.argv[2]
 found = []
 for use_c in (True, False):
     built = p.problem(use_c)
-    if use_c and not built.compiled: continue
-    for case in sys.argv[2]:
+    if use_c and not built.compiled:
+        continue
+    for case in cases:
         for solve in (p.ipopt, p.lbfgs):
-            r = min((solve(p.CASES[case], use_c) for _ in range(int(sys.argv[1]))), key=lambda r: r.seconds)
-            found.append(dict(case=case, solver=r.name + ("" if use_c else " (VM)"), cost=r.J, seconds=r.seconds,
-                iterations=r.iterations, task=r.setup_seconds + built.build_seconds, history=r.history))
+            runs = [solve(p.CASES[case], use_c) for _ in range(repeats)]
+            run = min(runs, key=lambda run: run.seconds)
+            found.append(dict(
+                case=case,
+                solver=run.name + ("" if use_c else " (VM)"),
+                cost=run.J,
+                seconds=run.seconds,
+                iterations=run.iterations,
+                prepared=run.setup_seconds + built.build_seconds,
+                history=run.history,
+            ))
 """
+
+# Relative distance to the best J within which a solver has reached it.
 CLOSE = 1e-6
+
+# Tables `cost` of the cases of the study.
 CASES: dict[str, dict[str, Any]] = {
     "a": {"control": 6e-3, "tracking": {}},
     "b": {"control": 1e-3, "tracking": {"slide": 0.05}},
@@ -64,8 +87,16 @@ CASES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """One solver on one case. history: (seconds, J) of every iterate; task: seconds before the
-    first of them.
+    """One solver on one case.
+
+    Attributes:
+        case: Letter of the case.
+        solver: Name of the solver.
+        cost: J of the solution.
+        iterations: Number of iterations.
+        seconds: Time of the solver [s].
+        prepared: Time before the first iterate [s].
+        history: Time [s] and J of every iterate.
     """
 
     case: str
@@ -73,102 +104,137 @@ class Run:
     cost: float
     iterations: int
     seconds: float
-    task: float
+    prepared: float
     history: tuple[tuple[float, float], ...]
 
     def time_to(self, cost: float) -> float:
-        """Seconds until J <= cost, infinite if never."""
-        return next((t for t, J in self.history if cost >= J), np.inf)
+        """Return the time until J is at most a cost [s], infinite if it never is."""
+        times = [t for t, J in self.history if cost >= J]
+        return times[0] if times else np.inf
 
     def iterations_to(self, cost: float) -> float:
-        """Iterates until J <= cost, infinite if never."""
-        return next((float(i) for i, (_, J) in enumerate(self.history) if cost >= J), np.inf)
+        """Return the number of iterations until J is at most a cost, infinite if it never is."""
+        numbers = [i for i, (_, J) in enumerate(self.history) if cost >= J]
+        return float(numbers[0]) if numbers else np.inf
 
 
 def experiment(case: str, **descent: Any) -> Experiment:
-    """The cart-pendulum at a case's weights."""
+    """Return the cart-pendulum with the weights of a case and settings of the descent."""
     return Experiment.from_file(EXPERIMENT).replace(cost=CASES[case], descent=descent)
 
 
 def step_seconds(task: DesignTask, trajectory: mjfim.Trajectory) -> float:
-    """Seconds of one `mj_step` in C: the user's model, stepped many times per call along the
-    designed motion.
+    """Measure the time of one engine step in C.
+
+    The model of the user is stepped many times in each call, from states of the designed motion.
+
+    Args:
+        task: The design task.
+        trajectory: The designed motion.
+
+    Returns:
+        Seconds per step, the fastest of all measurements.
     """
-    model, data = task.system.model_at(task.theta), mujoco.MjData(task.system.model)
+    model = task.system.model_at(task.theta)
+    data = mujoco.MjData(task.system.model)
     best = np.inf
+
     for k in range(0, trajectory.samples, 20):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = (
-            trajectory.qpos[k],
-            trajectory.qvel[k],
-            trajectory.ctrl[k],
-        )
+        data.qpos[:] = trajectory.qpos[k]
+        data.qvel[:] = trajectory.qvel[k]
+        data.ctrl[:] = trajectory.ctrl[k]
         clock = time.perf_counter()
         mujoco.mj_step(model, data, 500)
         best = min(best, (time.perf_counter() - clock) / 500)
+
     return float(best)
 
 
 def fastest(repeats: int, case: str, name: str, **descent: Any) -> tuple[Run, Design]:
-    """The quickest of several identical designs."""
-    return min(
-        (mjfim_run(case, name, **descent) for _ in range(repeats)), key=lambda pair: pair[0].seconds
-    )
+    """Return the fastest of several identical designs.
+
+    Args:
+        repeats: Number of designs.
+        case: Letter of the case.
+        name: Name of the solver in the tables.
+        **descent: Settings of the descent.
+
+    Returns:
+        The run and its design.
+    """
+    runs = [mjfim_run(case, name, **descent) for _ in range(repeats)]
+    return min(runs, key=lambda pair: pair[0].seconds)
 
 
 def mjfim_run(case: str, name: str, **descent: Any) -> tuple[Run, Design]:
-    """One design."""
+    """Run one design; the arguments are those of `fastest`."""
     clock = time.perf_counter()
     task = DesignTask.resolve(experiment(case, **descent))
     prepared = time.perf_counter() - clock
     design = design_task(task)
+
+    # The cost of a coarse level cannot be compared with that of the stated samples.
     fine = design.history[-1].rate
-    history = tuple(
-        (row.seconds, row.cost if row.rate == fine else np.inf) for row in design.history
-    )
+    history = []
+    for row in design.history:
+        cost = row.cost if row.rate == fine else np.inf
+        history.append((row.seconds, cost))
+
     run = Run(
-        case,
-        name,
-        design.final.cost,
-        design.history[-1].iteration,
-        design.seconds,
-        prepared,
-        history,
+        case=case,
+        solver=name,
+        cost=design.final.cost,
+        iterations=design.history[-1].iteration,
+        seconds=design.seconds,
+        prepared=prepared,
+        history=tuple(history),
     )
     return run, design
 
 
 def peer_runs(cases: Iterable[str], repeats: int) -> list[Run]:
-    """CasADi's; none where it is missing."""
+    """Run the solvers of CasADi; the list is empty where CasADi is not installed.
+
+    Args:
+        cases: Letters of the cases.
+        repeats: Number of identical runs, of which the fastest counts.
+
+    Returns:
+        One run for each solver and case.
+    """
     rows = run_in_subprocess(PEERS, repeats, "".join(cases))
-    return [
-        Run(**{**row, "history": tuple((t, J) for t, J in row["history"])}) for row in rows or ()
-    ]
+    runs = []
+    for row in rows or ():
+        history = tuple((t, J) for t, J in row.pop("history"))
+        runs.append(Run(history=history, **row))
+    return runs
 
 
-def table(title: str, *headings: str) -> Table:
-    """An empty table."""
-    new = Table(title=title, title_justify="left")
+def new_table(title: str, *headings: str) -> Table:
+    """Make an empty table whose first two columns are text."""
+    table = Table(title=title, title_justify="left")
     for i, heading in enumerate(headings):
-        new.add_column(heading, justify="left" if i < 2 else "right")
-    return new
+        table.add_column(heading, justify="left" if i < 2 else "right")
+    return table
 
 
 def engine_table(designs: list[tuple[Run, Design]], threads: int) -> Table:
-    """(a)"""
-    rows = table(
-        "(a) design over bare engine time (target 1.3)",
-        "case",
-        "descent",
-        "steps",
-        "mj_step",
-        "engine",
-        "wall",
-        "ratio",
-    )
+    """Compare designs with the time of the engine, table (a).
+
+    Args:
+        designs: Runs with their designs.
+        threads: Number of threads of the engine.
+
+    Returns:
+        Table with one row for each run.
+    """
+    title = "(a) design over bare engine time (target 1.3)"
+    table = new_table(title, "case", "descent", "steps", "mj_step", "engine", "wall", "ratio")
+
     for run, design in designs:
         step = step_seconds(DesignTask.resolve(experiment(run.case)), design.trajectory)
         engine = design.steps * step / threads
-        rows.add_row(
+        table.add_row(
             run.case,
             run.solver,
             f"{design.steps:,}",
@@ -177,12 +243,32 @@ def engine_table(designs: list[tuple[Run, Design]], threads: int) -> Table:
             f"{run.seconds:.3f} s",
             f"{run.seconds / engine:.2f}",
         )
-    return rows
+
+    return table
+
+
+def best_cost(runs: list[Run]) -> float:
+    """Return the cost that counts as the best J of some runs."""
+    return min(run.cost for run in runs) * (1 + CLOSE)
+
+
+def time_of_mjfim(runs: list[Run]) -> float:
+    """Return the time of mjfim to the best J of the runs of one case [s]."""
+    mine = next(run for run in runs if run.solver == "mjfim")
+    return mine.time_to(best_cost(runs))
+
+
+def by_case(runs: list[Run]) -> dict[str, list[Run]]:
+    """Return the runs of each case."""
+    found: dict[str, list[Run]] = {}
+    for run in runs:
+        found.setdefault(run.case, []).append(run)
+    return found
 
 
 def peer_table(runs: list[Run]) -> Table:
-    """(b)"""
-    rows = table(
+    """Compare mjfim with the peers, table (b)."""
+    table = new_table(
         "(b) seconds until J is within 1e-6 of the best J found from this start",
         "case",
         "solver",
@@ -192,171 +278,243 @@ def peer_table(runs: list[Run]) -> Table:
         "mjfim is",
         "before the first iterate",
     )
-    for case in dict.fromkeys(run.case for run in runs):
-        own = [run for run in runs if run.case == case]
-        goal = min(run.cost for run in own) * (1 + CLOSE)
-        mine = next(run for run in own if run.solver == "mjfim").time_to(goal)
-        for run in own:
-            taken = run.time_to(goal)
-            ratio = "" if run.solver == "mjfim" else comparison(mine, taken)
-            seconds = f"{taken:.3f} s" if np.isfinite(taken) else "never"
-            rows.add_row(
+
+    for case, group in by_case(runs).items():
+        goal = best_cost(group)
+        mine = time_of_mjfim(group)
+
+        for run in group:
+            seconds = run.time_to(goal)
+            table.add_row(
                 case,
                 run.solver,
                 f"{run.cost:.9g}",
                 str(run.iterations),
-                seconds,
-                ratio,
-                f"{run.task:.2f} s",
+                f"{seconds:.3f} s" if np.isfinite(seconds) else "never",
+                "" if run.solver == "mjfim" else comparison(mine, seconds),
+                f"{run.prepared:.2f} s",
             )
-    return rows
+
+    return table
 
 
 def comparison(mine: float, theirs: float) -> str:
-    """How mine compares."""
+    """Compare the time of mjfim with that of a peer in words."""
     if not np.isfinite(mine):
         return "never there"
-    return f"{theirs / mine:.1f} × faster" if theirs >= mine else f"{mine / theirs:.1f} × slower"
+    if theirs >= mine:
+        return f"{theirs / mine:.1f} × faster"
+    return f"{mine / theirs:.1f} × slower"
 
 
 def metric_table(pairs: list[tuple[Run, Run]]) -> Table:
-    """(c)"""
-    rows = table(
-        "(c) beside the paper's metric descent, to the same J",
-        "case",
-        "descent",
-        "iterations",
-        "seconds",
-        "J",
-    )
-    for mine, metric in pairs:
-        goal = min(mine.cost, metric.cost) * (1 + CLOSE)
-        for run in (mine, metric):
-            count, seconds = run.iterations_to(goal), run.time_to(goal)
-            text = (
-                (f"{count:.0f}", f"{seconds:.2f} s")
-                if np.isfinite(count)
-                else ("never", f"> {run.seconds:.1f} s")
-            )
-            rows.add_row(run.case, run.solver, *text, f"{run.cost:.9g}")
-    return rows
+    """Compare the descent of mjfim with that of the paper, table (c).
+
+    Args:
+        pairs: Runs of mjfim and of the metric descent on the same case.
+
+    Returns:
+        Table with two rows for each case.
+    """
+    title = "(c) beside the paper's metric descent, to the same J"
+    table = new_table(title, "case", "descent", "iterations", "seconds", "J")
+
+    for pair in pairs:
+        goal = best_cost(list(pair))
+        for run in pair:
+            count = run.iterations_to(goal)
+            iterations, seconds = "never", f"> {run.seconds:.1f} s"
+            if np.isfinite(count):
+                iterations, seconds = f"{count:.0f}", f"{run.time_to(goal):.2f} s"
+            table.add_row(run.case, run.solver, iterations, seconds, f"{run.cost:.9g}")
+
+    return table
 
 
 def monte_carlo_table(design: Design, trials: int) -> Table:
-    """(d)"""
-    rows = table(
-        f"(d) {trials} Monte-Carlo trials at 100 Hz (target 15 s)",
-        "trajectory",
-        "failed",
-        "seconds",
-    )
+    """Measure a Monte-Carlo study, table (d).
+
+    Args:
+        design: Design whose two trajectories are studied.
+        trials: Number of trials of each.
+
+    Returns:
+        Table with one row for each trajectory.
+    """
+    title = f"(d) {trials} Monte-Carlo trials at 100 Hz (target 15 s)"
+    table = new_table(title, "trajectory", "failed", "seconds")
+
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     study = mjfim.monte_carlo(experiment("b"), curves, trials=trials, seed=0)
-    for name, s in study.sets.items():
-        rows.add_row(name, str(s.failed), f"{s.seconds:.1f} s")
-    return rows
+    for name, result in study.sets.items():
+        table.add_row(name, str(result.failed), f"{result.seconds:.1f} s")
+    return table
 
 
-def engine_verdict(designs: list[tuple[Run, Design]], threads: int) -> str:
-    """What (a) comes to."""
+def engine_conclusion(designs: list[tuple[Run, Design]], threads: int) -> str:
+    """Summarise table (a) in a sentence; the arguments are those of `engine_table`."""
     ratios: dict[str, list[float]] = {}
     for run, design in designs:
         step = step_seconds(DesignTask.resolve(experiment(run.case)), design.trajectory)
-        ratios.setdefault(run.solver, []).append(run.seconds * threads / (design.steps * step))
-    told = [
-        f"{name} {min(r):.2f} to {max(r):.2f}, {judged(max(r), 1.3)}" for name, r in ratios.items()
-    ]
+        ratio = run.seconds * threads / (design.steps * step)
+        ratios.setdefault(run.solver, []).append(ratio)
+
+    parts = []
+    for name, values in ratios.items():
+        span = f"{min(values):.2f} to {max(values):.2f}"
+        parts.append(f"{name} {span}, {target_sentence(max(values), 1.3)}")
+
     return (
-        f"Ratios: {'; '.join(told)}. What is over 1: the projection runs on one thread; Riccati "
-        "and L-BFGS run in Python; a coarse level has few steps to spread that over."
+        f"Ratios: {'; '.join(parts)}. A ratio above 1 has three reasons: the projection runs on "
+        "one thread; Riccati recursions and L-BFGS run in Python; a coarse level has few engine "
+        "steps beside that work."
     )
 
 
-def judged(worst: float, target: float) -> str:
-    """Whether the worst case meets a target, and by how much it misses."""
-    return (
-        f"target {target:g} met"
-        if worst <= target
-        else f"target {target:g} missed by a factor {worst / target:.2g}"
-    )
+def target_sentence(worst: float, target: float) -> str:
+    """Return whether the worst case meets a target, and by which factor it misses the target."""
+    if worst <= target:
+        return f"target {target:g} met"
+    return f"target {target:g} missed by a factor {worst / target:.2g}"
 
 
-def peer_verdict(runs: list[Run]) -> str:
-    """What (b) comes to."""
-    worst: dict[str, list[float]] = {}
-    for case in dict.fromkeys(run.case for run in runs):
-        own = [run for run in runs if run.case == case]
-        goal = min(run.cost for run in own) * (1 + CLOSE)
-        mine = next(run for run in own if run.solver == "mjfim").time_to(goal)
-        for run in own:
+def peer_conclusion(runs: list[Run]) -> str:
+    """Summarise table (b) in a sentence."""
+    ratios: dict[str, list[float]] = {}
+    for group in by_case(runs).values():
+        goal = best_cost(group)
+        mine = time_of_mjfim(group)
+        for run in group:
             if run.solver != "mjfim":
-                worst.setdefault(run.solver, []).append(mine / run.time_to(goal))
-    told = [
-        f"{name} {min(r):.2g} to {max(r):.2g}, {judged(max(r), 5.0 if 'L-BFGS' in name else 1.0)}"
-        for name, r in worst.items()
-    ]
+                ratios.setdefault(run.solver, []).append(mine / run.time_to(goal))
+
+    parts = []
+    for name, values in ratios.items():
+        target = 5.0 if "L-BFGS" in name else 1.0
+        span = f"{min(values):.2g} to {max(values):.2g}"
+        parts.append(f"{name} {span}, {target_sentence(max(values), target)}")
+
     return (
-        f"mjfim's time over theirs: {'; '.join(told)}. The limit is the engine: a general mj_step "
+        f"mjfim's time over theirs: {'; '.join(parts)}. The limit is the engine: a general mj_step "
         "takes microseconds where a step of the hand-derived model, compiled for this one plant, "
         "takes a fraction of one."
     )
 
 
-def markdown(tables: list[Table], verdicts: dict[int, str], threads: int) -> str:
-    """The tables for the README; the machine is named by its cores alone."""
+def markdown(tables: list[Table], conclusions: dict[int, str], threads: int) -> str:
+    """Write the tables as Markdown; the machine is named by its cores alone.
+
+    Args:
+        tables: The tables.
+        conclusions: Sentences below tables, by the index of the table.
+        threads: Number of cores.
+
+    Returns:
+        Text with all tables.
+    """
     parts = [f"Measured on {threads} cores."]
-    for k, t in enumerate(tables):
-        cells = [list(column.cells) for column in t.columns]
-        header = " | ".join(str(column.header) for column in t.columns)
-        lines = [f"**{t.title}**", "", f"| {header} |", "|" + "---|" * len(t.columns)]
-        lines += ["| " + " | ".join(str(c[i]) for c in cells) + " |" for i in range(t.row_count)]
+
+    for k, table in enumerate(tables):
+        headings = [str(column.header) for column in table.columns]
+        columns = [[str(cell) for cell in column.cells] for column in table.columns]
+        rows = zip(*columns, strict=True)
+
+        lines = [
+            f"**{table.title}**",
+            "",
+            f"| {' | '.join(headings)} |",
+            "|" + "---|" * len(headings),
+        ]
+        lines += [f"| {' | '.join(row)} |" for row in rows]
         parts.append("\n".join(lines))
-        parts += [verdicts[k]] if k in verdicts else []
+
+        if k in conclusions:
+            parts.append(conclusions[k])
+
     return "\n\n".join(parts) + "\n"
 
 
+def compare_descents(cases: list[str], flat: list[tuple[Run, Design]]) -> Table:
+    """Run the metric descent of the paper and compare it with designs on one level, table (c).
+
+    Args:
+        cases: Letters of the cases.
+        flat: Designs of these cases without a coarse level.
+
+    Returns:
+        The table.
+    """
+    pairs = []
+    for case, (run, _) in zip(cases, flat, strict=True):
+        mine = dataclasses.replace(run, solver="L-BFGS on the manifold")
+        name = "metric (the paper's)"
+        metric, _ = mjfim_run(case, name, method="metric", max_iterations=400)
+        pairs.append((mine, metric))
+    return metric_table(pairs)
+
+
+def arm_table() -> Table:
+    """Measure designs of the seven-joint arm, table (e)."""
+    counts = (3, 10, 30, 70)
+    costs = [benchmark_arm.measured(benchmark_arm.ARM, p, 8) for p in counts]
+    return benchmark_arm.cost_table(costs)
+
+
 def main() -> None:
-    """Run and print."""
+    """Run all comparisons and print their tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="case a only, 100 trials, one repeat")
     parser.add_argument("--markdown", type=Path, help="also write the tables as Markdown")
     args = parser.parse_args()
-    console, threads = Console(highlight=False, width=130), cores()
+
+    console = Console(highlight=False, width=130)
+    threads = cores()
     cases, repeats, trials = (["a"], 1, 100) if args.quick else (list(CASES), 3, 1500)
+    tables: list[Table] = []
+    conclusions: dict[int, str] = {}
+
+    def show(table: Table, conclusion: str = "") -> None:
+        """Print a table with its conclusion, and keep both."""
+        if conclusion:
+            conclusions[len(tables)] = conclusion
+            console.print(table, conclusion)
+        else:
+            console.print(table)
+        tables.append(table)
+
+    # (a), after a first design that is not measured.
     mjfim_run(cases[0], "warm-up")
     default = [fastest(repeats, case, "mjfim") for case in cases]
     flat = [fastest(repeats, case, "mjfim, one level", coarse=1) for case in cases]
-    tables = [engine_table([*default, *flat], threads)]
-    verdicts = {0: engine_verdict([*default, *flat], threads)}
-    console.print(tables[-1], verdicts[0])
-    runs = [*(run for run, _ in default), *peer_runs(cases, repeats)]
-    tables.append(peer_table(runs))
-    verdicts[1] = peer_verdict(runs)
-    console.print(tables[-1], verdicts[1])
-    metric = [
-        mjfim_run(case, "metric (the paper's)", method="metric", max_iterations=400)[0]
-        for case in cases
-    ]
-    named = [dataclasses.replace(run, solver="L-BFGS on the manifold") for run, _ in flat]
-    tables.append(metric_table(list(zip(named, metric, strict=True))))
-    console.print(tables[-1])
-    tables.append(monte_carlo_table(default[-1][1] if args.quick else default[1][1], trials))
-    console.print(tables[-1])
+    designs = [*default, *flat]
+    show(engine_table(designs, threads), engine_conclusion(designs, threads))
+
+    # (b)
+    runs = [run for run, _ in default]
+    runs += peer_runs(cases, repeats)
+    show(peer_table(runs), peer_conclusion(runs))
+
+    # (c)
+    show(compare_descents(cases, flat))
+
+    # (d), with the design of case b.
+    design = default[-1][1] if args.quick else default[1][1]
+    show(monte_carlo_table(design, trials))
+
+    # (e)
     if benchmark_arm.ARM.is_file() and not args.quick:
-        tables.append(
-            benchmark_arm.cost_table(
-                [benchmark_arm.measured(benchmark_arm.ARM, p, 8) for p in (3, 10, 30, 70)]
-            )
-        )
-        console.print(tables[-1])
+        show(arm_table())
+
+    # (f)
     seconds = 10.0 if args.quick else 60.0
-    tables.append(benchmark_limits.limits_table(benchmark_limits.run_both(seconds, 0), seconds))
-    console.print(tables[-1])
-    tables.append(
-        benchmark_hour.hour_table(benchmark_hour.measured(0.01 if args.quick else 1.0, 0))
-    )
-    console.print(tables[-1])
+    results = benchmark_limits.run_both(seconds, 0)
+    show(benchmark_limits.limits_table(results, seconds))
+
+    # (g)
+    hours = 0.01 if args.quick else 1.0
+    show(benchmark_hour.hour_table(benchmark_hour.measured(hours, 0)))
+
     if args.markdown:
-        args.markdown.write_text(markdown(tables, verdicts, threads), encoding="utf-8")
+        args.markdown.write_text(markdown(tables, conclusions, threads), encoding="utf-8")

@@ -1,10 +1,10 @@
-"""How the cost of an E-optimal iteration grows with the number of parameters, on a seven-joint arm.
+"""Time of an E-optimal iteration by the number of parameters, on a seven-joint arm.
 
     python -m scripts.benchmarks benchmark_arm [--model panda_nohand_nomesh.xml] [--iterations 10]
 
-p = 3, 10, 30, 70 parameters of the last links' inertias (barycentric), 5 s at 100 Hz, position
-servos inside the model. The value of J needs psi, 2p rollouts; its gradient needs one direction,
-whatever p is.
+The parameters are p = 3, 10, 30 or 70 barycentric coordinates of the inertias of the last links.
+The experiment takes 5 s at 100 Hz, with position servos inside the model. The value of J needs psi,
+which takes 2p rollouts; its gradient needs one direction for every p.
 """
 
 from __future__ import annotations
@@ -25,21 +25,26 @@ from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
 from mjfim.plant.mixed_derivatives import FORWARD_DIFFERENCES
 
-ARM = (
-    Path(__file__).resolve().parents[3]
-    / "shared"
-    / "models"
-    / "menagerie_panda"
-    / "panda_nohand_nomesh.xml"
-)
+# Models that others wrote, beside the repository.
+MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
+
+# Model of the arm.
+ARM = MODELS / "menagerie_panda" / "panda_nohand_nomesh.xml"
+
+# Numbers of parameters.
 COUNTS = (3, 10, 30, 70)
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Seconds at p parameters, s of whose combinations are identifiable.
+    """Times with p parameters.
 
-    value: J;  gradient: its gradient, A and B;  iteration: of the design, all in
+    Attributes:
+        p: Number of parameters.
+        identifiable: Number of identifiable combinations.
+        value: Time of J [s].
+        gradient: Time of the gradient of J, with A and B [s].
+        iteration: Time of a whole iteration of the design [s].
     """
 
     p: int
@@ -50,15 +55,28 @@ class Cost:
 
 
 def experiment(model: Path, p: int, iterations: int) -> Experiment:
-    """The arm with p unknown inertial parameters, counted from its tip."""
+    """Make the experiment of the arm.
+
+    Args:
+        model: MJCF of the arm.
+        p: Number of unknown inertial parameters, counted from the tip of the arm.
+        iterations: Number of iterations of the design.
+
+    Returns:
+        The experiment.
+    """
+    unknown: dict[str, Any] = {}
     if p == 3:
-        unknown: dict[str, Any] = {
-            f"c{i}": {"target": f"body/link7:firstmoment[{i}]"} for i in range(3)
-        }
+        for i in range(3):
+            unknown[f"c{i}"] = {"target": f"body/link7:firstmoment[{i}]"}
     else:
-        links = range(8 - p // 10, 8)
-        unknown = {f"L{i}": {"inertial": f"link{i}", "coordinates": "barycentric"} for i in links}
-    noise = {"state": 0.02, **{f"qpos:joint{i}": 0.002 for i in range(1, 8)}}
+        for i in range(8 - p // 10, 8):
+            unknown[f"L{i}"] = {"inertial": f"link{i}", "coordinates": "barycentric"}
+
+    noise = {"state": 0.02}
+    for i in range(1, 8):
+        noise[f"qpos:joint{i}"] = 0.002
+
     chirp = {"kind": "chirp", "amplitude": 0.2, "frequency": 0.2}
     return Experiment(
         model=str(model),
@@ -74,44 +92,57 @@ def experiment(model: Path, p: int, iterations: int) -> Experiment:
 
 
 def measured(model: Path, p: int, iterations: int) -> Cost:
-    """Run the design for some iterations, then time its parts."""
+    """Run the design for some iterations, then measure its parts.
+
+    Args:
+        model: MJCF of the arm.
+        p: Number of parameters.
+        iterations: Number of iterations.
+
+    Returns:
+        Times.
+    """
     task = DesignTask.resolve(experiment(model, p, iterations))
     seconds: list[float] = []
     design_task(task, callback=lambda event: seconds.append(event.row.seconds))
+    iteration = (seconds[-1] - seconds[0]) / max(len(seconds) - 1, 1)
+
     curve = task.initial
     sensitivity = task.plant.derivatives.sensitivity(task.theta, curve)
     if sensitivity is None:
         raise SystemExit("the arm diverges")
-    problem = DescentLevel(task, task.identifiability_test.along(curve, sensitivity).basis).problem
+    basis = task.identifiability_test.along(curve, sensitivity).basis
+    problem = DescentLevel(task, basis).problem
+
     clock = time.perf_counter()
     point = problem.point(curve, FORWARD_DIFFERENCES)
     value = time.perf_counter() - clock
+
     clock = time.perf_counter()
     problem.expand(point)
     gradient = time.perf_counter() - clock
-    seen = 0 if point.criterion is None else len(point.criterion.eigenvalues)
-    return Cost(p, seen, value, gradient, (seconds[-1] - seconds[0]) / max(len(seconds) - 1, 1))
+
+    identifiable = 0 if point.criterion is None else len(point.criterion.eigenvalues)
+    return Cost(
+        p=p,
+        identifiable=identifiable,
+        value=value,
+        gradient=gradient,
+        iteration=iteration,
+    )
 
 
 def cost_table(costs: list[Cost]) -> Table:
-    """One row per p, the growth beside p = 3, and a bar."""
-    rows = Table(
-        title="(e) seconds per E-optimal iteration, seven-joint arm, 5 s at 100 Hz",
-        title_justify="left",
-    )
-    for heading in (
-        "p",
-        "identifiable",
-        "J (psi)",
-        "gradient",
-        "gradient / p = 3",
-        "iteration",
-        "curve",
-    ):
-        rows.add_column(heading, justify="left" if heading == "curve" else "right")
+    """Make table (e): one row for each p, with the growth beside the first one and a bar."""
+    title = "(e) seconds per E-optimal iteration, seven-joint arm, 5 s at 100 Hz"
+    table = Table(title=title, title_justify="left")
+    for heading in ("p", "identifiable", "J (psi)", "gradient", "gradient / p = 3", "iteration"):
+        table.add_column(heading, justify="right")
+    table.add_column("curve")
+
     longest = max(cost.iteration for cost in costs)
     for cost in costs:
-        rows.add_row(
+        table.add_row(
             str(cost.p),
             str(cost.identifiable),
             f"{cost.value:.2f} s",
@@ -120,11 +151,12 @@ def cost_table(costs: list[Cost]) -> Table:
             f"{cost.iteration:.2f} s",
             "█" * max(1, round(24 * cost.iteration / longest)),
         )
-    return rows
+
+    return table
 
 
 def main() -> None:
-    """Run and print."""
+    """Measure all numbers of parameters and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -138,6 +170,7 @@ def main() -> None:
     args = parser.parse_args()
     if not args.model.is_file():
         raise SystemExit(f"{args.model}: no such model; the arm is not part of this repository")
+
     console = Console(highlight=False, width=130)
     costs = [measured(args.model, p, args.iterations) for p in COUNTS]
     console.print(cost_table(costs), f"{cores()} cores")

@@ -1,11 +1,10 @@
-"""An hour of two joints at 1 kHz: 3.6 million samples are written as CSV, read and fitted by the
-command line.
+"""Time and memory to read and fit an hour of two joints at 1 kHz by the command line.
 
     python -m scripts.benchmarks benchmark_hour [--hours 1.0] [--seed 0]
 
-Says how long reading and fitting took, beside the bare engine time of one rollout over all samples
-on as many threads, and how much memory the process had at most. The limits are 6 minutes and 3 GiB
-on two cores.
+The 3.6 million samples are written as CSV first. The times of reading and fitting stand beside
+the time that the engine needs to simulate all samples once on as many threads. The memory is the
+largest of the process. The limits are 6 minutes and 3 GiB on two cores.
 """
 
 from __future__ import annotations
@@ -31,11 +30,15 @@ from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 from mjfim.signals import multisine
 
+# Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]
+
+# Experiment of the two joints.
 EXPERIMENT = ROOT / "models" / "two_joint_arm.toml"
+
+# Code of the process that reads the recording and prints the time that this takes.
 READ = """
 import sys, time
-clock = time.perf_counter()
 from pathlib import Path
 import mjfim
 from mjfim.recordings.read import read_recording
@@ -49,11 +52,19 @@ print(time.perf_counter() - clock)
 
 @dataclass(frozen=True)
 class Hour:
-    """What was measured. engine: seconds of one rollout over all samples;  gigabytes: of the fit's
-    process at most
+    """Measurements of one recording.
 
-    wrong: largest error of a parameter in formal standard deviations;  steps: MuJoCo steps of the
-    fit
+    Attributes:
+        samples: Number of samples.
+        size: Size of the file [MB].
+        read: Time of reading [s].
+        fitted: Time of the whole command [s].
+        engine: Time of one simulation over all samples [s].
+        steps: Number of MuJoCo steps of the fit.
+        gigabytes: Largest memory of the process [GiB].
+        wrong: Largest error of a parameter in formal standard deviations.
+        within: Number of parameters whose interval holds the true value.
+        parameters: Number of parameters.
     """
 
     samples: int
@@ -69,25 +80,35 @@ class Hour:
 
 
 def played(system: System, seconds: float, seed: int) -> Recording:
-    """A simulated log: random multisines of a minute each, noise on everything measured."""
+    """Simulate a recording under random multisines of a minute each, with noise on all outputs.
+
+    Args:
+        system: The system.
+        seconds: Duration [s].
+        seed: Seed of controls and noise.
+
+    Returns:
+        The recording.
+    """
     rng = np.random.default_rng(seed)
     rate = system.experiment.rate
+
+    # Controls.
     minute = np.arange(round(60.0 * rate)) / rate
     amplitude = np.array([8.0, 3.0])
-    parts = [
-        amplitude * multisine(minute, 2, 0.1, 30, rng) for _ in range(int(np.ceil(seconds / 60.0)))
-    ]
+    minutes = int(np.ceil(seconds / 60.0))
+    parts = [amplitude * multisine(minute, 2, 0.1, 30, rng) for _ in range(minutes)]
     ctrl = np.concatenate(parts)[: round(seconds * rate)]
-    theta, states = (
-        system.parameters.true,
-        [system.plant.initial_state(system.parameters.true)[None]],
-    )
+
+    # Simulate in pieces, to bound the memory.
+    theta = system.parameters.true
+    states = [system.plant.initial_state(theta)[None]]
     for first in range(0, len(ctrl), 100_000):
         model = [system.plant.model(theta)]
-        out = system.plant.simulator.rollout(
-            model, states[-1][-1:], ctrl[None, first : first + 100_000]
-        )
-        states.append(out.states[0, 1:])
+        piece = ctrl[None, first : first + 100_000]
+        result = system.plant.simulator.rollout(model, states[-1][-1:], piece)
+        states.append(result.states[0, 1:])
+
     y = system.plant.outputs(np.concatenate(states), None)
     y += system.noise.sample(len(y), rng)
     return Recording(
@@ -96,78 +117,81 @@ def played(system: System, seconds: float, seed: int) -> Recording:
 
 
 def bare(system: System, samples: int) -> float:
-    """Seconds that the engine takes for so many steps on all threads."""
+    """Measure the time of the engine for a number of samples on all threads [s]."""
     count = system.plant.simulator.threads * 50
     steps = 2000
     starts = np.tile(system.plant.initial_state(system.theta), (count, 1))
     ctrl = np.zeros((count, steps, len(system.controls)))
     model = [system.plant.model(system.theta)]
+
+    # The first call is not measured.
     system.plant.simulator.rollout(model, starts, ctrl)
     clock = time.perf_counter()
     system.plant.simulator.rollout(model, starts, ctrl)
-    return (time.perf_counter() - clock) / (count * steps) * samples
+    seconds = time.perf_counter() - clock
+    return seconds / (count * steps) * samples
 
 
 def measured(hours: float, seed: int) -> Hour:
-    """Write, read and fit."""
+    """Write, read and fit a recording.
+
+    Args:
+        hours: Duration of the recording [h].
+        seed: Seed of controls and noise.
+
+    Returns:
+        Measurements.
+    """
     system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
     recording = played(system, 3600.0 * hours, seed)
+    samples = len(recording.ctrl)
+
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         log = folder / "hour.csv"
         write_recording(log, recording, system)
-        size, samples = log.stat().st_size / 1e6, len(recording.ctrl)
         del recording
-        read = float(
-            subprocess.check_output(
-                [sys.executable, "-c", READ, str(EXPERIMENT), str(log)], text=True
-            )
-        )
-        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+        size = log.stat().st_size / 1e6
+
+        files = [str(EXPERIMENT), str(log)]
+        read = subprocess.check_output([sys.executable, "-c", READ, *files], text=True)
+
         clock = time.perf_counter()
-        command = [
-            sys.executable,
-            "-m",
-            "mjfim",
-            "identify",
-            str(EXPERIMENT),
-            str(log),
-            "-o",
-            str(folder / "out"),
-        ]
+        command = [sys.executable, "-m", "mjfim", "identify", *files, "-o", str(folder / "out")]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         fitted = time.perf_counter() - clock
-        peak = max(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, before) / 2**20
-        if not (folder / "out" / "estimate.json").is_file():
+
+        # Of all child processes up to now, the fit needs the most memory.
+        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+
+        estimate = folder / "out" / "estimate.json"
+        if not estimate.is_file():
             raise SystemExit(done.stderr)
-        found = json.loads((folder / "out" / "estimate.json").read_text(encoding="utf-8"))
-    theta, true = np.array(found["theta"]), system.parameters.true
-    inside = np.array(
-        [low <= value <= high for (low, high), value in zip(found["interval"], true, strict=True)]
-    )
-    wrong = float(np.abs((theta - true) / np.array(found["std"])).max())
-    engine = bare(system, samples)
+        found = json.loads(estimate.read_text(encoding="utf-8"))
+
+    true = system.parameters.true
+    error = (np.array(found["theta"]) - true) / np.array(found["std"])
+    low, high = np.array(found["interval"], dtype=float).T
+    inside = (low <= true) & (true <= high)
     return Hour(
-        samples,
-        size,
-        read,
-        fitted,
-        engine,
-        found["steps"],
-        peak,
-        wrong,
-        int(inside.sum()),
-        len(true),
+        samples=samples,
+        size=size,
+        read=float(read),
+        fitted=fitted,
+        engine=bare(system, samples),
+        steps=found["steps"],
+        gigabytes=peak,
+        wrong=float(np.abs(error).max()),
+        within=int(inside.sum()),
+        parameters=len(true),
     )
 
 
 def hour_table(hour: Hour) -> Table:
-    """One row."""
-    table = Table(
-        title="(g) an hour of two joints at 1 kHz, five parameters, CSV (limits: 360 s, 3 GiB)",
-        title_justify="left",
-    )
-    for heading in (
+    """Make table (g), with one row."""
+    title = "(g) an hour of two joints at 1 kHz, five parameters, CSV (limits: 360 s, 3 GiB)"
+    table = Table(title=title, title_justify="left")
+    headings = (
         "samples",
         "file",
         "read",
@@ -177,7 +201,8 @@ def hour_table(hour: Hour) -> Table:
         "steps",
         "memory",
         "truth inside",
-    ):
+    )
+    for heading in headings:
         table.add_column(heading, justify="right")
     table.add_row(
         f"{hour.samples:,}",
@@ -194,7 +219,7 @@ def hour_table(hour: Hour) -> Table:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

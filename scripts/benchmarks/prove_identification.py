@@ -1,14 +1,13 @@
-"""Does identification keep its word?
-
-Many recordings of a simulated robot, fitted without knowing what was done to them.
+"""Coverage of the 95 % intervals of an identification, over many recordings of a simulated robot.
 
     python -m scripts.benchmarks prove_identification [--runs 200] [--seed 0] [-o FILE.json]
 
-The robot is the cart-pendulum on the designed control, stepped at 2 kHz. Its controller ticks with
-2 ms of jitter and logs at its own ticks; what it logs is read 10 ms late, with noise and constant
-biases; it starts somewhere else than stated. Fitted are the parameters, delay, biases, start and
-the noise itself. Counted is how often each lies inside its 95 % interval, and how often `misfit` is
-raised: without a reason, and with dry friction in the cart's slide that the model does not have.
+The robot is the cart-pendulum under the designed control, stepped at 2 kHz. Its controller has 2 ms
+of jitter and logs at the times at which it really acts. The readings are 10 ms late, with noise and
+constant biases, and the robot does not start at the stated state. The fit estimates the parameters,
+delay, biases, start and the noise. The script counts how often each true value lies inside its 95 %
+interval, and how often `misfit` is raised: without a reason, and with dry friction in the slide of
+the cart that the model does not have.
 """
 
 from __future__ import annotations
@@ -36,24 +35,41 @@ from mjfim.identification.identify import identify_system
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 
+# Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]
-STEP = 0.0005  # [s] of the robot
-JITTER, LATE, OFF = (
-    0.002,
-    0.010,
-    0.1,
-)  # [s] of ticks, [s] of readings, standard deviation of the start
+
+# Timestep of the robot [s].
+STEP = 0.0005
+
+# Standard deviation of the times of the controller [s].
+JITTER = 0.002
+
+# Delay of the readings [s].
+DELAY = 0.010
+
+# Standard deviation of the initial state from the stated one.
+START_DEVIATION = 0.1
+
+# Standard deviation of the noise.
 SIGMA = 0.05
+
+# Constant errors of the readings [rad/s, rad].
 BIAS = {"qvel:hinge": 0.3, "qpos:hinge": -0.1}
-FRICTION = 0.5  # [N] in the slide, where the model has none
+
+# Dry friction in the slide [N], which the model does not have.
+FRICTION = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Of one run. inside, formally: (p,) truth inside the interval, and inside the formal one;
-    error: (p,) in formal sigmas
+    """Outcome of one run.
 
-    misfit: it was raised;  named: the friction was named as what is missing
+    Attributes:
+        inside: (p,) whether the interval holds the true value.
+        formally: (p,) whether the formal interval, from the standard deviation, holds it.
+        error: (p,) error in formal standard deviations.
+        misfit: Whether a misfit was raised.
+        named: Whether the friction was named as the first missing term.
     """
 
     inside: np.ndarray
@@ -65,105 +81,178 @@ class Outcome:
 
 @cache
 def prepared() -> tuple[DesignTask, Array]:
-    """The experiment as the user states it, and the designed control."""
+    """Return the task as the user states it, and the designed control (N, 1)."""
     base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     control = mjfim.design(base).trajectory.ctrl
-    nuisance = {"initial": OFF, "bias": dict.fromkeys(BIAS, True), "delay": True}
-    return DesignTask.resolve(
-        base.replace(nuisance=nuisance, fit={"noise": "estimated"}), threads=1
-    ), control
+
+    nuisance = {"initial": START_DEVIATION, "bias": dict.fromkeys(BIAS, True), "delay": True}
+    stated = base.replace(nuisance=nuisance, fit={"noise": "estimated"})
+    return DesignTask.resolve(stated, threads=1), control
 
 
 def robot(
     task: DesignTask, control: Array, friction: float, rng: np.random.Generator
 ) -> tuple[Array, Recording]:
-    """True theta and what the robot logged."""
+    """Play the control on the robot.
+
+    Args:
+        task: The task as the user states it.
+        control: (N, nu) control.
+        friction: Dry friction in the slide [N].
+        rng: Source of random numbers.
+
+    Returns:
+        (p,) true values of all unknowns, and the recording.
+    """
     p = task.parameters
-    theta, names = np.array(p.true), list(p.names)
+    theta = np.array(p.true)
+    names = list(p.names)
+
+    # True values of start, biases and delay.
     starts = [i for i, name in enumerate(names) if name.startswith("initial")]
-    theta[starts] = rng.normal(0.0, OFF, len(starts))
+    theta[starts] = rng.normal(0.0, START_DEVIATION, len(starts))
     for output, bias in BIAS.items():
         theta[names.index(f"bias {output}")] = bias
-    theta[names.index("delay")] = LATE
+    theta[names.index("delay")] = DELAY
+
     model = task.system.model_at(theta)
     model.opt.timestep = STEP
     model.dof_frictionloss[int(model.joint("slide").dofadr[0])] = friction
+
+    # Times at which the controller acts, on the grid of the robot's timesteps.
     N = len(control)
-    ticks = np.arange(N + 1) * task.dt
-    ticks[1:] += np.clip(rng.normal(0.0, JITTER, N), -0.45 * task.dt, 0.45 * task.dt)
-    ticks = np.rint(ticks / STEP) * STEP
-    states = stepped(model, task, theta, control, ticks)
-    read = np.clip(np.rint((ticks - LATE) / STEP).astype(int), 0, len(states) - 1)
-    y = (
-        states[read]
-        + p.bias_derivative(len(task.system.outputs)) @ theta
-        + rng.normal(0.0, SIGMA, (N + 1, len(task.system.outputs)))
-    )
-    return theta, Recording(
-        t=ticks, ctrl=control, y=y, outputs=task.system.outputs.names, name="robot"
-    )
+    times = np.arange(N + 1) * task.dt
+    times[1:] += np.clip(rng.normal(0.0, JITTER, N), -0.45 * task.dt, 0.45 * task.dt)
+    times = np.rint(times / STEP) * STEP
+
+    # Late readings with biases and noise.
+    states = stepped(model, task, theta, control, times)
+    rows = np.rint((times - DELAY) / STEP).astype(int)
+    rows = np.clip(rows, 0, len(states) - 1)
+    outputs = task.system.outputs
+    bias = p.bias_derivative(len(outputs)) @ theta
+    noise = rng.normal(0.0, SIGMA, (N + 1, len(outputs)))
+    y = states[rows] + bias + noise
+
+    recording = Recording(t=times, ctrl=control, y=y, outputs=outputs.names, name="robot")
+    return theta, recording
 
 
 def stepped(
-    model: mujoco.MjModel, task: DesignTask, theta: Array, control: Array, ticks: Array
+    model: mujoco.MjModel, task: DesignTask, theta: Array, control: Array, times: Array
 ) -> Array:
-    """States at every step; the control changes at the controller's own ticks."""
+    """Simulate the robot.
+
+    Args:
+        model: Model of the robot.
+        task: The task as the user states it.
+        theta: (p,) true values.
+        control: (N, nu) control.
+        times: (N+1,) times at which the controller acts [s].
+
+    Returns:
+        (n+1, nx) states at every engine step.
+    """
     data = mujoco.MjData(model)
     qpos, qvel, _ = task.space.split(task.plant.initial_state(theta))
-    data.qpos[:], data.qvel[:] = qpos, qvel
-    count = round(ticks[-1] / STEP)
-    tick = np.clip(
-        np.searchsorted(ticks, np.arange(count) * STEP + 1e-9, side="right") - 1,
-        0,
-        len(control) - 1,
-    )
+    data.qpos[:] = qpos
+    data.qvel[:] = qvel
+
+    # Sample of the control that acts at each step.
+    count = round(times[-1] / STEP)
+    clock = np.arange(count) * STEP + 1e-9
+    sample = np.searchsorted(times, clock, side="right") - 1
+    sample = np.clip(sample, 0, len(control) - 1)
+
     states = np.empty((count + 1, len(qpos) + len(qvel)))
     states[0] = [*data.qpos, *data.qvel]
     for i in range(count):
-        data.ctrl[:] = control[tick[i]]
+        data.ctrl[:] = control[sample[i]]
         mujoco.mj_step(model, data)
         states[i + 1] = [*data.qpos, *data.qvel]
+
     return states
 
 
 def run(job: tuple[int, int, float]) -> Outcome:
-    """One run: (seed, number, friction)."""
+    """Play and identify one robot.
+
+    Args:
+        job: Seed of the study, number of the run and friction [N].
+
+    Returns:
+        Outcome of the run.
+    """
     seed, number, friction = job
     task, control = prepared()
-    theta, recording = robot(task, control, friction, np.random.default_rng([seed, number]))
+    rng = np.random.default_rng([seed, number])
+    theta, recording = robot(task, control, friction, rng)
+
     found = identify_system(task.system, [recording])
     error = (found.theta - theta) / found.std
-    inside = (found.interval[:, 0] <= theta) & (theta <= found.interval[:, 1])
-    named = bool(found.missing_terms) and found.missing_terms[0].path == "joint/slide:frictionloss"
-    return Outcome(inside, np.abs(error) <= 1.96, error, found.misfit, named)
+    low, high = found.interval.T
+
+    # Terms are sorted by how much they explain.
+    first = found.missing_terms[0].path if found.missing_terms else ""
+    return Outcome(
+        inside=(low <= theta) & (theta <= high),
+        formally=np.abs(error) <= 1.96,
+        error=error,
+        misfit=found.misfit,
+        named=first == "joint/slide:frictionloss",
+    )
 
 
 def study(runs: int, seed: int, friction: float) -> list[Outcome]:
-    """All runs on all cores."""
+    """Run many robots on all cores.
+
+    Args:
+        runs: Number of runs.
+        seed: Seed of the study.
+        friction: Dry friction in the slide [N].
+
+    Returns:
+        Outcomes of all runs.
+    """
     tasks = [(seed, number, friction) for number in range(runs)]
-    with ProcessPoolExecutor(cores(), mp_context=get_context("spawn")) as pool:
-        return list(pool.map(run, tasks, chunksize=max(runs // (4 * cores()), 1)))
+    chunk = max(runs // (4 * cores()), 1)
+    context = get_context("spawn")
+    with ProcessPoolExecutor(cores(), mp_context=context) as pool:
+        return list(pool.map(run, tasks, chunksize=chunk))
 
 
 def coverage_table(names: Sequence[str], found: list[Outcome]) -> Table:
-    """How often the truth was inside."""
-    table = Table(
-        title=f"Truth inside the 95 % interval, {len(found)} recordings (at least 90 % wanted)",
-        title_justify="left",
-    )
-    for heading in ("unknown", "interval", "formal interval", "rms error [formal σ]"):
-        table.add_column(heading, justify="left" if heading == "unknown" else "right")
+    """Make a table of how often the intervals hold the true values.
+
+    Args:
+        names: Names of the unknowns.
+        found: Outcomes of all runs.
+
+    Returns:
+        Table with one row for each unknown.
+    """
+    title = f"Truth inside the 95 % interval, {len(found)} recordings (at least 90 % wanted)"
+    table = Table(title=title, title_justify="left")
+    table.add_column("unknown")
+    for heading in ("interval", "formal interval", "rms error [formal σ]"):
+        table.add_column(heading, justify="right")
+
+    inside = 100.0 * np.mean([outcome.inside for outcome in found], axis=0)
+    formally = 100.0 * np.mean([outcome.formally for outcome in found], axis=0)
+    rms = np.sqrt(np.mean([outcome.error**2 for outcome in found], axis=0))
     for j, name in enumerate(names):
-        shares = [
-            100.0 * np.mean([getattr(o, key)[j] for o in found]) for key in ("inside", "formally")
-        ]
-        rms = float(np.sqrt(np.mean([o.error[j] ** 2 for o in found])))
-        table.add_row(name, *(f"{share:.1f} %" for share in shares), f"{rms:.2f}")
+        table.add_row(name, f"{inside[j]:.1f} %", f"{formally[j]:.1f} %", f"{rms[j]:.2f}")
+
     return table
 
 
+def share_of(flags: list[bool]) -> float:
+    """Return the share of true values."""
+    return float(np.mean(flags))
+
+
 def main() -> int:
-    """Run both studies and print; exit code 1 where a promise is not kept."""
+    """Run both studies and print the shares; return 1 where a share is too small."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -171,14 +260,20 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--output", type=Path, help="JSON file with the shares")
     args = parser.parse_args()
-    clock, console = time.perf_counter(), Console(width=100)
+
+    # The model is right in the first study and lacks the friction in the second.
+    clock = time.perf_counter()
     names = prepared()[0].parameters.names
-    right, wrong = (study(args.runs, args.seed, friction) for friction in (0.0, FRICTION))
-    shares = {name: float(np.mean([o.inside[j] for o in right])) for j, name in enumerate(names)}
-    false, caught, named = (
-        float(np.mean([getattr(o, key) for o in found]))
-        for found, key in ((right, "misfit"), (wrong, "misfit"), (wrong, "named"))
-    )
+    right = study(args.runs, args.seed, 0.0)
+    wrong = study(args.runs, args.seed, FRICTION)
+
+    inside = np.mean([outcome.inside for outcome in right], axis=0)
+    shares = dict(zip(names, inside.tolist(), strict=True))
+    false = share_of([outcome.misfit for outcome in right])
+    caught = share_of([outcome.misfit for outcome in wrong])
+    named = share_of([outcome.named for outcome in wrong])
+
+    console = Console(width=100)
     console.print(coverage_table(names, right))
     console.print(f"misfit raised without a reason: {100 * false:.1f} %")
     console.print(
@@ -187,8 +282,9 @@ def main() -> int:
     )
     console.print(f"  and this friction named first as what is missing: {100 * named:.1f} %")
     console.print(f"{2 * args.runs} fits in {time.perf_counter() - clock:.0f} s on {cores()} cores")
+
     if args.output is not None:
-        told = {
+        summary = {
             "runs": args.runs,
             "inside": shares,
             "false_misfit": false,
@@ -196,5 +292,6 @@ def main() -> int:
             "named": named,
         }
         with replacing(args.output) as temporary:
-            temporary.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+            temporary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
     return 0 if min(shares.values()) >= 0.9 and caught >= 0.95 else 1
