@@ -1,6 +1,4 @@
-"""Helpers on arrays: scaling to unit diagonal, the pseudo-inverse on top of it, evenly spread
-indices.
-"""
+"""Functions of arrays: scaling to a unit diagonal, the pseudo-inverse, evenly spread indices."""
 
 from __future__ import annotations
 
@@ -9,20 +7,23 @@ import pytest
 
 from mjfim.arrays import evenly_spread_indices, scaled_pseudo_inverse, scaled_to_unit_diagonal
 
+# Changes of the units of three parameters.
 UNITS = np.array([1e-8, 1.0, 1e6])
 
 
 def semidefinite(rank: int) -> np.ndarray:
-    """A random symmetric positive semidefinite (3, 3) matrix of a rank."""
+    """Return a random symmetric positive semidefinite matrix (3, 3) of a rank."""
     root = np.random.default_rng(rank).normal(size=(3, rank))
     return root @ root.T
 
 
 def test_scaling_gives_a_unit_diagonal_whatever_the_units() -> None:
-    """Stacks of matrices too; a zero row stays zero."""
+    """Stacks of matrices are scaled as well, and a row of zeros stays zero."""
     plain, _ = scaled_to_unit_diagonal(semidefinite(3))
+
     stacked = np.stack([semidefinite(3) * np.outer(UNITS, UNITS), np.diag([4.0, 0.0, 9.0])])
     scaled, scale = scaled_to_unit_diagonal(stacked)
+
     np.testing.assert_allclose(scaled[0], plain, rtol=1e-12)
     np.testing.assert_array_equal(scaled[1], np.diag([1.0, 0.0, 1.0]))
     assert scale[1, [0, 2]].tolist() == [2.0, 3.0]

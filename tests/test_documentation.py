@@ -1,5 +1,4 @@
-"""The code that README.md and docs/ show: Python, commands and experiment files run; links point to
-files.
+"""The Python code, commands and experiment files in README.md and docs/ run; links point to files.
 
 A block that cannot run here carries the comment `<!-- not run: reason -->` on a line above it.
 Python blocks stand alone. Commands of one file run one after another in one folder that holds a
@@ -26,26 +25,26 @@ from mjfim.experiment import System
 from tests.support.markdown import CodeBlock, code_blocks, linked_files
 from tests.support.paths import MODELS, ROOT
 
+# All documents of the repository.
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 # Experiment that TOML blocks extend in a file that states no complete experiment before them.
 DEFAULT_EXPERIMENT = MODELS / "cart_pendulum.toml"
 
-
-# Code that a document names: one or two names in backquotes, then `in`, then a file of the package
-# in backquotes.
+# One or two names in backquotes, the word `in`, and a file of the package in backquotes.
 NAMED_CODE = re.compile(r"`([\w.]+)`(?: and `([\w.]+)`)? in `(mjfim/[\w/]+\.py)`")
 
 
 def runnable(path: Path, language: str) -> list[CodeBlock]:
-    """Blocks of one language of a file that are not marked as `not run`."""
+    """Return the blocks of one language of a file that are not marked as `not run`."""
     blocks = [block for block in code_blocks(path) if block.language == language]
     return [block for block in blocks if not block.skip_reason]
 
 
 def commands(block: CodeBlock) -> list[tuple[str, int]]:
-    """Commands of a shell block with their exit codes, which a comment `exits with 1` behind a
-    command states.
+    """Return the commands of a shell block with their exit codes.
+
+    A comment such as `exits with 1` behind a command states a code other than 0.
     """
     lines = block.text.replace("\\\n", " ").splitlines()
     found = []
@@ -59,8 +58,9 @@ def commands(block: CodeBlock) -> list[tuple[str, int]]:
 
 
 def experiments(path: Path) -> list[tuple[str, dict[str, Any]]]:
-    """The experiment of every TOML block of a file: the block alone, or the experiment before it
-    extended by the block.
+    """Return the name and the experiment of every TOML block of a file.
+
+    The experiment is the block alone, or the experiment before it extended by the block.
     """
     whole = tomllib.loads(DEFAULT_EXPERIMENT.read_text(encoding="utf-8"))
     found = []
@@ -75,7 +75,7 @@ def experiments(path: Path) -> list[tuple[str, dict[str, Any]]]:
 
 
 def merged(whole: dict[str, Any], tables: dict[str, Any]) -> dict[str, Any]:
-    """Tables of an experiment, their entries replaced by those of other tables."""
+    """Return the tables of an experiment with the entries of other tables."""
     result = dict(whole)
 
     for key, value in tables.items():
@@ -167,9 +167,7 @@ def test_links_point_to_files(path: Path) -> None:
 
 @pytest.mark.parametrize("path", [*DOCUMENTS, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
 def test_named_code_exists(path: Path) -> None:
-    """Files of the package that a document names exist, and so do the functions and classes that it
-    names with a file.
-    """
+    """The files of the package that a document names exist, with the functions and classes."""
     text = path.read_text(encoding="utf-8")
     named_files = set(re.findall(r"mjfim/[\w/]+\.py", text))
     assert [name for name in sorted(named_files) if not (ROOT / name).exists()] == []
@@ -188,6 +186,7 @@ def test_named_code_exists(path: Path) -> None:
 
 # ---- the checks themselves, on small documents
 
+# A document with blocks of all kinds.
 DOCUMENT = """# Title
 ```python
 print(1)

@@ -1,6 +1,4 @@
-"""Searches side by side: stopped early they return their best results, and one that fails does not
-end the others.
-"""
+"""Searches in several processes: stopped early, they return their best results."""
 
 from __future__ import annotations
 
@@ -31,11 +29,12 @@ from tests.support.limits import HARD, cart_inside
 
 
 def identity() -> int:
+    """Return the number of this process."""
     return os.getpid()
 
 
 def wait_for_stop(longest: float) -> tuple[bool, int]:
-    """Wait for the request of the pool to stop."""
+    """Wait for the request of the pool to stop; return whether it came, and the process."""
     end = time.monotonic() + longest
     while time.monotonic() < end and not workers.pool_stop_token().requested:
         time.sleep(0.02)
@@ -93,7 +92,7 @@ def test_finished_tasks_are_collected_in_order_and_the_others_are_left(
 def test_an_interrupted_design_keeps_the_results_of_its_workers(
     tmp_path: Path, pool: mjfim.Pool
 ) -> None:
-    """SIGINT while two of hundreds of starts are under way."""
+    """SIGINT arrives while two of hundreds of starts are running."""
     task = cart_inside(tmp_path, horizon=2.0, descent={"starts": 400, "max_iterations": 100_000})
     assert pool.submit(identity).result()
     timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT))
@@ -128,7 +127,7 @@ def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(
 def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
     tmp_path: Path,
 ) -> None:
-    """A terminal sends SIGINT to the whole process group."""
+    """A terminal sends SIGINT to all processes of the group."""
     hard = (
         "[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] "
         "}\ncontrol_rate = 100.0"

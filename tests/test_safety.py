@@ -1,6 +1,4 @@
-"""Nothing in the package executes or unpickles what a file holds, and importing it loads no
-plotting library.
-"""
+"""The package never executes or unpickles the content of a file, and it is light to import."""
 
 from __future__ import annotations
 
@@ -26,8 +24,9 @@ HEAVY_LIBRARIES = {"matplotlib", "rerun", "rich", "typer"}
 
 
 def unsafe_code(source: str) -> list[str]:
-    """Uses of pickling modules, of functions that execute text and of pickles in NumPy files, with
-    line numbers.
+    """Return the unsafe uses in a source, with their line numbers.
+
+    Pickling modules, functions that execute text and pickles in NumPy files are unsafe.
     """
     found = []
 
@@ -52,7 +51,7 @@ def unsafe_code(source: str) -> list[str]:
 
 
 def heavy_libraries_after(code: str) -> set[str]:
-    """Heavy libraries that are loaded in a new Python process after it has run this code."""
+    """Return the heavy libraries that a new Python process has loaded after this code."""
     script = f"{code}\nimport sys\nprint(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True

@@ -1,4 +1,4 @@
-"""An experiment under limits for the baselines, and an independent simulation of a control."""
+"""An experiment under limits for the baselines, and a simulation by a plain loop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ from tests.support.paths import MODELS
 
 
 def pendulum(bandwidth: float | None = None, **tables: Any) -> Experiment:
-    """The cart-pendulum over two seconds under hard limits, without weights; bandwidth in Hz."""
+    """Return the cart-pendulum over two seconds under hard limits, without weights.
+
+    Args:
+        bandwidth: Limit of the bandwidth [Hz].
+        **tables: Further tables of the experiment.
+    """
     hard = {
         "horizon": 2.0,
         "limits": {
@@ -28,7 +33,11 @@ def pendulum(bandwidth: float | None = None, **tables: Any) -> Experiment:
 
 
 def played(experiment: Experiment, control: Array) -> tuple[Array, Array, Array]:
-    """Simulate a control (N, nu) on the user's model by a plain loop around `mj_step`.
+    """Simulate a control on the model of the user by a plain loop around `mj_step`.
+
+    Args:
+        experiment: The experiment.
+        control: (N, nu) control.
 
     Returns:
         Positions (n+1, nq), velocities (n+1, nv) and controls (n, nu) at all n engine steps.
@@ -37,11 +46,15 @@ def played(experiment: Experiment, control: Array) -> tuple[Array, Array, Array]
     model = task.system.model_at(task.theta)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key(experiment.initial.keyframe).id)
-    qpos, qvel, ctrl = [data.qpos.copy()], [data.qvel.copy()], []
+
+    qpos = [data.qpos.copy()]
+    qvel = [data.qvel.copy()]
+    ctrl = []
     for u in np.repeat(control, task.system.grid.substeps, axis=0):
         data.ctrl[:] = u
         mujoco.mj_step(model, data)
         qpos.append(data.qpos.copy())
         qvel.append(data.qvel.copy())
         ctrl.append(u)
+
     return np.array(qpos), np.array(qvel), np.array(ctrl)

@@ -1,4 +1,4 @@
-"""Run the command line inside the test process, on a short study; check its files and its errors."""
+"""Run the command line inside the test process; check its files and its errors."""
 
 from __future__ import annotations
 
@@ -64,12 +64,14 @@ def run_script(name: str, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 def write_experiment(home: Path, **lines: str) -> Path:
-    """Write the paper's study with a short horizon and a loose tolerance; return its experiment
-    file.
+    """Write the study of the paper with a short horizon and a loose tolerance.
 
     Args:
         home: Folder that receives the experiment, its model and its initial control.
         **lines: New values of single keys of the experiment file; `start` is the initial control.
+
+    Returns:
+        Path of the experiment file.
 
     Raises:
         ValueError: A key is missing in the experiment file or stands there more than once.
@@ -111,8 +113,11 @@ def names(folder: Path) -> set[str]:
 
 
 def misused(result: Result, *fragments: str) -> None:
-    """Assert exit code 2 and one message of one line on stderr that contains all fragments, without
-    a traceback.
+    """Assert that a run ended with exit code 2 and one message of one line on stderr.
+
+    Args:
+        result: Result of the run.
+        *fragments: Words that the message contains.
     """
     assert isinstance(result.exception, SystemExit), repr(result.exception)
     assert (result.exit_code, result.stdout) == (2, "")

@@ -14,7 +14,7 @@ from tests.support.paths import MODELS
 
 @dataclass(frozen=True, kw_only=True)
 class DesignTables:
-    """What a design needs besides an experiment for identification, as TOML.
+    """TOML that makes an experiment for identification one that can be designed.
 
     Attributes:
         horizon: Duration of the design [s].
@@ -27,6 +27,7 @@ class DesignTables:
     tables: str = "[descent]\ntolerance = 1e-2\n"
 
 
+# Additions to the experiments that state none.
 DESIGN_TABLES = {
     "dfki_simple_pendulum": DesignTables(
         horizon=4.0,
@@ -35,9 +36,10 @@ DESIGN_TABLES = {
     ),
     "dfki_double_pendulum": DesignTables(
         horizon=5.0,
-        control='{ kind = "chirp", amplitude = { shoulder = 0.6, elbow = 0.4 }, frequency = 0.4, frequency_end = 2.0 }',
+        control='{ kind = "chirp", amplitude = { shoulder = 0.6, elbow = 0.4 }, '
+        "frequency = 0.4, frequency_end = 2.0 }",
     ),
-    # The goal (pull) swings at kp = 100; the brake fades in and out, which separates it from
+    # The goal (pull) swings at kp = 100. The brake grows and fades, which separates it from
     # damping.
     "bam_xl330": DesignTables(
         horizon=6.0,
@@ -46,15 +48,19 @@ DESIGN_TABLES = {
     ),
     "two_joint_arm": DesignTables(
         horizon=4.0,
-        control='{ kind = "multisine", amplitude = { shoulder = 8.0, elbow = 3.0 }, frequency = 0.3, harmonics = 8 }',
+        control='{ kind = "multisine", amplitude = { shoulder = 8.0, elbow = 3.0 }, '
+        "frequency = 0.3, harmonics = 8 }",
         tables="",
     ),
 }
 
 
 def design_file(name: str, folder: Path) -> Path:
-    """The file of an example, in `folder` and with the tables of a design where the example itself
-    has none.
+    """Return the file of an example that can be designed.
+
+    Args:
+        name: Name of the example.
+        folder: Folder that receives a copy, where the example needs additions.
     """
     file = MODELS / f"{name}.toml"
     if name not in DESIGN_TABLES:

@@ -15,17 +15,21 @@ from tests.support.numerics import Array, cart_task, make_task
 # limits the force of its actuators.
 FLOATING = """
 <mujoco model="floating">
-  <option timestep="0.002" integrator="{integrator}" gravity="0 0 -1"><flag contact="disable"/></option>
+  <option timestep="0.002" integrator="{integrator}" gravity="0 0 -1">
+    <flag contact="disable"/>
+  </option>
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
     <body name="hull" pos="0 0 1">
       <freejoint name="float"/>
       <geom type="box" size="0.2 0.1 0.1" mass="3"/>
       <body name="upper" pos="0.2 0 0">
-        <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.01" actuatorfrcrange="-0.9 0.9"/>
+        <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.01"
+               actuatorfrcrange="-0.9 0.9"/>
         <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.5"/>
         <body name="fore" pos="0.3 0 0">
-          <joint name="elbow" axis="0 0 1" damping="0.1" armature="0.005" range="-3 3" limited="false"/>
+          <joint name="elbow" axis="0 0 1" damping="0.1" armature="0.005"
+                 range="-3 3" limited="false"/>
           <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.3"/>
           <site name="tip" pos="0.25 0 0"/>
         </body>
@@ -34,7 +38,8 @@ FLOATING = """
   </worldbody>
   <actuator>
     <motor name="thrust" joint="float" gear="0 0 1 0 0 0"/>
-    <general name="shoulder" joint="shoulder" dyntype="filter" dynprm="0.03" gainprm="20" biastype="affine" biasprm="0 -20 -0.5"/>
+    <general name="shoulder" joint="shoulder" dyntype="filter" dynprm="0.03"
+             gainprm="20" biastype="affine" biasprm="0 -20 -0.5"/>
     <position name="elbow" joint="elbow" kp="12" kv="0.3" forcerange="-0.7 0.7"/>
   </actuator>
   <sensor><gyro name="gyro" site="tip"/></sensor>
@@ -51,7 +56,7 @@ FLOATING_LIMITS = {
 
 
 def floating_task(folder: Path, integrator: str = "implicitfast", **tables: Any) -> DesignTask:
-    """The floating arm, swinging: 0.3 s of five engine steps per sample; every state is measured."""
+    """The floating arm, swinging for 0.3 s with five engine steps in each sample."""
     tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
     control = {
         "kind": "sine",
@@ -103,13 +108,16 @@ ARM = """
 
 def directions_of(task: DesignTask, count: int, seed: int = 0) -> Array:
     """Random changes of the control, half of them smooth and half of them rough: (count, N, nu)."""
-    rng, t = np.random.default_rng(seed), task.t[:, None] / task.experiment.horizon
+    rng = np.random.default_rng(seed)
+    t = task.t[:, None] / task.experiment.horizon
     nu = task.control.shape[1]
+
     smooth = [
         np.sin(2 * np.pi * rng.uniform(0.5, 3.0, nu) * t + rng.uniform(0, 6, nu))
         for _ in range(count // 2)
     ]
-    return np.array([*smooth, *rng.normal(size=(count - count // 2, *task.control.shape))])
+    rough = rng.normal(size=(count - count // 2, *task.control.shape))
+    return np.array([*smooth, *rough])
 
 
 # Limits that the cart-pendulum meets quickly.
@@ -121,9 +129,7 @@ HARD = {
 
 
 def cart_inside(folder: Path, **tables: Any) -> DesignTask:
-    """The cart-pendulum over one second under the limits `HARD`, without weights on control or
-    state.
-    """
+    """The cart-pendulum over one second under the limits `HARD`, without weights."""
     defaults: dict[str, Any] = {
         "horizon": 1.0,
         "cost": {"control": 0.0},

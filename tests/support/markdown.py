@@ -6,9 +6,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-# A constraints that opens a block, with its language; the block ends at the next line with the same
-# constraints.
-FENCE = re.compile(r"^(?P<constraints>```+|~~~+)(?P<language>\w*)\s*$")
+# A fence that opens a block, with its language; the block ends at the next equal fence.
+FENCE = re.compile(r"^(?P<fence>```+|~~~+)(?P<language>\w*)\s*$")
 
 # A comment above a block that is not run, with the reason, e.g. `<!-- not run: needs a robot -->`.
 SKIP = re.compile(r"^<!--\s*not run:\s*(?P<reason>\S.*?)\s*-->\s*$")
@@ -23,9 +22,9 @@ class CodeBlock:
 
     Attributes:
         path: Markdown file that holds the block.
-        line: Line of the opening constraints, counted from 1.
-        language: Word behind the opening constraints; empty if there is none.
-        text: Lines between the constraint_sets.
+        line: Line of the opening fence, counted from 1.
+        language: Word behind the opening fence; empty if there is none.
+        text: Lines between the fences.
         skip_reason: Reason of the comment `<!-- not run: reason -->` above the block; empty if
             there is none.
     """
@@ -43,7 +42,7 @@ class CodeBlock:
 
 
 def code_blocks(path: Path) -> list[CodeBlock]:
-    """All fenced blocks of a Markdown file.
+    """Return all fenced blocks of a Markdown file.
 
     Raises:
         ValueError: A block is not closed.
@@ -54,7 +53,8 @@ def code_blocks(path: Path) -> list[CodeBlock]:
     index = 0
 
     while index < len(lines):
-        skip, opening = SKIP.match(lines[index]), FENCE.match(lines[index])
+        skip = SKIP.match(lines[index])
+        opening = FENCE.match(lines[index])
 
         if opening is None:
             # Only blank lines may stand between the comment and its block.
@@ -67,7 +67,7 @@ def code_blocks(path: Path) -> list[CodeBlock]:
 
         first = index + 1
         try:
-            last = lines.index(opening["constraints"], first)
+            last = lines.index(opening["fence"], first)
         except ValueError:
             raise ValueError(f"{path}: the block of line {first} is not closed") from None
 
@@ -86,5 +86,6 @@ def code_blocks(path: Path) -> list[CodeBlock]:
 
 
 def linked_files(path: Path) -> list[Path]:
-    """Files that a Markdown file links to or shows."""
-    return [path.parent / target for target in LINK.findall(path.read_text(encoding="utf-8"))]
+    """Return the files that a Markdown file links to or shows."""
+    targets = LINK.findall(path.read_text(encoding="utf-8"))
+    return [path.parent / target for target in targets]

@@ -1,6 +1,4 @@
-"""What the tests of the numerical core share: models, experiments, plain-loop references, checks of
-derivatives.
-"""
+"""Models, tasks, plain loops around the engine and checks of derivatives, for many tests."""
 
 from __future__ import annotations
 
@@ -48,11 +46,12 @@ CART_PENDULUM = """
 </mujoco>
 """
 
-# A body in free flight, pushed off its centre; an arm hangs from it by a ball joint. All four joint
-# types but slide.
+# A body in free flight, pushed off its centre; an arm hangs from it by a ball joint.
 FREE_BODY = """
 <mujoco model="free_body">
-  <option timestep="0.01" integrator="{integrator}" gravity="0 0 -0.5"><flag contact="disable"/></option>
+  <option timestep="0.01" integrator="{integrator}" gravity="0 0 -0.5">
+    <flag contact="disable"/>
+  </option>
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
     <body name="hull" pos="0 0 1">
@@ -85,10 +84,13 @@ FILTERED = """
   <worldbody>
     <body name="link">
       <joint name="hinge" type="hinge" axis="0 1 0" damping="0.2"/>
-      <geom name="link" type="capsule" fromto="0 0 0 0.1 0 -0.5" size="0.03" mass="1" contype="0" conaffinity="0"/>
+      <geom name="link" type="capsule" fromto="0 0 0 0.1 0 -0.5" size="0.03" mass="1"
+            contype="0" conaffinity="0"/>
     </body>
   </worldbody>
-  <actuator><general name="servo" joint="hinge" dyntype="filter" dynprm="0.08" gainprm="3"/></actuator>
+  <actuator>
+    <general name="servo" joint="hinge" dyntype="filter" dynprm="0.08" gainprm="3"/>
+  </actuator>
   <sensor>
     <jointpos name="angle" joint="hinge" noise="0.01"/>
     <actuatorfrc name="torque" actuator="servo" noise="0.05"/>
@@ -114,7 +116,7 @@ FILTERED_PARAMETERS = {
 
 
 def shared_model(relative: str) -> Path:
-    """Path of a model that others wrote; skips the test where it is absent."""
+    """Return the path of a model that others wrote; skip the test where it is absent."""
     path = SHARED_MODELS / relative
     if not path.is_file():
         pytest.skip(f"the shared model {relative} is not here")
@@ -122,18 +124,23 @@ def shared_model(relative: str) -> Path:
 
 
 def make_task(model: str | Path, folder: Path, **tables: Any) -> DesignTask:
-    """DesignTask of an experiment on an MJCF string (written into folder) or file.
+    """Resolve an experiment; by default it takes 0.5 s at 100 Hz under a chirp.
 
-    Default: 100 Hz, 0.5 s, a chirp.
+    Args:
+        model: Text of an MJCF, which is written into the folder, or its path.
+        folder: Folder of the model.
+        **tables: Tables of the experiment; `control` is the initial control.
     """
     path = model
     if isinstance(model, str):
         path = folder / "model.xml"
         path.write_text(model, encoding="utf-8")
+
     chirp = {"kind": "chirp", "amplitude": 1.0, "frequency": 0.7, "frequency_end": 2.0}
     values = {"rate": 100.0, "horizon": 0.5, "initial": {"control": chirp}, **tables}
     if "control" in values:
         values["initial"] = {**values["initial"], "control": values.pop("control")}
+
     return DesignTask.resolve(Experiment(model=str(path), **values), threads=1)
 
 
@@ -149,7 +156,7 @@ def cart_task(folder: Path, integrator: str = "RK4", **tables: Any) -> DesignTas
 
 
 def body_task(folder: Path, integrator: str = "RK4", **tables: Any) -> DesignTask:
-    """Free body with a ball joint, seen by its sensors only, tumbling from the start."""
+    """Free body with a ball joint, measured by its sensors alone, tumbling from the start."""
     spin = (0.2, -0.1, 0.3, 0.8, -0.5, 0.6, -0.4, 0.7, 0.3)
     tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
     control = {"kind": "sine", "amplitude": 1.5, "frequency": 1.3, "offset": 0.4}
@@ -169,23 +176,19 @@ def filtered_task(folder: Path, integrator: str = "implicitfast", **tables: Any)
 
 
 class Loop:
-    """F, h and their differences by plain Python around `mj_step`, one simulation at a time: the
-    slow independent way.
-    """
+    """F, h and their differences by a plain loop around `mj_step`, one simulation at a time."""
 
     def __init__(self, model: Any, substeps: int) -> None:
         self.model, self.substeps, self.data = model, substeps, mujoco.MjData(model)
 
     def load(self, state: Array, ctrl: Array) -> None:
         """Put a state (qpos, qvel, act) and a control into fresh data."""
-        m, d = self.model, self.data
-        mujoco.mj_resetData(m, d)
-        d.qpos[:], d.qvel[:], d.act[:] = (
-            state[: m.nq],
-            state[m.nq : m.nq + m.nv],
-            state[m.nq + m.nv :],
-        )
-        d.ctrl[:] = ctrl
+        model, data = self.model, self.data
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = state[: model.nq]
+        data.qvel[:] = state[model.nq : model.nq + model.nv]
+        data.act[:] = state[model.nq + model.nv :]
+        data.ctrl[:] = ctrl
 
     def F(self, state: Array, ctrl: Array) -> Array:
         """Next state."""
@@ -217,15 +220,17 @@ class Loop:
         self, state: Array, ctrl: Array, step: float = 1e-6
     ) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D of one sample by central differences; C and D of all sensor data."""
-        nx, nu = 2 * self.model.nv + self.model.na, self.model.nu
+        nx = 2 * self.model.nv + self.model.na
+        nu = self.model.nu
         dx, dy = [], []
+
         for i in range(nx + nu):
             e = step * np.eye(nx + nu)[i]
-            up, down = self.plus(state, e[:nx]), self.plus(state, -e[:nx])
-            dx.append(
-                self.minus(self.F(up, ctrl + e[nx:]), self.F(down, ctrl - e[nx:])) / (2 * step)
-            )
-            dy.append((self.h(up, ctrl + e[nx:]) - self.h(down, ctrl - e[nx:])) / (2 * step))
+            forward = (self.plus(state, e[:nx]), ctrl + e[nx:])
+            backward = (self.plus(state, -e[:nx]), ctrl - e[nx:])
+            dx.append(self.minus(self.F(*forward), self.F(*backward)) / (2 * step))
+            dy.append((self.h(*forward) - self.h(*backward)) / (2 * step))
+
         x, y = np.array(dx).T, np.array(dy).T
         return x[:, :nx], x[:, nx:], y[:, :nx], y[:, nx:]
 
@@ -239,8 +244,12 @@ def richardson(f: Callable[[float], float], h: float) -> float:
 def directional_check(
     slopes: Sequence[float], curves: Sequence[Callable[[float], float]], h: float
 ) -> float:
-    """Largest error of claimed slopes against differences of f(t) at 0, relative to the largest of
-    those differences.
+    """Largest error of slopes, relative to the largest of the measured ones.
+
+    Args:
+        slopes: Slopes to check.
+        curves: Functions f(t) whose derivatives at 0 are measured by differences.
+        h: Step of the differences.
     """
     measured = np.array([richardson(f, h) for f in curves])
     return float(np.abs(np.array(slopes) - measured).max() / np.abs(measured).max())

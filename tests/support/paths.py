@@ -1,4 +1,4 @@
-"""Where the repository, its models and scripts, and the data of others beside it are."""
+"""Paths of the repository, of its models and scripts, and of the data of others beside it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def _repository() -> Path:
-    """The nearest folder above this file that holds pyproject.toml."""
+    """Return the nearest folder above this file that holds pyproject.toml."""
     for folder in Path(__file__).resolve().parents:
         if (folder / "pyproject.toml").is_file():
             return folder
@@ -14,7 +14,7 @@ def _repository() -> Path:
     raise FileNotFoundError(f"no pyproject.toml in a folder above {__file__}")
 
 
-# The repository's top folder.
+# The top folder of the repository.
 ROOT = _repository()
 
 # The experiments and MuJoCo models that the package ships.

@@ -1,4 +1,4 @@
-"""ROS 2 bags of joint states, written by the library's own writer; needs the extra `ros`."""
+"""ROS 2 bags of joint states, written by the library rosbags of the extra `ros`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from rosbags.typesys import Stores, get_typestore
 
 # Definitions of the ROS 2 message types.
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-
 
 # Time stamp of the first message [ns].
 EPOCH = 1_700_000_000_123_456_789
@@ -32,29 +31,37 @@ class State:
 
 
 def message(state: State) -> Any:
-    """The state as a `sensor_msgs/msg/JointState`."""
+    """Return the state as a `sensor_msgs/msg/JointState`."""
     types = STORE.types
     stamp = types["builtin_interfaces/msg/Time"](
         sec=state.stamp // 10**9, nanosec=state.stamp % 10**9
     )
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
-    arrays = (np.array(v, dtype=np.float64) for v in (state.position, state.velocity, state.effort))
+    values = (state.position, state.velocity, state.effort)
+    arrays = [np.array(v, dtype=np.float64) for v in values]
     return types["sensor_msgs/msg/JointState"](header, list(state.names), *arrays)
 
 
 def write(path: Path, storage: Any, topics: dict[str, list[State]], text: bool = False) -> Path:
-    """Write a bag with these topics and return its folder; text adds a topic of strings."""
+    """Write a bag and return its folder.
+
+    Args:
+        path: Folder of the bag.
+        storage: Storage plugin of rosbags.
+        topics: States of every topic.
+        text: Whether a topic of strings is added.
+    """
     with Writer(path, version=9, storage_plugin=storage) as writer:
         if text:
             other = writer.add_connection("/log", "std_msgs/msg/String", typestore=STORE)
-            raw = STORE.serialize_cdr(
-                STORE.types["std_msgs/msg/String"](data="hello"), "std_msgs/msg/String"
-            )
-            writer.write(other, EPOCH, raw)
+            hello = STORE.types["std_msgs/msg/String"](data="hello")
+            writer.write(other, EPOCH, STORE.serialize_cdr(hello, "std_msgs/msg/String"))
+
         for topic, states in topics.items():
             kind = "sensor_msgs/msg/JointState"
             connection = writer.add_connection(topic, kind, typestore=STORE)
             for state in states:
                 received = state.stamp + 500_000 if state.received is None else state.received
                 writer.write(connection, received, STORE.serialize_cdr(message(state), kind))
+
     return path

@@ -1,14 +1,19 @@
-"""Experiments for the models of others: name -> keyword arguments of `mjfim.Experiment`. Data only.
+"""Experiments for the models of others, as keyword arguments of `mjfim.Experiment` by name.
 
-Model paths are relative to `paths.SHARED_MODELS`.
+Paths of models are relative to `paths.SHARED_MODELS`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+# The number pi, as it stands in experiment files.
 PI = 3.141592653589793
+
+# Joints of the SO-ARM100.
 SO_ARM = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+
+# Activations of the six muscles that hold the pose (0.9, 1.2).
 ARM26 = {
     "SF": 0.489,
     "SE": 0.41,
@@ -16,12 +21,14 @@ ARM26 = {
     "EE": 0.5,
     "BF": 0.36,
     "BE": 0.506,
-}  # holds (0.9, 1.2)
+}
+
+# Joints of the Panda.
 PANDA = tuple(f"joint{i}" for i in range(1, 8))
 
 
 def chirp(amplitude: float, low: float, high: float, **more: Any) -> dict[str, Any]:
-    """A chirp from low to high [Hz] as initial control."""
+    """Return a chirp from one frequency to another [Hz] as initial control."""
     return {
         "kind": "chirp",
         "amplitude": amplitude,
@@ -32,12 +39,13 @@ def chirp(amplitude: float, low: float, high: float, **more: Any) -> dict[str, A
 
 
 def state_noise(joints: tuple[str, ...], q: float = 0.002, v: float = 0.02) -> dict[str, float]:
-    """Encoders [rad or m] and their rates."""
+    """Return the noise of encoders [rad or m] and of their rates."""
     return {f"qpos:{j}": q for j in joints} | {f"qvel:{j}": v for j in joints}
 
 
+# The experiments by their names.
 EXPERIMENTS: dict[str, dict[str, Any]] = {
-    # swings about hanging; motor torque is weak against gravity
+    # The pendulum swings about hanging, because its motor is weak against gravity.
     "pendulum": {
         "model": "dmc_pendulum/pendulum.xml",
         "rate": 50.0,
@@ -61,7 +69,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
             "cart_mass": {"target": "body/cart:mass"},
             "pole_mass": {"target": "body/pole_1:mass"},
             "pole_com": {"target": "body/pole_1:ipos[2]"},
-            # the model's own dampings, 5e-4 and 2e-6, do not show in four seconds
+            # The dampings of the model, 5e-4 and 2e-6, have no visible effect in four seconds.
             "cart_damping": {"target": "joint/slider:damping", "guess": 0.5},
             "pole_damping": {"target": "joint/hinge_1:damping", "guess": 2e-3},
         },
@@ -69,8 +77,9 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "cost": {
             "criterion": "E",
             "control": 4e-3,
+            # The weight keeps the cart on its rail.
             "tracking": {"slider": 1e-3},
-        },  # stay on the rail
+        },
         "descent": {"tolerance": 1e-3},
     },
     "acrobot": {
@@ -90,7 +99,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "cost": {"criterion": "E", "control": 0.2},
         "descent": {"tolerance": 1e-3},
     },
-    # motor in N m; it bears +-0.02, the arm's cable two radians
+    # The motor allows a torque of 0.02 N m, and the cable of the arm two radians.
     "furuta": {
         "model": "qube_furuta/furuta_pendulum_implicitfast.xml",
         "rate": 100.0,
@@ -107,7 +116,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "descent": {"tolerance": 1e-2},
         "limits": {"control": {"motor": (-0.02, 0.02)}, "position": {"theta": (-2.0, 2.0)}},
     },
-    # home with the jaw open: closed, its pads touch
+    # The jaw is open, because the pads of a closed jaw touch.
     "so_arm100": {
         "model": "menagerie_so_arm100/so_arm100_nomesh.xml",
         "rate": 50.0,
@@ -154,7 +163,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         },
         "descent": {"tolerance": 1e-2, "max_iterations": 40},
     },
-    # six muscles; about the equilibrium of half activation
+    # The controls of the six muscles swing about the equilibrium of half activation.
     "arm26": {
         "model": "mj_arm26/arm26_lengthrange.xml",
         "rate": 50.0,
@@ -174,7 +183,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "cost": {"criterion": "E", "control": 3.0, "control_about": ARM26},
         "descent": {"tolerance": 1e-2, "max_iterations": 60},
     },
-    # what the last links weigh and where; the model has neither damping nor armature
+    # The unknowns are masses and their centres; the model has neither damping nor armature.
     "panda": {
         "model": "menagerie_panda/panda_nohand_nomesh.xml",
         "rate": 100.0,
@@ -189,8 +198,8 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "noise": state_noise(PANDA),
         "cost": {
             "criterion": "E",
-            # dear enough to keep the stiff servos (kp 2000, 500) inside forcerange when the command
-            # jumps
+            # The weights keep the stiff servos (kp 2000 and 500) inside their forcerange when the
+            # command jumps.
             "control": {j: 5e5 if j in PANDA[:4] else 1.5e6 for j in PANDA},
         },
         "descent": {"tolerance": 2e-2, "max_iterations": 20},
