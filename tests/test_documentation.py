@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 import mjfim
+from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment import System
 from tests.support.markdown import CodeBlock, code_blocks, linked_files
@@ -157,7 +158,7 @@ def test_toml_blocks_are_experiments(tables: dict[str, Any]) -> None:
         return
 
     task = DesignTask.resolve(stated)
-    assert task.problem.point(task.initial).cost < float("inf")
+    assert evaluate_task(task, task.initial).cost < float("inf")
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
