@@ -130,9 +130,9 @@ def robot(
     rows = np.rint((times - DELAY) / STEP).astype(int)
     rows = np.clip(rows, 0, len(states) - 1)
     outputs = task.system.outputs
-    bias = p.bias_derivative(len(outputs)) @ theta
+    biases = p.bias_derivative(len(outputs)) @ theta
     noise = rng.normal(0.0, SIGMA, (N + 1, len(outputs)))
-    y = states[rows] + bias + noise
+    y = states[rows] + biases + noise
 
     recording = Recording(t=times, ctrl=control, y=y, outputs=outputs.names, name="robot")
     return theta, recording
