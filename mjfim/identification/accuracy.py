@@ -1,4 +1,4 @@
-"""Accuracy of an estimate: formal covariance, robust intervals, and parameters that are poorly known."""
+"""Accuracy of an estimate: formal covariance, robust intervals, and poorly known parameters."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ UNKNOWN_SHARE = 10.0
 # Correlation above which another parameter is named as confounded.
 CONFOUNDED_CORRELATION = 0.5
 
-# Smallest size of a value, relative to the magnitude of its parameter, to which an interval is
-# compared.
+# The width of an interval is compared with the estimated value, or with this share of the
+# parameter's magnitude where the value is smaller.
 SMALLEST_RELATIVE_SIZE = 1e-3
 
 # Smallest variance whose square root is divided by.
@@ -45,10 +45,10 @@ class Accuracy:
         sandwich: (p,) standard deviations that allow for autocorrelated residuals [theta-unit].
         interval: (p, 2) 95 % intervals [theta-unit].
         between: (p,) standard deviations from recording to recording [theta-unit].
-        groups: Parameters that are known in combination only.
-        singular: True where parameters outside these groups are not determined either.
-        single_unidentifiable: True where a parameter that was declared by itself is in one of the
-            groups.
+        groups: Parameters of which only combinations are identifiable.
+        singular: True where parameters outside these groups are not identifiable either.
+        single_unidentifiable: True where one of the groups contains a parameter that was not
+            declared as a member of a parameter group.
         poorly_known: Names of parameters of interest that are poorly known, and a remark on each.
         data_information: (p, p) information of the recordings alone, without priors.
         robust: Robust uncertainty of the common unknowns; None where one of them is not determined.
@@ -89,7 +89,8 @@ def accuracy_of(
     theta = problem.theta(solution.unknowns)
     covariance, std = _formal_covariance(problem, solution)
 
-    # Members of a group are not known by themselves, though pins make their information regular.
+    # Members of a group are not identifiable separately, though pins make their information
+    # regular.
     units = [parameter.unit for parameter in parameters.parameters]
     groups = parameter_groups(null_space, parameters.names, parameters.magnitude, units)
     members = [name for group in groups for name in group.members]
@@ -116,55 +117,77 @@ def accuracy_of(
 
 
 def _formal_covariance(problem: FitProblem, solution: Solution) -> tuple[Array, Array]:
-    """(p, p) covariance and (p,) standard deviations; for unknowns of each recording, those of the first one."""
+    """(p, p) formal covariance and (p,) standard deviations.
+
+    Unknowns of each recording have the values of the first recording.
+    """
     layout = problem.layout
-    condensed = solution.condensed
-    H = condensed.information()
+    H = solution.condensed.information()
     common_std = standard_deviations(H)
     is_singular = not np.isfinite(common_std).all()
-    common = np.full_like(H, np.inf) if is_singular else np.linalg.inv(H)
+    common: Array = np.full_like(H, np.inf)
+    if not is_singular:
+        common = np.asarray(np.linalg.inv(H), dtype=np.float64)
 
     # Common unknowns of the first recording.
     p = len(problem.system.parameters)
     columns = layout.first_columns
     index = layout.parameter_of_column[columns]
     covariance = np.zeros((p, p))
-    std = np.zeros(p)
     covariance[np.ix_(index, index)] = common[np.ix_(columns, columns)]
+    std = np.zeros(p)
     std[index] = common_std[columns]
 
-    # Deviations of the first initial state, which follow the common unknowns.
+    # Deviations of the first initial state, which are private unknowns.
     private = layout.private
-    n = len(private)
-    if not n or layout.free_starts:
-        return covariance, std
+    if len(private) and not layout.free_starts:
+        of_private, cross = _private_covariance(solution.condensed, common, columns)
+        covariance[np.ix_(private, private)] = of_private
+        covariance[np.ix_(private, index)] = cross
+        covariance[np.ix_(index, private)] = cross.T
+        std[private] = np.sqrt(np.diag(of_private))
 
-    R = condensed.triangles[0, :n, :n]
-    own = np.full((n, n), np.inf)
-    cross = np.full((n, len(columns)), np.inf)
-    if np.linalg.matrix_rank(R) == n and not is_singular:
-        response = condensed.private_response[0]
-        own = np.linalg.inv(R.T @ R) + response @ common @ response.T
-        cross = (response @ common)[:, columns]
-
-    covariance[np.ix_(private, private)] = own
-    covariance[np.ix_(private, index)] = cross
-    covariance[np.ix_(index, private)] = cross.T
-    std[private] = np.sqrt(np.diag(own))
     return covariance, std
+
+
+def _private_covariance(
+    condensed: Condensed, common: Array, columns: np.ndarray
+) -> tuple[Array, Array]:
+    """(n, n) covariance of the first segment's private unknowns, and (n, k) with k common ones.
+
+    Both are infinite where an unknown is not determined.
+
+    Args:
+        condensed: Linearisation at the solution.
+        common: (c, c) covariance of the common unknowns.
+        columns: (k,) indices of the k common unknowns.
+    """
+    n = condensed.private_count
+    R = condensed.triangles[0, :n, :n]
+    if np.linalg.matrix_rank(R) < n or not np.isfinite(common).all():
+        return np.full((n, n), np.inf), np.full((n, len(columns)), np.inf)
+
+    # The private unknowns follow the common ones linearly.
+    response = condensed.private_response[0]
+    of_private = np.linalg.inv(R.T @ R) + response @ common @ response.T
+    cross = (response @ common)[:, columns]
+    return of_private, cross
 
 
 def _robust(
     problem: FitProblem, solution: Solution, correlation_rows: Sequence[float]
 ) -> Uncertainty | None:
-    """Robust uncertainty from the blocks of the last linearisation; None where a common unknown is not determined."""
+    """Robust uncertainty from the blocks of the last linearisation.
+
+    None where a common unknown is not determined.
+    """
     settings = problem.system.experiment.fit
     information = solution.condensed.information()
     if not np.isfinite(standard_deviations(information)).all():
         return None
 
-    # Length of a block of the bootstrap, stated in seconds or from the autocorrelation of the
-    # residuals.
+    # The length of a bootstrap block is stated in seconds, or follows from the autocorrelation of
+    # the residuals.
     rows = problem.row_count
     length = block_length(correlation_rows, rows)
     if settings.blocks is not None:
@@ -186,7 +209,10 @@ def _robust(
 def _intervals(
     problem: FitProblem, theta: Array, std: Array, robust: Uncertainty | None
 ) -> tuple[Array, Array, Array]:
-    """(p,) sandwich deviations, (p, 2) intervals, (p,) deviations between recordings; formal values stand in."""
+    """(p,) sandwich deviations, (p, 2) intervals and (p,) deviations between recordings.
+
+    Formal values replace robust ones that are not available.
+    """
     parameters = problem.system.parameters
     sandwich = np.array(std)
     between = np.zeros(len(std))
@@ -202,19 +228,23 @@ def _intervals(
         between[index] = robust.between[columns]
         interval[index] = robust.interval[columns]
 
-    # Intervals end at the bounds; an estimate beyond its bounds (newton) stays inside its interval.
+    # Intervals end at the bounds. An estimate beyond its bounds, which the method newton allows,
+    # stays inside its interval.
     low = np.maximum(interval[:, 0], np.minimum(parameters.lower, theta))
     high = np.minimum(interval[:, 1], np.maximum(parameters.upper, theta))
     return sandwich, np.column_stack([low, high]), between
 
 
 def _data_information(problem: FitProblem, condensed: Condensed) -> Array:
-    """(p, p) information of the recordings alone about the parameters that they share, all others marginalised."""
+    """(p, p) information of the recordings alone about the parameters that they share.
+
+    All other unknowns are marginalised.
+    """
     parameters = problem.system.parameters
     layout = problem.layout
     index = layout.parameter_of_column
 
-    # Priors count for the unknowns that are marginalised only.
+    # Only the priors on the marginalised unknowns count.
     H = condensed.information(with_common_rows=False)
     prior = parameters.prior_information[np.ix_(index, index)] * np.eye(len(index))
     kept = np.arange(len(layout.shared))
@@ -227,7 +257,10 @@ def _data_information(problem: FitProblem, condensed: Condensed) -> Array:
 def _poorly_known(
     system: System, theta: Array, interval: Array, covariance: Array
 ) -> Iterator[tuple[str, str]]:
-    """Names of the parameters of interest that are poorly known, with a remark on how well and why."""
+    """Names of the parameters of interest that are poorly known, each with a remark.
+
+    The remark says how accurate the estimate is, and which parameter it is confounded with.
+    """
     parameters = system.parameters
     variance = np.diag(covariance)
     is_known = np.isfinite(variance)

@@ -1,7 +1,7 @@
-"""Recordings aligned with the sample grid of an experiment: the control on the grid, the measured values at their times.
+"""Recordings aligned with the sample grid of an experiment.
 
-Measured values are not interpolated, because that would colour their noise; predictions are
-interpolated instead.
+The control is resampled to the grid. Measured values keep their times: they are not interpolated,
+because that would colour their noise. Predictions are interpolated instead.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from mjfim.records.trajectory import Trajectory
 # Largest distance from the grid [sample periods] at which a time stamp counts as lying on it.
 GRID_TOLERANCE = 0.01
 
-# Time [sample periods] by which edges of samples are moved before they are compared with time
-# stamps, against round-off.
+# Edges of samples are moved by this time [sample periods] before they are compared with time
+# stamps, so that round-off does not decide.
 EDGE_TOLERANCE = 1e-9
 
 # Smallest number of rows of a recording.
 MIN_ROWS = 3
 
-# Samples that are simulated to find the sign of a quaternion at the start.
+# Number of samples that are simulated to find the sign of a quaternion at the first row.
 SAMPLES_FOR_SIGN = 4
 
 # Smallest norm by which an interpolated quaternion is divided.
@@ -75,7 +75,7 @@ def align(system: System, recording: Recording) -> AlignedRecording:
     """Align a recording with the sample grid of a system.
 
     Args:
-        system: System whose grid, controls and outputs the recording has.
+        system: System that defines the grid, the controls and the outputs.
         recording: Recording in SI units.
 
     Returns:
@@ -199,8 +199,8 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     at_edges = np.column_stack([np.interp(edges, extended_t, column) for column in integral.T])
     mean = np.diff(at_edges, axis=0) / dt
 
-    # Where the control does not change within a sample, its value itself is free of the round-off
-    # of a long sum.
+    # Where the control does not change within a sample, its value is taken directly, because the
+    # difference of two long sums has round-off.
     margin = EDGE_TOLERANCE * dt
     first = np.searchsorted(t, edges[:-1] + margin, side="right") - 1
     last = np.searchsorted(t, edges[1:] - margin, side="left") - 1
@@ -211,10 +211,10 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
 
 
 def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array:
-    """(M, ny) outputs in which measured quaternions never flip their sign; q and -q are one orientation.
+    """(M, ny) outputs in which the signs of measured quaternions are continuous.
 
-    The sign at the start is that of the model at the guess. The array y: (M, ny) is changed in
-    place.
+    The quaternions q and -q describe one orientation. The first sign is that of the model at the
+    guess. The array y: (M, ny) is changed in place.
     """
     quaternions = _quaternion_outputs(system)
     if not quaternions:
@@ -235,26 +235,33 @@ def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array
 
 
 def _quaternion_outputs(system: System) -> list[list[int]]:
-    """Indices of the four outputs of every quaternion, of a joint or of a sensor, that is measured completely."""
+    """Indices of the four outputs of every quaternion that is measured completely.
+
+    Quaternions are positions of joints or values of sensors.
+    """
     outputs = system.outputs.outputs
     model = system.model
     kinds = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
 
     found = []
     for q, _ in system.space.quaternions:
-        found.append([i for i, output in enumerate(outputs) if output.state in range(q, q + 4)])
+        addresses = range(q, q + 4)
+        found.append([i for i, output in enumerate(outputs) if output.state in addresses])
+
     for sensor in range(model.nsensor):
         if int(model.sensor_type[sensor]) not in kinds:
             continue
         first = int(model.sensor_adr[sensor])
-        values = range(first, first + 4)
-        found.append([i for i, output in enumerate(outputs) if output.sensor in values])
+        addresses = range(first, first + 4)
+        found.append([i for i, output in enumerate(outputs) if output.sensor in addresses])
 
     return [columns for columns in found if len(columns) == 4]
 
 
 def measured_trajectory(system: System, recording: Recording) -> Trajectory | None:
-    """The recorded motion as a trajectory, for figures; gaps are bridged linearly and velocities are zero.
+    """The recorded motion as a trajectory, for figures.
+
+    Missing values are interpolated linearly. Velocities are zero.
 
     Args:
         system: System that was recorded.

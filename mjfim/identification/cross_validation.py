@@ -1,8 +1,7 @@
 """Predictions of data that were not fitted, by the identified and by the nominal model.
 
-Without held-out recordings, parts of the fitted ones are left out in turn. Theta stays as it was
-fitted to the other parts; the initial state of a predicted part is estimated from it, for both
-models alike.
+Without held-out recordings, parts of the fitted ones are left out in turn, and theta is fitted to
+the other parts. The initial state of a predicted part is estimated from that part, for both models.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ MAX_FOLDS = 5
 # Share of a single recording, at its end, that is predicted from the part before.
 PREDICTED_SHARE = 0.25
 
-# Largest number of samples that are fitted to predict the others.
+# Largest number of samples in a cross-validation; of more data, a subset of the segments is used.
 MAX_SAMPLES = 400_000
 
-# Searches for theta without a part of the data, and for initial states, which begin close to their
-# result.
+# Settings of the searches for theta without a part of the data, and for initial states. Few
+# iterations are enough, because these searches begin close to their result.
 SEARCH = SearchSettings(max_iterations=8, tolerance=1e-2, relinearise_at_end=False)
 
 
@@ -42,7 +41,10 @@ def predict(
     *,
     threads: int | None = None,
 ) -> tuple[PredictionErrors, ...]:
-    """Prediction errors of a model on recordings; only unknowns of each recording, as its initial state, are estimated.
+    """Prediction errors of a model on recordings.
+
+    Theta is given. Only the unknowns of each recording are estimated, for example its initial
+    state.
 
     Args:
         experiment: Model, parameters and noise.
@@ -69,13 +71,16 @@ def predict(
 def predict_unfitted(
     problem: FitProblem, at: UnknownValues, held_out: FitProblem | None, budget: Budget
 ) -> tuple[Prediction, ...]:
-    """Predict data that were not fitted: held-out recordings, else every part of the data from the others.
+    """Predict data that were not fitted.
+
+    These are the held-out recordings. Without any, every part of the data is predicted from the
+    other parts.
 
     Args:
         problem: Problem of the fitted recordings.
         at: Its solution.
         held_out: Problem of held-out recordings; None without any.
-        budget: Where it is exhausted, parts that were not predicted by then are missing.
+        budget: When it is exhausted, only the predictions that were made before are returned.
 
     Returns:
         The predictions.
@@ -97,7 +102,7 @@ class _Part:
     """A part of the data that is predicted.
 
     Attributes:
-        recordings: Indices of the recordings to which it belongs.
+        recordings: Indices of the recordings that contain the part.
         masks: (M, ny) for every recording, True for the values of the part.
     """
 
@@ -107,7 +112,7 @@ class _Part:
 
 def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> Iterator[Prediction]:
     """Prediction of every part of the data by a fit to the others."""
-    # Of much data, segments that are evenly spread over them are enough.
+    # With much data, a subset of evenly spread segments is enough.
     count = len(problem.segments)
     if problem.sample_count > MAX_SAMPLES and count > 1:
         wanted = max(MAX_SAMPLES * count // problem.sample_count, 2)
@@ -130,7 +135,10 @@ def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> I
 
 
 def _parts(problem: FitProblem) -> Iterator[_Part]:
-    """Parts of the data that are left out in turn: groups of recordings, or the end of a single one."""
+    """Parts of the data that are left out in turn.
+
+    They are groups of recordings, or the end of a single recording.
+    """
     count = len(problem.recordings)
     if count == 1:
         recording = problem.recordings[0]
@@ -152,7 +160,7 @@ def _masks_of(masks: Sequence[np.ndarray], recordings: Sequence[int]) -> list[np
 def _prediction(
     problem: FitProblem, theta: Array, part: _Part, held_out: bool, budget: Budget
 ) -> Prediction:
-    """Errors of the model at theta: (p,), and of the nominal one, on a part of the data."""
+    """Errors of the model at theta: (p,), and of the nominal model, on a part of the data."""
     name = ", ".join(problem.recordings[i].name for i in part.recordings)
     if len(problem.recordings) == 1 and not held_out:
         name = f"last {100 * PREDICTED_SHARE:.0f} % of {name}"

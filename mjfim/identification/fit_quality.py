@@ -1,4 +1,4 @@
-"""Quality of a fit: predictions, size and whiteness of the residuals, and where they are largest."""
+"""Quality of a fit: predictions, size and whiteness of the residuals, and their largest values."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mjfim.identification.residuals import FitProblem
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Whiteness, WorstResidual
 
-# Root mean square of residuals over the standard deviation of the measured values, above which a
-# motion is not explained.
+# Ratio of the root mean square residual to the standard deviation of the measured values, above
+# which the fit does not explain a motion.
 UNEXPLAINED_SHARE = 0.5
 
 
@@ -31,7 +31,7 @@ class FitQuality:
         rms: Root mean square residual of every measured output [y-unit].
         whiteness: Test of the residuals of every output.
         worst_residual: Interval in which residuals are largest; None without residuals.
-        unexplained: Names of the outputs of whose motion the fit explains little.
+        unexplained: Names of the outputs whose motion the fit hardly explains.
     """
 
     predicted: tuple[Array, ...]
@@ -90,7 +90,7 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
         rms[name] = float(np.sqrt(np.mean(errors**2)))
         mean_square = float(np.nanmean(np.concatenate(by_output[j]) ** 2))
 
-        # Residuals as large as the motion itself, and larger than noise.
+        # Residuals that are nearly as large as the motion, and larger than the noise.
         large = rms[name] > UNEXPLAINED_SHARE * _measured_deviation(problem, j)
         if large and mean_square > 1.0 / UNEXPLAINED_SHARE**2:
             unexplained.append(name)
@@ -123,9 +123,14 @@ def _measured_deviation(problem: FitProblem, output: int) -> float:
 
 
 def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> list[Array]:
-    """(M, ny) whitened measured minus predicted values of every recording, NaN where none count."""
+    """(M, ny) whitened measured minus predicted values of every recording.
+
+    They are NaN where there is no measured value that counts.
+    """
+    data = zip(predicted, problem.recordings, problem.masks, strict=True)
+
     whitened = []
-    for y, recording, mask in zip(predicted, problem.recordings, problem.masks, strict=True):
+    for y, recording, mask in data:
         z = np.full(y.shape, np.nan)
         difference = np.where(mask, recording.y - y, 0.0)
         z[mask] = problem.noise.whiten_present(difference, mask)
@@ -135,6 +140,8 @@ def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> list
 
 def _without_outliers(problem: FitProblem, whitened: Sequence[Array]) -> Array:
     """(n,) all whitened residuals; NaN for the outliers of a robust loss."""
-    residuals = np.concatenate([z.ravel() for z in whitened])
+    columns = [z.ravel() for z in whitened]
+    residuals = np.concatenate(columns)
+
     is_inlier = np.abs(residuals) <= problem.loss.outlier_threshold
     return np.where(is_inlier, residuals, np.nan)

@@ -1,8 +1,8 @@
-"""Least-squares identification in MuJoCo: `min_theta sum_k |Sigma^-1/2 (y~_k - y_k(theta))|^2` over recordings.
+"""Least-squares identification of parameters from recordings.
 
-The Jacobian is the sensitivity G = dy/dtheta. The method `newton` is the paper's Newton-Raphson
-iteration with the Fisher information as Hessian (Gauss-Newton); the default is Levenberg-Marquardt
-inside the bounds.
+It minimises `sum_k |Sigma^-1/2 (y~_k - y_k(theta))|^2` over theta; the Jacobian is the sensitivity
+G = dy/dtheta. The default method is Levenberg-Marquardt inside the bounds. The method `newton` is
+the paper's Newton-Raphson iteration, with the Fisher information as Hessian (Gauss-Newton).
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ NEWTON = SearchSettings(max_iterations=50, tolerance=1e-5, damped=False)
 # Length of a step [standard deviations] below which the search over all data has converged.
 FINAL_TOLERANCE = 1e-3
 
-# The same for much data, which are not linearised more often than needed.
+# Length of a step [standard deviations] below which the search over a large amount of data has
+# converged. It is looser, because every linearisation takes long.
 FINAL_TOLERANCE_OF_MUCH_DATA = 1e-2
 
-# Number of simulated samples, summed over the two sides of all differences, from which data count
-# as much.
+# Number of samples that one linearisation simulates, with two-sided differences, above which the
+# amount of data is large.
 SAMPLES_OF_MUCH_DATA = 10 * SAMPLES_FOR_ONE_SIDED
 
-# Number of samples of the segments on which the search begins where there are more data.
+# Number of samples of the subset of segments on which the search begins, if there are more data.
 SUBSET_SAMPLES = 40_000
 
-# Iterations of a search from a random start, before the best one continues, and of initial states
-# on a subset.
+# Iterations of a short search: from a random start, or for the initial states of a subset.
 SHORT_SEARCH_ITERATIONS = 8
 
 # Length of a step [standard deviations] at which a search from a random start ends.
@@ -96,13 +96,14 @@ def identify(
     """Estimate parameters from recordings, with the settings of the table `[fit]`.
 
     The stated `std` is formal: it is the accuracy only if the model and the noise are right.
-    `misfit` says when they are not, and `interval` remains valid where residuals are
+    `misfit` is true when they are not, and `interval` remains valid where residuals are
     autocorrelated. Ctrl-C ends the search with the best result so far.
 
     Args:
         experiment: Model, parameters and noise; nothing else needs to be stated.
         recordings: Recordings to which the parameters are fitted.
-        method: `least_squares` (inside the bounds) or `newton` (the paper's, without bounds).
+        method: `least_squares` (inside the bounds) or `newton` (the paper's method, without
+            bounds).
         start: (p,) parameters at which the search starts; default: the guess.
         held_out: Recordings that are predicted, not fitted.
         callback: Called with every iterate.
@@ -158,23 +159,23 @@ def identify_task(
     begun = time.perf_counter()
     steps_before = task.system.plant.engine_steps
 
-    # The matrices are small: threads of the linear algebra library would only wait for each other.
+    # One thread of the linear algebra library: the matrices are too small for more.
     with threadpool_limits(1, user_api="blas"), stop_on_interrupt(stop) as token:
         problem = task.problem()
         held_out = task.held_out_problem()
         search = _Search(task=task, budget=Budget(stop=token), callback=callback)
 
-        # Much data are searched on a subset of their segments first.
+        # With much data, the search begins on a subset of the segments.
         subset = _quick_subset(problem)
         begin = problem.begin(task.start)
         _require_finite_cost(task, problem, subset, begin)
 
-        # Combinations of parameters that no recording shows are held at their start.
+        # Combinations of parameters that no recording determines are held at their start values.
         null_space = _unseen_directions(task, problem.of_segments(subset))
         problem = problem.pinned(task.start, null_space)
 
-        # Short searches from several starts avoid local minima; the best one continues over all
-        # data.
+        # Short searches from several starts avoid local minima. The best result continues over
+        # all data.
         begin = search.best_start(problem, subset, begin)
         problem, solution = search.solve(problem, begin)
 
@@ -223,9 +224,10 @@ def least_squares(
 
 
 def newton_raphson(problem: FitProblem, start: Array, budget: Budget | None = None) -> Solution:
-    """The paper's iteration `theta - (J'J)^-1 J'r` without bounds; a step is halved while the residual would grow.
+    """The paper's iteration `theta - (J'J)^-1 J'r` without bounds.
 
-    It ends when a step is below 1e-5 standard deviations.
+    A step is halved while it would raise the cost. The iteration ends when a step is below 1e-5
+    standard deviations.
 
     Args:
         problem: Residuals as functions of the unknowns.
@@ -242,7 +244,10 @@ def newton_raphson(problem: FitProblem, start: Array, budget: Budget | None = No
 
 
 def _quick_subset(problem: FitProblem) -> np.ndarray:
-    """Indices of segments, evenly spread over the data, that are quick to simulate; all of them if there are few data."""
+    """Indices of segments that are quick to simulate, evenly spread over the data.
+
+    With little data, these are all segments.
+    """
     count = len(problem.segments)
     if problem.sample_count <= SUBSET_SAMPLES or count == 1:
         return evenly_spread_indices(count, count)
@@ -267,13 +272,16 @@ def _require_finite_cost(
 
 
 def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
-    """Directions of theta about which neither the recordings nor the priors contain information, at the start."""
+    """Directions of theta, at the start, about which the data contain no information.
+
+    The data are the recordings and the priors.
+    """
     parameters = task.system.parameters
     rows = problem.sensitivity_rows(problem.begin(task.start))
     J = np.concatenate([row for row, _ in rows])
     change = np.concatenate([error for _, error in rows])
 
-    # Priors are further rows, known without an error of differences.
+    # Priors are further rows, which have no error of finite differences.
     prior = np.sqrt(np.diag(np.diag(parameters.prior_information)))
     exact = np.zeros_like(prior)
     return find_null_space(
@@ -301,13 +309,15 @@ class _Search:
     callback: Callback | None
 
     def interrupted(self) -> bool:
-        """True once somebody asked to stop."""
+        """True after a request to stop."""
         return self.budget.stop.requested
 
     def best_start(
         self, problem: FitProblem, subset: np.ndarray, begin: UnknownValues
     ) -> UnknownValues:
-        """Find where the search over all data begins: the best result of short searches on a subset of the segments.
+        """Find where the search over all data begins.
+
+        This is the best result of short searches on a subset of the segments.
 
         Args:
             problem: Problem of all segments.
@@ -321,7 +331,7 @@ class _Search:
         part = problem.of_segments(subset)
         is_whole = len(part.segments) == len(problem.segments)
 
-        # Initial states first: far from their best values, theta would follow their errors.
+        # Initial states are estimated first; otherwise theta would compensate for their errors.
         placed = self._with_initial_states(part, _of_subset(begin, subset), SHORT_SEARCH_ITERATIONS)
         if is_whole and starts == 1:
             return placed
@@ -333,15 +343,18 @@ class _Search:
         if is_whole:
             return best
 
-        # The other segments keep their measured initial states, improved for the theta that was
-        # found.
+        # The initial states of the other segments are the measured ones, improved for the theta
+        # that was found.
         private = np.array(begin.private)
         private[subset] = best.private
         whole = replace(best, private=private)
         return self._with_initial_states(problem, whole, INITIAL_STATE_ITERATIONS)
 
     def solve(self, problem: FitProblem, begin: UnknownValues) -> tuple[FitProblem, Solution]:
-        """Search over all data; where the noise is to be estimated, until it agrees with the residuals.
+        """Search over all data.
+
+        Where the noise is estimated, the search is repeated until the noise agrees with the
+        residuals.
 
         Args:
             problem: Problem of all segments.
@@ -359,10 +372,10 @@ class _Search:
             if solution.interrupted:
                 break
 
+            # The noise that is estimated from the residuals weights them in the next search.
             sigma = self._residual_sigma(problem, solution.unknowns)
             change = float(np.abs(sigma / problem.noise.sigma - 1.0).max())
             noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
-
             problem = problem.with_noise(noise)
             solution = self._minimise(
                 problem, solution.unknowns, settings, "all data, noise estimated"
@@ -387,7 +400,10 @@ class _Search:
     def _with_initial_states(
         self, problem: FitProblem, begin: UnknownValues, iterations: int
     ) -> UnknownValues:
-        """Unknowns with measured initial states improved for theta as it is; unchanged where they are stated."""
+        """Unknowns with measured initial states improved for the given theta.
+
+        They are unchanged where initial states are stated.
+        """
         if not problem.layout.free_starts or self.interrupted():
             return begin
 
@@ -462,7 +478,10 @@ class _Search:
         return report
 
     def _residual_sigma(self, problem: FitProblem, at: UnknownValues) -> Array:
-        """(ny,) standard deviations of the residuals [y-unit]; with a robust loss, those of the inliers."""
+        """(ny,) standard deviations of the residuals [y-unit].
+
+        With a robust loss, outliers do not count.
+        """
         sigma = np.array(problem.noise.sigma)
         predicted = problem.predict(at)
         if predicted is None:
@@ -472,14 +491,15 @@ class _Search:
         is_robust = self.task.settings.loss != "linear"
         count = problem.value_count
         correction = count / max(count - problem.unknown_count, 1)
+        smallest = MIN_NOISE_SHARE * self.task.system.noise.sigma
 
         for j, errors in enumerate(problem.errors(predicted)):
             if not len(errors):
                 continue
+
+            # The median is used with a robust loss, because outliers hardly change it.
+            spread = float(np.sqrt(np.mean(errors**2) * correction))
             if is_robust:
-                # Outliers hardly move the median.
                 spread = SIGMA_PER_MEDIAN * float(np.median(np.abs(errors)))
-            else:
-                spread = float(np.sqrt(np.mean(errors**2) * correction))
-            sigma[j] = max(spread, MIN_NOISE_SHARE * self.task.system.noise.sigma[j])
+            sigma[j] = max(spread, smallest[j])
         return sigma

@@ -1,9 +1,9 @@
-"""Score tests of physical terms that a model which does not fit may lack.
+"""Score tests of physical terms that a model may lack.
 
-Each candidate (dry friction, damping, stiffness or rotor inertia of a joint; bias or delay of
-outputs) gets a column of sensitivities at the estimate. With g its score and I its information once
-all parameters follow, `g^2 / I` is the squared residual that it would explain and `-g / I` its
-size. One linearisation tests all candidates.
+Candidates are dry friction, damping, stiffness and rotor inertia of every joint, and bias and delay
+of outputs. Each candidate has a column of sensitivities at the estimate. With its score g and its
+information I, both after the parameters are eliminated, the term would reduce the sum of squared
+residuals by `g^2 / I`, and its estimated size is `-g / I`. One linearisation tests all candidates.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.estimate import MissingTerm
 from mjfim.records.recording import Recording
 
-# Probability, over all candidates, that one is named though the model lacks nothing.
+# Probability, over all candidates, that one is reported although the model is complete.
 SIGNIFICANCE = 1e-3
 
-# Smallest share of all squared residuals that a term must explain to be named.
+# Smallest share of the sum of squared residuals that a reported term explains.
 MIN_EXPLAINED_SHARE = 2e-3
 
 # Size at which the sensitivity of a term is taken where it is zero in the model [unit of the term].
@@ -38,11 +38,11 @@ LINEARISATION_SIZE = 1e-4
 # Largest number of candidates.
 MAX_CANDIDATES = 60
 
-# Largest number of terms that are named.
+# Largest number of terms that are reported.
 MAX_NAMED_TERMS = 4
 
-# Share of a term's information that must remain once all parameters follow; below, it cannot be
-# told from them.
+# Smallest share of a term's information that remains after the parameters are eliminated. With
+# less, the term is not identifiable separately from the parameters.
 MIN_REMAINING_SHARE = 1e-8
 
 # Eigenvalues of the scaled information of the parameters below this share of the largest one count
@@ -116,7 +116,7 @@ def find_missing_terms(
         at: Solution of the problem.
 
     Returns:
-        The terms, most significant first; none where the model lacks nothing.
+        The terms, most significant first; empty where no term is significant.
     """
     system = problem.system
     candidates = list(_candidates(system, problem.layout.free_starts))[:MAX_CANDIDATES]
@@ -145,21 +145,45 @@ def _linearise(
     at: UnknownValues,
     candidates: Sequence[Candidate],
 ) -> _Linearisation | None:
-    """Linearise the residuals by parameters and candidates; None where that is impossible."""
-    system = problem.system
+    """Linearise the residuals by parameters and candidates.
 
-    # Candidates become further parameters of the experiment.
+    None where the experiment with the candidates is invalid, or where a simulation diverges.
+    """
     names = [f"?{i}" for i in range(len(candidates))]
-    tables = {
-        name: {
+    extended = _extended_system(problem.system, names, candidates)
+    if extended is None:
+        return None
+
+    # The parameters of the experiment have their estimated values.
+    extended_names = extended.parameters.names
+    places = [extended_names.index(name) for name in problem.system.parameters.names]
+    theta = np.array(extended.parameters.guess)
+    theta[places] = at.theta
+
+    wider = FitProblem.of(extended, recordings).of_segments(segments).with_noise(problem.noise)
+    condensed = wider.condense(replace(at, theta=theta))
+    if condensed is None:
+        return None
+
+    column_names = np.array(extended_names)[wider.layout.parameter_of_column]
+    columns = [int(np.flatnonzero(column_names == name)[0]) for name in names]
+    return _normal_equations(condensed, candidates, columns)
+
+
+def _extended_system(
+    system: System, names: Sequence[str], candidates: Sequence[Candidate]
+) -> System | None:
+    """The system with candidates as further parameters of given names; None where it is invalid."""
+    tables = {}
+    for name, candidate in zip(names, candidates, strict=True):
+        tables[name] = {
             "target": candidate.path,
             "guess": candidate.linearised_at,
             "scale": LINEARISATION_SIZE,
         }
-        for name, candidate in zip(names, candidates, strict=True)
-    }
+
     try:
-        extended = System.resolve(
+        return System.resolve(
             system.experiment.replace(parameters=tables),
             threads=system.threads,
             source=system.source,
@@ -167,36 +191,27 @@ def _linearise(
     except ExperimentError:
         return None
 
-    theta = np.array(extended.parameters.guess)
-    theta[[extended.parameters.names.index(name) for name in system.parameters.names]] = at.theta
-
-    wider = FitProblem.of(extended, recordings).of_segments(segments).with_noise(problem.noise)
-    condensed = wider.condense(replace(at, theta=theta))
-    if condensed is None:
-        return None
-
-    column_names = np.array(extended.parameters.names)[wider.layout.parameter_of_column]
-    columns = [int(np.flatnonzero(column_names == name)[0]) for name in names]
-    return _normal_equations(condensed, candidates, columns)
-
 
 def _normal_equations(
     condensed: Condensed, candidates: Sequence[Candidate], columns: list[int]
 ) -> _Linearisation:
-    """Information and gradient with scaled columns, the candidates at their values in the model."""
+    """Information and gradient with scaled columns.
+
+    The gradient is that of the residuals with all candidates at their values in the model.
+    """
     rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
     norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
     J = rows[:, :-1] / norms
     H = J.T @ J
     g = J.T @ rows[:, -1]
 
-    # Sensitivities were taken at a small value of each term; the residuals that count are those
-    # without it.
+    # Sensitivities were computed at a small value of each term. Correct the gradient to the
+    # residuals without the terms.
     offset = np.zeros(len(H))
     offset[columns] = [candidate.linearised_at - candidate.value for candidate in candidates]
     g = g - H @ (offset * norms)
 
-    # The parameters follow each candidate.
+    # The parameters are eliminated by the pseudo-inverse of their information.
     others = np.setdiff1d(np.arange(len(H)), columns)
     about_others = H[np.ix_(others, others)]
     inverse = np.linalg.pinv(about_others, rcond=INVERSE_TOLERANCE, hermitian=True)
@@ -206,16 +221,25 @@ def _normal_equations(
 def _tested(
     candidate: Candidate, column: int, linearisation: _Linearisation, squares: float, count: int
 ) -> MissingTerm | None:
-    """Score test of one of `count` candidates; None where it is not significant. squares: sum of squared residuals."""
-    H, g = linearisation.H, linearisation.g
+    """Score test of one candidate; None where it is not significant.
 
-    # Information and score once all parameters follow.
+    Args:
+        candidate: The term.
+        column: Its column in the linearisation.
+        linearisation: Normal equations of parameters and candidates.
+        squares: Sum of squared residuals.
+        count: Number of candidates.
+    """
+    H = linearisation.H
+    g = linearisation.g
+
+    # Information and score after the parameters are eliminated.
     others = linearisation.others
     response = linearisation.inverse @ H[others, column]
     information = H[column, column] - H[column, others] @ response
     score = g[column] - g[others] @ response
 
-    # The term cannot be told from the parameters of the experiment.
+    # The term is not identifiable separately from the parameters of the experiment.
     if information <= MIN_REMAINING_SHARE * H[column, column]:
         return None
 
@@ -223,10 +247,10 @@ def _tested(
     sigmas = abs(score) / np.sqrt(information)
     share = score**2 / information / squares
 
-    # A share above 1: the fit is too far from its minimum for a linear answer.
-    impossible = candidate.positive and candidate.value + value < 0.0
-    significant = sigmas > norm.isf(0.5 * SIGNIFICANCE / count)
-    if impossible or not significant or not MIN_EXPLAINED_SHARE < share < 1.0:
+    # A share above 1 means that the fit is too far from its minimum for a linear test.
+    is_impossible = candidate.positive and candidate.value + value < 0.0
+    is_significant = sigmas > norm.isf(0.5 * SIGNIFICANCE / count)
+    if is_impossible or not is_significant or not MIN_EXPLAINED_SHARE < share < 1.0:
         return None
 
     return MissingTerm(
@@ -248,42 +272,51 @@ def _candidates(system: System, free_starts: bool) -> Iterator[Candidate]:
         for target in parameter.targets
     }
 
-    model: Any = system.model
-    for joint in scalar_joints(model):
-        for field, words in JOINT_TERMS.items():
-            path = f"joint/{joint.name}:{field}"
-            if path in targets:
-                continue
-            values = getattr(model, f"{'jnt' if field == 'stiffness' else 'dof'}_{field}")
-            value = float(values[joint.joint if field == "stiffness" else joint.v])
-            yield Candidate(
-                description=f"{words} of {joint.name}",
-                path=path,
-                unit=JOINT_FIELD_UNITS[field][joint.unit],
-                positive=True,
-                value=value,
-                linearised_at=value or LINEARISATION_SIZE,
-            )
+    for candidate in (*_joint_terms(system), *_output_biases(system)):
+        if candidate.path not in targets:
+            yield candidate
 
-    for output in system.outputs.outputs:
-        path = f"output/{output.name}:bias"
-        if path not in targets:
-            yield Candidate(
-                description=f"bias of {output.name}",
-                path=path,
-                unit=output.unit,
-                positive=False,
-                value=0.0,
-                linearised_at=0.0,
-            )
-
-    # A delay would move the segments of free initial states.
+    # A delay would shift the segments whose initial states are free.
     if not free_starts and not parameters.delay_derivative.any():
         yield Candidate(
             description="a delay of all outputs",
             path="output:delay",
             unit="s",
             positive=True,
+            value=0.0,
+            linearised_at=0.0,
+        )
+
+
+def _joint_terms(system: System) -> Iterator[Candidate]:
+    """Friction, damping, rotor inertia and stiffness of every joint with one degree of freedom."""
+    model: Any = system.model
+    for joint in scalar_joints(model):
+        for field, words in JOINT_TERMS.items():
+            # MuJoCo stores stiffness by joint, the other fields by degree of freedom.
+            if field == "stiffness":
+                value = float(model.jnt_stiffness[joint.joint])
+            else:
+                value = float(getattr(model, f"dof_{field}")[joint.v])
+
+            yield Candidate(
+                description=f"{words} of {joint.name}",
+                path=f"joint/{joint.name}:{field}",
+                unit=JOINT_FIELD_UNITS[field][joint.unit],
+                positive=True,
+                value=value,
+                linearised_at=value or LINEARISATION_SIZE,
+            )
+
+
+def _output_biases(system: System) -> Iterator[Candidate]:
+    """A constant bias of every output."""
+    for output in system.outputs.outputs:
+        yield Candidate(
+            description=f"bias of {output.name}",
+            path=f"output/{output.name}:bias",
+            unit=output.unit,
+            positive=False,
             value=0.0,
             linearised_at=0.0,
         )

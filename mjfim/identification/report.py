@@ -1,4 +1,4 @@
-"""From the solution of the least-squares problem to the estimate that a user reads: accuracy, predictions, warnings."""
+"""The estimate that a user reads: values, accuracy, predictions and warnings of a solved fit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class FitResult:
 
     Attributes:
         task: System, recordings and settings.
-        problem: The least-squares problem, with the noise that was used at last.
+        problem: The least-squares problem, with the noise of the last search.
         solution: Its solution.
         null_space: Directions of theta about which neither recordings nor priors contain
             information.
@@ -71,7 +71,7 @@ class _Findings:
         reasons: Reasons for a misfit, in sentences; empty where there is none.
         at_bound: Names of the parameters at a bound or beyond it.
         outside: True where a parameter is beyond a bound.
-        interrupted: True where somebody asked to stop.
+        interrupted: True after a request to stop.
     """
 
     result: FitResult
@@ -85,9 +85,9 @@ class _Findings:
 
 
 def estimate_from(result: FitResult, budget: Budget) -> Estimate:
-    """Assess a fit and put the estimate together.
+    """Assess a fit and make the estimate.
 
-    Once somebody asks to stop, missing terms and predictions are left out; the estimate itself is
+    After a request to stop, missing terms and predictions are left out; the rest of the estimate is
     complete.
 
     Args:
@@ -134,11 +134,14 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
 def _missing_terms(
     result: FitResult, quality: FitQuality, budget: Budget
 ) -> tuple[MissingTerm, ...]:
-    """Terms that the model may lack; none where the fit is too poor for an answer, or where somebody asked to stop."""
+    """Terms that the model may lack.
+
+    There are none where the fit is too poor for the test, and none after a request to stop.
+    """
     if budget.stop.requested or quality.unexplained:
         return ()
 
-    # A subset of much data is enough for the test.
+    # With much data, a subset is enough for the test.
     unknowns = result.solution.unknowns
     at = replace(unknowns, private=unknowns.private[result.subset])
     problem = result.problem.of_segments(result.subset)
@@ -147,7 +150,7 @@ def _missing_terms(
 
 
 def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
-    """Predictions of data that were not fitted; none where somebody asked to stop."""
+    """Predictions of data that were not fitted; none after a request to stop."""
     if budget.stop.requested:
         return ()
 
@@ -157,27 +160,33 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
 
 def _at_bounds(parameters: ParameterSet, theta: Array) -> tuple[tuple[str, ...], bool]:
     """Names of the parameters at a bound or beyond it, and whether any is beyond."""
-    near = BOUND_TOLERANCE * parameters.magnitude
-    outside = (theta < parameters.lower - near) | (theta > parameters.upper + near)
+    tolerance = BOUND_TOLERANCE * parameters.magnitude
+    below = theta < parameters.lower - tolerance
+    above = theta > parameters.upper + tolerance
 
     distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
-    touching = distance < near
-    names = tuple(name for name, touches in zip(parameters.names, touching, strict=True) if touches)
-    return names, bool(outside.any())
+    at_bound = np.flatnonzero(distance < tolerance)
+    names = tuple(parameters.names[j] for j in at_bound)
+    return names, bool((below | above).any())
 
 
 def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estimate:
     """The record that a user gets."""
-    result, quality, accuracy = findings.result, findings.quality, findings.accuracy
-    system, problem = result.task.system, result.problem
-    solution, parameters = result.solution, result.task.system.parameters
+    result = findings.result
+    quality = findings.quality
+    accuracy = findings.accuracy
+    problem = result.problem
+    solution = result.solution
+    system = result.task.system
+    parameters = system.parameters
 
     undetermined = accuracy.singular or accuracy.single_unidentifiable
     sigma = problem.noise.sigma.tolist()
-    per_recording = {
-        parameters.names[j]: tuple(solution.unknowns.per_recording[:, column].tolist())
-        for column, j in enumerate(problem.layout.per_recording)
-    }
+
+    per_recording = {}
+    for column, j in enumerate(problem.layout.per_recording):
+        values = solution.unknowns.per_recording[:, column]
+        per_recording[parameters.names[j]] = tuple(values.tolist())
 
     return Estimate(
         parameters=parameters.names,
@@ -259,27 +268,31 @@ def _warnings(findings: _Findings) -> Iterator[str]:
 
 
 def _warnings_of_search(findings: _Findings) -> Iterator[str]:
-    """Warnings about a search that was interrupted, found a poor minimum or could not find all parameters."""
-    quality, accuracy = findings.quality, findings.accuracy
+    """Warnings about an interrupted search, a poor minimum and undetermined parameters."""
+    quality = findings.quality
+    accuracy = findings.accuracy
     if findings.interrupted and not findings.result.solution.interrupted:
         yield "interrupted after the search: there are no predictions of data that were not fitted"
+
     if quality.unexplained:
         yield (
             f"the fit explains little of the motion of {', '.join(quality.unexplained)}: probably "
             "a local minimum. Shorter segments (fit.segments), more starts (fit.starts) or a "
             "better guess may find a better one"
         )
+
     for group in accuracy.groups:
         yield (
             f"not identifiable separately: {group}; what the recordings do not determine was held "
             "at the start"
         )
+
     if accuracy.singular:
         yield "the recordings do not determine all parameters: the information is singular"
 
 
 def _warnings_of_misfit(findings: _Findings) -> Iterator[str]:
-    """Warnings about residuals that are not the noise that was stated."""
+    """Warnings about residuals that differ from the stated noise."""
     quality = findings.quality
     noise_is_stated = findings.result.task.noise_is_stated
     if findings.reasons:

@@ -1,4 +1,4 @@
-"""Tests of residuals: whether they are white noise of the stated size, and where they are largest."""
+"""Tests of residuals: are they white noise of the stated size, and where are they largest?"""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from scipy.stats import chi2 as chi2_distribution
 from mjfim.arrays import Array
 from mjfim.records.estimate import Whiteness, WorstResidual
 
-# Probability below which residuals are not noise.
+# Probability below which a test rejects that residuals are the expected noise.
 SIGNIFICANCE = 1e-3
 
-# Residuals over the stated noise above which the difference matters.
+# Ratio of the size of the residuals to the stated noise, above which the difference is relevant.
 RELEVANT_SIZE_RATIO = 1.03
 
-# Variance of means over that of white noise above which autocorrelation matters.
+# Variance of means over that of white noise, above which autocorrelation is relevant.
 RELEVANT_INFLATION = 1.25
 
 # Lag-1 correlation that is large enough to describe an autocorrelation.
@@ -30,20 +30,20 @@ MAX_LISTED_OUTPUTS = 4
 # Largest number of windows into which a recording is divided to find its largest residuals.
 MAX_WINDOWS = 25
 
-# Number of values of a window, about; windows with fewer values count as if the others were zero.
+# Approximate number of values in a window. Windows with fewer values are filled up with zeros.
 VALUES_PER_WINDOW = 8
 
-# Root mean square of a window over that of the recording, above which the window is named rather
-# than the whole recording.
+# Root mean square of a window over that of the recording, above which the window is reported
+# instead of the whole recording.
 PEAK_RATIO = 1.5
 
-# Share of the peak down to which neighbouring windows belong to it.
+# Neighbouring windows belong to the peak if their root mean square is at least this share of it.
 PEAK_SHARE = 0.5
 
 # Number of lags of the Ljung-Box test.
 LAGS = 20
 
-# Smallest number of values, or of means of runs, of which a variance is taken.
+# Smallest number of values, or of means of runs, from which a variance is computed.
 MIN_VALUES = 8
 
 # Ratio of the lengths of successive runs whose means are tested.
@@ -52,7 +52,7 @@ RUN_RATIO = 4
 # Autocorrelation below which it counts as zero.
 NO_AUTOCORRELATION = 0.05
 
-# Smallest sum of squares by which is divided.
+# Smallest sum of squares in a denominator.
 SMALLEST_SQUARES = 1e-300
 
 
@@ -79,7 +79,7 @@ def is_smaller_than_noise(chi2: float, dof: int) -> bool:
 
 
 def autocorrelated(tests: Sequence[Whiteness]) -> tuple[Whiteness, ...]:
-    """Tests that find autocorrelation which is significant and large enough to matter.
+    """Tests that find significant and relevant autocorrelation.
 
     Args:
         tests: Test of every output.
@@ -88,11 +88,13 @@ def autocorrelated(tests: Sequence[Whiteness]) -> tuple[Whiteness, ...]:
         These tests, strongest autocorrelation first.
     """
     level = SIGNIFICANCE / max(len(tests), 1)
-    found = [
-        test
-        for test in tests
-        if test.p < level and max(test.inflation, test.time) * test.variance > RELEVANT_INFLATION
-    ]
+
+    found = []
+    for test in tests:
+        inflation = max(test.inflation, test.time) * test.variance
+        if test.p < level and inflation > RELEVANT_INFLATION:
+            found.append(test)
+
     return tuple(sorted(found, key=lambda test: -test.inflation))
 
 
@@ -131,7 +133,11 @@ def misfit_reasons(
 
 
 def _describe(test: Whiteness) -> str:
-    """An autocorrelation in words: by the correlation of neighbours, or by the variance of means over long runs."""
+    """An autocorrelation in words.
+
+    It is described by the correlation of neighbouring values, or, where that is small, by the
+    variance of means over long runs.
+    """
     if abs(test.correlation) > RELEVANT_CORRELATION:
         return f"lag-1 correlation {test.correlation:+.2f}"
     return f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
@@ -160,8 +166,8 @@ def find_worst_residual(
 ) -> WorstResidual | None:
     """The output and the interval in which residuals are largest.
 
-    An interval is a window or several neighbouring ones; where none stands out, it is the whole
-    recording.
+    An interval is one window or several neighbouring ones. It is the whole recording where no
+    window has clearly larger residuals than the others.
 
     Args:
         outputs: Names of the ny outputs.
@@ -197,14 +203,25 @@ def find_worst_residual(
 
 
 def _windows(t: Array, z: Array) -> _Windows | None:
-    """Divide the residuals z: (M,) of an output at times t: (M,) into windows; None without a residual."""
+    """Divide the residuals of an output into windows.
+
+    Args:
+        t: (M,) times of the rows [s].
+        z: (M,) whitened residuals, NaN where not measured.
+
+    Returns:
+        The windows; None without a residual.
+    """
     measured = np.isfinite(z)
     if not measured.any():
         return None
 
+    # Windows of equal duration; round-off must not exclude the last row.
     count = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
     edges = np.linspace(t[0], t[-1] * (1 + 1e-12), count + 1)
-    window = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)[measured]
+
+    window_of_row = np.searchsorted(edges, t, side="right") - 1
+    window = np.clip(window_of_row, 0, count - 1)[measured]
     squares = np.bincount(window, weights=z[measured] ** 2, minlength=count)
     return _Windows(
         edges=edges,
@@ -214,8 +231,11 @@ def _windows(t: Array, z: Array) -> _Windows | None:
 
 
 def _largest_windows(windows: _Windows) -> slice:
-    """Neighbouring windows in which residuals are largest; all of them where none stands out."""
-    # A single large value is not an interval: windows with few values count as if they had more.
+    """Neighbouring windows in which residuals are largest.
+
+    These are all windows where none has clearly larger residuals than the others.
+    """
+    # Windows with few values count as if they had more: a single large value is not an interval.
     rms = np.sqrt(windows.squares / np.maximum(windows.counts, VALUES_PER_WINDOW))
     peak = int(np.argmax(rms))
     overall = float(np.sqrt(windows.squares.sum() / windows.counts.sum()))
@@ -232,7 +252,10 @@ def _largest_windows(windows: _Windows) -> slice:
 
 
 def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
-    """Test whether residuals are white noise: Ljung-Box at short lags, and variances of means over longer and longer runs.
+    """Test whether residuals are white noise.
+
+    The Ljung-Box test examines short lags. Variances of means over longer and longer runs show
+    slow drifts.
 
     Args:
         output: Name of the output.
@@ -263,8 +286,8 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
     terms = rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))
     statistic = count * (count + 2) * float(np.sum(terms))
 
-    # Means over runs show slow drifts that short lags miss. The number of tests corrects the
-    # probability.
+    # Means over runs show slow drifts that short lags miss. The smallest probability is multiplied
+    # by the number of tests (Bonferroni).
     variance = squares / count
     runs = list(_run_tests(series, variance))
     probabilities = [float(chi2_distribution.sf(statistic, lags)), *(p for _, p in runs)]
@@ -281,29 +304,51 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
 
 
 def _autocorrelation(series: Sequence[Array], longest_lag: int) -> Array:
-    """(longest_lag+1,) autocorrelation of all series together, about zero: a constant offset is not noise either."""
+    """(longest_lag+1,) autocorrelation of all series together.
+
+    The mean is not subtracted, because a constant offset is not noise either.
+    """
     total = np.zeros(longest_lag + 1)
     for part in series:
+        # The correlation has lags of both signs; lag zero is in the middle.
         products = correlate(part, part, method="fft")
-        at_lags = products[len(part) - 1 :][: longest_lag + 1]
+        zero_lag = len(part) - 1
+        at_lags = products[zero_lag : zero_lag + longest_lag + 1]
         total[: len(at_lags)] += at_lags
+
     return np.asarray(total / total[0])
 
 
 def _autocorrelation_time(rho: Array) -> float:
-    """Integrated autocorrelation time `1 + 2 sum rho` [rows], up to where rho first vanishes (initial positive sequence)."""
+    """Integrated autocorrelation time `1 + 2 sum rho` [rows].
+
+    The sum ends where rho: (lags,) first vanishes (initial positive sequence).
+    """
+    end = len(rho)
     vanishing = np.flatnonzero(rho < NO_AUTOCORRELATION)
-    end = int(vanishing[0]) if len(vanishing) else len(rho)
+    if len(vanishing):
+        end = int(vanishing[0])
+
     return float(1.0 + 2.0 * rho[1:end].sum())
 
 
 def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float, float]]:
-    """Variance of the mean of a run over that of white noise, and its probability, for longer and longer runs."""
+    """Tests of means over runs of 4, 16, 64, ... values.
+
+    Args:
+        series: Residuals of every recording.
+        variance: Variance of a residual.
+
+    Yields:
+        Variance of the means over that of white noise, and its probability.
+    """
     length = RUN_RATIO
     while True:
-        means = [
-            part[: len(part) // length * length].reshape(-1, length).mean(axis=1) for part in series
-        ]
+        means = []
+        for part in series:
+            runs = len(part) // length
+            means.append(part[: runs * length].reshape(runs, length).mean(axis=1))
+
         joined = np.concatenate(means)
         if len(joined) < MIN_VALUES:
             return

@@ -1,7 +1,7 @@
-"""The least-squares problem of an identification: whitened residuals of recordings and their linearisation.
+"""The least-squares problem of an identification: whitened residuals and their linearisation.
 
-Residuals are compared at the times of the logs. The problem is condensed for the solver, block of
-rows by block of rows.
+Predictions and measured values are compared at the times of the recordings. For the solver, the
+linearised rows are condensed block by block.
 """
 
 from __future__ import annotations
@@ -33,23 +33,26 @@ from mjfim.records.trajectory import Trajectory
 # Smallest number of rows of a block.
 MIN_BLOCK_ROWS = 8
 
-# Number of blocks into which all rows are divided at most, about.
+# Approximate largest number of blocks into which all rows are divided.
 MAX_BLOCKS = 1024
 
-# Standard deviation of the prior on a free initial state [m, rad, m/s, ...]; it holds components
-# that no output shows.
+# Standard deviation of the prior on a free initial state [m, rad, m/s, ...]. This weak prior keeps
+# components finite that no output determines.
 FREE_START_SIGMA = 1e3
 
-# Prior standard deviations, or scales, by which a delay may grow during the search.
+# Largest increase of a delay during the search, in prior standard deviations of its parameters, or
+# in their scales where there is no prior.
 MAX_DELAY_GROWTH = 5.0
 
-# Samples of the longest recording along which difference steps are calibrated.
+# Number of samples of the longest recording along which difference steps are calibrated.
 CALIBRATION_SAMPLES = 1000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Residuals:
-    """All rows of a linearised problem: whitened residuals of the recordings, then priors, then pins.
+    """All rows of a linearised problem.
+
+    Whitened residuals of the recordings come first, then priors, then pins.
 
     Attributes:
         r: (n,) residuals [standard deviations].
@@ -63,34 +66,34 @@ class Residuals:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pins:
-    """Rows that hold combinations of parameters which no recording shows.
+    """Rows that hold combinations of parameters which no recording determines.
 
     Attributes:
-        rows: (k, p) combinations, each in units of the magnitudes of the parameters.
-        theta: (p,) parameters at which they are held.
+        rows: (k, p) coefficients of the combinations, each over the magnitude of the parameter.
+        theta: (p,) parameters at which the combinations are held.
     """
 
     rows: Array
     theta: Array
 
     def residual(self, theta: Array) -> Array:
-        """(k,) distances of theta: (p,) from the place where it is held."""
+        """(k,) differences of the combinations at theta: (p,) from their held values."""
         return np.asarray(self.rows @ (theta - self.theta))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitProblem:
-    """Residuals of a system against recordings as functions of the unknowns (`levenberg_marquardt.Problem`).
+    """Residuals of recordings as functions of the unknowns; a `levenberg_marquardt.Problem`.
 
-    The common unknowns are theta without private deviations of the initial state; every segment has
-    deviations of its own. Where initial states are measured, the whole state is private.
+    Every segment has private unknowns: the deviations of its initial state, or its whole initial
+    state where that is measured. All other parameters are common unknowns.
 
     Attributes:
         simulation: Simulation of the segments.
         masks: (M, ny) for every recording, True for the measured values that count.
         noise: Noise of the outputs.
         loss: Loss of a whitened residual.
-        pins: Combinations that no recording shows, and where they are held.
+        pins: Combinations that no recording determines, and their values.
         with_priors: Whether priors of the parameters count.
     """
 
@@ -117,8 +120,8 @@ class FitProblem:
 
         Raises:
             RecordingError: There is no recording, or one cannot be used.
-            ExperimentError: The initial state is measured, and deviations of the stated one are
-                asked for.
+            ExperimentError: Parameters move the stated initial state, but the settings of the fit
+                take the initial state from the measured values.
         """
         if not recordings:
             raise RecordingError("identify needs at least one recording")
@@ -127,22 +130,13 @@ class FitProblem:
         parameters = system.parameters
         aligned = tuple(align(system, recording) for recording in recordings)
 
-        # Difference steps suit the motion that was recorded; a part of it shows how strongly each
-        # parameter acts.
+        # Difference steps depend on how strongly each parameter changes the recorded motion.
         longest = max(aligned, key=lambda recording: len(recording.ctrl))
         system = system.calibrated(parameters.guess, longest.ctrl[:CALIBRATION_SAMPLES])
 
-        # Segments need initial states of their own, which only the measured values show.
+        # The initial states of segments are not stated; they come from the measured values.
         free_starts = settings.start == "measured" or settings.segments is not None
-        if free_starts:
-            _require_measured_starts(system)
-            directions = np.eye(system.space.nx)
-            lead = _max_delay(parameters)
-            segments = cut_into_segments(system, aligned, settings.segments, lead)
-        else:
-            by_theta = parameters.initial_state_derivative(system.space.nx)
-            directions = by_theta[:, parameters.initial_deviations]
-            segments = whole_recordings(aligned, system.plant.nominal_initial_state)
+        segments, directions = _segments_of(system, aligned, free_starts)
 
         masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
         if not any(mask.any() for mask in masks):
@@ -174,7 +168,7 @@ class FitProblem:
         return replace(self, simulation=self.simulation.with_layout(self.layout.unbounded()))
 
     def with_shared_held(self) -> FitProblem:
-        """This problem with the shared parameters held at any theta; pins do not matter then."""
+        """This problem with all shared parameters held, so that it needs no pins."""
         simulation = self.simulation.with_layout(self.layout.without_shared())
         return replace(
             self, simulation=simulation, pins=replace(self.pins, rows=self.pins.rows[:0])
@@ -187,10 +181,12 @@ class FitProblem:
     def of_segments(self, indices: np.ndarray) -> FitProblem:
         """The problem of some segments only; only their rows count."""
         simulation = self.simulation.of_segments(indices)
+
         masks = tuple(np.zeros_like(mask) for mask in self.masks)
         for segment in simulation.segments:
-            counted = self.masks[segment.recording][segment.rows]
-            masks[segment.recording][segment.rows] = counted
+            rows = segment.rows
+            masks[segment.recording][rows] = self.masks[segment.recording][rows]
+
         return replace(self, simulation=simulation, masks=masks)
 
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
@@ -206,11 +202,13 @@ class FitProblem:
         return replace(self, masks=both)
 
     def pinned(self, theta: Array, null_space: NullSpace) -> FitProblem:
-        """This problem with the combinations of parameters that no recording shows held, to one magnitude of each parameter.
+        """This problem with the combinations of parameters held that no recording determines.
+
+        A pin has the weight of a prior whose standard deviation is the magnitude of the parameters.
 
         Args:
-            theta: (p,) parameters at which they are held.
-            null_space: Invisible directions of all p parameters.
+            theta: (p,) parameters at which the combinations are held.
+            null_space: Directions of theta about which there is no information.
 
         Returns:
             The problem.
@@ -264,34 +262,33 @@ class FitProblem:
 
     @property
     def segments_with_values(self) -> np.ndarray:
-        """Indices of the segments that hold a measured value that counts."""
-        indices = [
-            i
-            for i, segment in enumerate(self.segments)
-            if self.masks[segment.recording][segment.rows].any()
-        ]
+        """Indices of the segments that contain a measured value that counts."""
+        indices = []
+        for i, segment in enumerate(self.segments):
+            if self.masks[segment.recording][segment.rows].any():
+                indices.append(i)
+
         return np.array(indices, dtype=np.intp)
+
+    @cached_property
+    def _rows_per_segment(self) -> np.ndarray:
+        """(P,) number of rows of every segment."""
+        return np.array([segment.rows.stop - segment.rows.start for segment in self.segments])
 
     @cached_property
     def _block_offsets(self) -> np.ndarray:
         """(P+1,) first block of every segment, and the number of all blocks."""
         block_rows = max(MIN_BLOCK_ROWS, -(-self.row_count // MAX_BLOCKS))
-        counts = [
-            max(round((segment.rows.stop - segment.rows.start) / block_rows), 1)
-            for segment in self.segments
-        ]
+        counts = np.maximum(np.rint(self._rows_per_segment / block_rows).astype(int), 1)
         return np.concatenate([[0], np.cumsum(counts)])
 
     @property
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:
         """(B,) index of the recording, and (B,) mean number of rows, of every block."""
         counts = np.diff(self._block_offsets)
-        recordings = np.repeat([segment.recording for segment in self.segments], counts)
-        rows = [
-            (segment.rows.stop - segment.rows.start) / count
-            for segment, count in zip(self.segments, counts, strict=True)
-        ]
-        return recordings, np.repeat(rows, counts)
+        recordings = [segment.recording for segment in self.segments]
+        rows = self._rows_per_segment / counts
+        return np.repeat(recordings, counts), np.repeat(rows, counts)
 
     # ---- unknowns
 
@@ -314,7 +311,7 @@ class FitProblem:
         return self.layout.common_values(at)
 
     def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
-        """The unknowns after a fraction of a step; rounding does not take them out of the bounds."""
+        """The unknowns after a fraction of a step, clipped to the bounds."""
         return self.layout.moved(at, step, fraction)
 
     def theta(self, at: UnknownValues) -> Array:
@@ -324,7 +321,7 @@ class FitProblem:
     # ---- residuals
 
     def predict(self, at: UnknownValues) -> list[Array] | None:
-        """(M, ny) predicted outputs of every recording at its times; None where a simulation diverges."""
+        """(M, ny) predicted outputs of every recording; None where a simulation diverges."""
         return self.simulation.predict(at)
 
     def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
@@ -332,7 +329,7 @@ class FitProblem:
         return self.simulation.motion(at, recording)
 
     def errors(self, predicted: Sequence[Array]) -> list[Array]:
-        """Predicted minus measured values of every output, for all recordings one after the other.
+        """Predicted minus measured values of every output, for all recordings in their order.
 
         Args:
             predicted: (M, ny) predicted outputs of every recording [y-unit].
@@ -340,34 +337,35 @@ class FitProblem:
         Returns:
             One array for each output [y-unit].
         """
-        differences = [
-            y - recording.y for y, recording in zip(predicted, self.recordings, strict=True)
-        ]
-        return [
-            np.concatenate(
-                [
-                    difference[mask[:, j], j]
-                    for difference, mask in zip(differences, self.masks, strict=True)
-                ]
-            )
-            for j in range(len(self.system.outputs))
-        ]
+        data = zip(predicted, self.recordings, self.masks, strict=True)
+        differences = [(y - recording.y, mask) for y, recording, mask in data]
+
+        errors = []
+        for j in range(len(self.system.outputs)):
+            parts = [difference[mask[:, j], j] for difference, mask in differences]
+            errors.append(np.concatenate(parts))
+        return errors
 
     def cost(self, at: UnknownValues) -> float:
-        """Half of the loss of the residuals and of the squared priors; infinite where a simulation diverges."""
+        """Half of the sum of the residuals' loss and of the squared priors and pins.
+
+        It is infinite where a simulation diverges.
+        """
         total = 0.0
         for rows in self.simulation.rows(at, derivatives=False):
             if rows is None:
                 return np.inf
-            _, residual = self._whitened(rows)
-            total += self.loss.value(residual)
+            total += self.loss.value(self._whitened_residual(rows))
 
         common = self._common_rows(at)[:, -1]
         private = self._private_rows(at)[:, :, -1]
         return 0.5 * (total + float(common @ common) + float(np.sum(private**2)))
 
     def condense(self, at: UnknownValues) -> Condensed | None:
-        """Linearisation about the unknowns, condensed block by block; None where a perturbed simulation diverges."""
+        """Linearisation about the unknowns, condensed block by block.
+
+        None where a perturbed simulation diverges.
+        """
         m = self.simulation.private_count + self.layout.column_count + 1
         blocks = np.zeros((int(self._block_offsets[-1]), m, m))
         segment_of_block = np.repeat(np.arange(len(self.segments)), np.diff(self._block_offsets))
@@ -380,7 +378,7 @@ class FitProblem:
             block, r, J = self._linearised(rows)
             weighted = np.concatenate([J, r[:, None]], axis=1) * self.loss.weight(r)[:, None]
 
-            # Rows of a block join its triangle.
+            # Rows are added to the triangle of their block.
             edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
             for first, last in pairwise(edges):
                 index = block[first]
@@ -406,36 +404,50 @@ class FitProblem:
             Residuals with their derivatives; None where a perturbed simulation diverges.
         """
         n = self.simulation.private_count
-        c = self.layout.column_count
-        residuals, jacobians = [], []
-
-        def append(residual: Array, common: Array, private: Array, segment: int) -> None:
-            """Append rows of one segment with derivatives by the common and by its private unknowns."""
-            wide = np.zeros((len(residual), self.unknown_count))
-            wide[:, :c] = common
-            wide[:, c + segment * n : c + (segment + 1) * n] = private
-            residuals.append(residual)
-            jacobians.append(wide)
+        residuals = []
+        jacobians = []
 
         for rows in self.simulation.rows(at, derivatives=True):
             if rows is None:
                 return None
             _, residual, J = self._linearised(rows)
-            append(residual, J[:, n:], J[:, :n], rows.segment)
+            residuals.append(residual)
+            jacobians.append(self._wide_jacobian(J[:, n:], J[:, :n], rows.segment))
 
         common_rows = self._common_rows(at)
-        none = np.zeros((len(common_rows), n))
-        append(common_rows[:, -1], common_rows[:, :-1], none, 0)
+        no_private = np.zeros((len(common_rows), n))
+        residuals.append(common_rows[:, -1])
+        jacobians.append(self._wide_jacobian(common_rows[:, :-1], no_private, 0))
 
-        for i, own in enumerate(self._private_rows(at)):
-            append(own[:, -1], own[:, n:-1], own[:, :n], i)
+        for segment, private_rows in enumerate(self._private_rows(at)):
+            common, private = private_rows[:, n:-1], private_rows[:, :n]
+            residuals.append(private_rows[:, -1])
+            jacobians.append(self._wide_jacobian(common, private, segment))
 
         return Residuals(r=np.concatenate(residuals), J=np.concatenate(jacobians))
 
-    def sensitivity_rows(self, at: UnknownValues) -> list[tuple[Array, Array]]:
-        """Condensed rows of the whitened sensitivity G for every segment, and their change with a longer difference step.
+    def _wide_jacobian(self, common: Array, private: Array, segment: int) -> Array:
+        """(k, c + P n) derivatives by all unknowns, for rows of one segment.
 
-        Where the whole initial state is free, only what it cannot explain remains of them.
+        Args:
+            common: (k, c) derivatives by the common unknowns.
+            private: (k, n) derivatives by the private unknowns of the segment.
+            segment: Index of the segment.
+        """
+        n = private.shape[1]
+        c = common.shape[1]
+        first = c + segment * n
+
+        wide = np.zeros((len(common), self.unknown_count))
+        wide[:, :c] = common
+        wide[:, first : first + n] = private
+        return wide
+
+    def sensitivity_rows(self, at: UnknownValues) -> list[tuple[Array, Array]]:
+        """Condensed rows of the whitened sensitivity G, and their change with a longer step.
+
+        The longer difference step shows the error of the differences. Where the whole initial state
+        is free, rows are projected onto the complement of its derivatives.
 
         Args:
             at: The unknowns.
@@ -447,6 +459,27 @@ class FitProblem:
         Raises:
             SimulationDivergedError: A perturbed simulation diverges.
         """
+        condensed = self._condensed_sensitivity(at)
+        n = self.simulation.private_count if self.layout.free_starts else 0
+
+        found = []
+        for segment in sorted(condensed):
+            J, change = np.split(condensed[segment], 2, axis=1)
+            by_theta = J[:, n:]
+            change_by_theta = change[:, n:]
+
+            # A free initial state explains everything in the span of its derivatives.
+            Q = np.linalg.qr(J[:, :n])[0]
+            remaining = by_theta - Q @ (Q.T @ by_theta)
+            remaining_change = change_by_theta - Q @ (Q.T @ change_by_theta)
+            found.append((remaining, remaining_change))
+        return found
+
+    def _condensed_sensitivity(self, at: UnknownValues) -> dict[int, Array]:
+        """Triangle of the whitened sensitivity and its change with a longer step, by segment.
+
+        Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes.
+        """
         fine, coarse = (
             self.simulation.rows(
                 at, derivatives=True, central=True, step=step, by_all_parameters=True
@@ -454,8 +487,6 @@ class FitProblem:
             for step in (SENSITIVITY_STEP, COARSER_STEP_FACTOR * SENSITIVITY_STEP)
         )
 
-        # Rows of G and of their change stand side by side while they are condensed, so that they
-        # stay together.
         condensed: dict[int, Array] = {}
         for rows, coarse_rows in zip_longest(fine, coarse):
             if rows is None:
@@ -463,6 +494,8 @@ class FitProblem:
                 raise SimulationDivergedError(
                     f"{name}: the simulation diverges under the recorded control"
                 )
+
+            # Where the simulation with the longer step diverges, the change is unknown.
             J = self._whitened_sensitivity(rows)
             change = np.zeros_like(J)
             if coarse_rows is not None:
@@ -471,57 +504,49 @@ class FitProblem:
             both = np.concatenate([J, change], axis=1)
             earlier = condensed.get(rows.segment, both[:0])
             condensed[rows.segment] = triangle(np.concatenate([earlier, both]))
-
-        # Project onto the complement of what a free initial state can explain.
-        n = self.simulation.private_count if self.layout.free_starts else 0
-        found = []
-        for segment in sorted(condensed):
-            J, change = np.split(condensed[segment], 2, axis=1)
-            Q = np.linalg.qr(J[:, :n])[0]
-            by_theta, change_by_theta = J[:, n:], change[:, n:]
-            found.append(
-                (
-                    by_theta - Q @ (Q.T @ by_theta),
-                    change_by_theta - Q @ (Q.T @ change_by_theta),
-                )
-            )
-        return found
+        return condensed
 
     # ---- rows
 
+    def _mask_of(self, rows: SegmentRows) -> np.ndarray:
+        """(k, ny) True for the values of k rows that count."""
+        recording = self.segments[rows.segment].recording
+        return np.asarray(self.masks[recording][rows.rows])
+
     def _whitened_sensitivity(self, rows: SegmentRows) -> Array:
         """(k, n+p) whitened derivatives, by the initial state where that is free, then by theta."""
-        mask = self.masks[self.segments[rows.segment].recording][rows.rows]
         common, private = rows.jacobians
         G = common
         if self.layout.free_starts:
             G = np.concatenate([private, common], axis=2)
-        return self.noise.whiten_present(G, mask)
+        return self.noise.whiten_present(G, self._mask_of(rows))
 
-    def _whitened(self, rows: SegmentRows) -> tuple[np.ndarray, Array]:
-        """(k, ny) mask of the values that count, and their whitened residuals one after the other."""
-        recording = self.segments[rows.segment].recording
-        mask = self.masks[recording][rows.rows]
-        measured = self.recordings[recording].y[rows.rows]
-        residual = np.where(mask, rows.y - measured, 0.0)
-        return mask, self.noise.whiten_present(residual, mask)
+    def _whitened_residual(self, rows: SegmentRows) -> Array:
+        """(n,) whitened residuals of the values of some rows that count, row by row."""
+        mask = self._mask_of(rows)
+        recording = self.recordings[self.segments[rows.segment].recording]
+        residual = np.where(mask, rows.y - recording.y[rows.rows], 0.0)
+        return self.noise.whiten_present(residual, mask)
 
     def _linearised(self, rows: SegmentRows) -> tuple[np.ndarray, Array, Array]:
-        """Block, whitened residual and derivative by private, then common unknowns of every value."""
-        mask, r = self._whitened(rows)
-        common, private = rows.jacobians
+        """Block, whitened residual and derivatives of every value that counts.
+
+        The (n, n_private + c) derivatives are those by the private, then by the common unknowns.
+        """
+        mask = self._mask_of(rows)
         segment = self.segments[rows.segment]
+        common, private = rows.jacobians
         columns = self.layout.to_columns(common, segment.recording)
         G = np.concatenate([private, columns], axis=2)
 
         # The rows of a segment are divided evenly among its blocks.
         first = int(self._block_offsets[rows.segment])
         count = int(self._block_offsets[rows.segment + 1]) - first
-        length = segment.rows.stop - segment.rows.start
-        block_of_row = first + (rows.rows - segment.rows.start) * count // length
+        row_in_segment = rows.rows - segment.rows.start
+        block_of_row = first + row_in_segment * count // self._rows_per_segment[rows.segment]
         block = np.broadcast_to(block_of_row[:, None], mask.shape)[mask]
 
-        return block, r, self.noise.whiten_present(G, mask)
+        return block, self._whitened_residual(rows), self.noise.whiten_present(G, mask)
 
     def _common_rows(self, at: UnknownValues) -> Array:
         """(l, c+1) rows `[J, r]` of priors and pins on the common unknowns."""
@@ -541,13 +566,13 @@ class FitProblem:
         return bool(self.pins.rows[:, self.layout.private].any())
 
     def _private_rows(self, at: UnknownValues) -> Array:
-        """(P, k, m) rows `[J_private, J_common, r]` of priors on private unknowns, and of pins that involve them."""
+        """(P, k, m) rows `[J_private, J_common, r]` of priors and pins on private unknowns."""
         n = self.simulation.private_count
         m = n + self.layout.column_count + 1
         count = len(self.segments)
         diagonal = np.arange(n)
 
-        # A weak prior holds components of a free initial state that no output shows.
+        # A weak prior on a free initial state, for components that no output determines.
         if self.layout.free_starts:
             rows = np.zeros((count, n, m))
             rows[:, diagonal, diagonal] = 1.0 / FREE_START_SIGMA
@@ -573,16 +598,32 @@ class FitProblem:
         return rows
 
 
+def _segments_of(
+    system: System, recordings: Sequence[AlignedRecording], free_starts: bool
+) -> tuple[tuple[Segment, ...], Array]:
+    """Segments, and (nx, n) directions in which their private unknowns move the initial state."""
+    parameters = system.parameters
+    if free_starts:
+        _require_measured_starts(system)
+        length = system.experiment.fit.segments
+        segments = cut_into_segments(system, recordings, length, _max_delay(parameters))
+        return segments, np.eye(system.space.nx)
+
+    by_theta = parameters.initial_state_derivative(system.space.nx)
+    directions = by_theta[:, parameters.initial_deviations]
+    return whole_recordings(recordings, system.plant.nominal_initial_state), directions
+
+
 def _require_measured_starts(system: System) -> None:
-    """Raise ExperimentError where deviations of the stated initial state are asked for though the state is measured."""
+    """Raise ExperimentError where a parameter moves the initial state, which is measured."""
     parameters = system.parameters
     moves_start = parameters.initial_state_derivative(system.space.nx).any(axis=0)
     if moves_start.any():
         name = parameters.names[int(np.argmax(moves_start))]
         raise ExperimentError(
             f"{system.experiment.source}: {name}: the initial state is free where fit.segments or "
-            'fit.start = "measured" is stated; remove nuisance.initial and parameters of the initial state, '
-            "or remove the settings of the fit"
+            'fit.start = "measured" is stated; remove nuisance.initial and parameters of the '
+            "initial state, or remove the settings of the fit"
         )
 
 
@@ -597,7 +638,10 @@ def _max_delay(parameters: ParameterSet) -> float:
 
 
 def _counted_values(recording: AlignedRecording, free_starts: bool) -> np.ndarray:
-    """(M, ny) True for the measured values that count; at a stated initial state they contain no information."""
+    """(M, ny) True for the measured values that count.
+
+    Those at a stated initial state do not count, because they contain no information.
+    """
     mask = np.array(recording.measured)
     if not free_starts:
         mask[0] = False

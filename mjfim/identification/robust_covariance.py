@@ -1,8 +1,11 @@
-"""Uncertainty of an estimate where residuals are not white noise: sandwich covariance, block bootstrap, recordings that differ.
+"""Uncertainty of an estimate where residuals are not white noise.
 
-Everything comes from the condensed blocks of the last linearisation, without another simulation.
-With g_b the score of block b, H the information and W that of the priors, `cov = H^-1 (sum g_b g_b'
-+ W) H^-1`. The bootstrap draws blocks with replacement and takes a Gauss-Newton step for each draw.
+Three methods use the condensed blocks of the last linearisation, without another simulation:
+
+- The sandwich covariance is `H^-1 (sum_b g_b g_b' + W) H^-1`, with the score g_b of block b, the
+  information H and the information W of the priors.
+- The bootstrap draws blocks with replacement and takes a Gauss-Newton step for each draw.
+- Estimates from single recordings are compared with each other.
 """
 
 from __future__ import annotations
@@ -21,34 +24,34 @@ from mjfim.records.estimate import Uncertainty
 # Confidence level of the intervals.
 LEVEL = 0.95
 
-# Eigenvalues of an information scaled to unit diagonal below this share of the largest one count as
+# Eigenvalues of a scaled information (unit diagonal) below this share of the largest one count as
 # zero.
 INVERSE_TOLERANCE = 1e-14
 
-# Probability below which recordings disagree.
+# Probability below which the test rejects that recordings agree.
 SIGNIFICANCE = 1e-3
 
-# Length of a block over the autocorrelation time of the residuals.
+# Length of an independent block over the autocorrelation time of the residuals.
 LENGTH_PER_CORRELATION_TIME = 4.0
 
 # Autocorrelation time [rows] up to which residuals count as white.
 WHITE_TIME = 1.5
 
-# Smallest number of blocks that must remain, whatever the autocorrelation time.
+# Smallest number of independent blocks, for any autocorrelation time.
 MIN_BLOCKS = 20
 
 # Number of bootstrap replicates that are computed at once.
 REPLICATES_AT_ONCE = 200
 
-# Condition of the scaled information of one recording above which it does not determine all
-# unknowns.
+# Condition number of the scaled information of one recording, above which the recording does not
+# determine all unknowns.
 MAX_CONDITION_OF_RECORDING = 1e12
 
-# Condition of the scaled information of a bootstrap draw above which it does not determine all
-# unknowns.
+# Condition number of the scaled information of a bootstrap draw, above which the draw does not
+# determine all unknowns.
 MAX_CONDITION_OF_DRAW = 1e14
 
-# Smallest variance by which is divided.
+# Smallest variance in a denominator.
 SMALLEST_VARIANCE = 1e-300
 
 
@@ -76,15 +79,15 @@ class _Blocks:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _SingleEstimates:
-    """Estimates from each of K recordings by itself.
+    """Separate estimates from each of K recordings.
 
     Attributes:
         theta: (K, c) estimates, NaN where a recording does not determine all unknowns.
         formal_variance: (K, c) formal variances.
-        variance: (K, c) variances from the scatter of the recording's own scores, infinite where
-            there is no estimate.
+        variance: (K, c) variances from the scatter of the scores within the recording, infinite
+            where there is no estimate.
         information: (c, c) information of the recordings with an estimate.
-        scores: (b, c) their scores, each recording's about its own mean.
+        scores: (b, c) scores of these recordings, less the mean of the recording.
         count: Number of recordings with an estimate.
     """
 
@@ -113,14 +116,15 @@ def robust_uncertainty(
         theta: (c,) values of the common unknowns.
         recording: (b,) index of the recording of every block of the linearisation, ascending.
         rows: (b,) number of rows of every block.
-        min_rows: Smallest number of rows of the longer blocks that count as independent.
+        min_rows: Blocks are merged to longer ones with at least this number of rows, which count as
+            independent.
         draws: Number of bootstrap replicates.
         rng: Random generator of the bootstrap.
 
     Returns:
         The uncertainty.
     """
-    # Blocks long enough to be independent.
+    # Merge blocks to longer ones that count as independent.
     label = merge_blocks(recording, rows, min_rows)
     known = condensed.reduced_private_rows
     blocks = _merged(condensed, label, recording, known)
@@ -136,7 +140,7 @@ def robust_uncertainty(
 
     replicates = _bootstrap(blocks, draws, rng)
 
-    # Each recording with the priors on its own private unknowns.
+    # Separate estimates from each recording, with the priors on its private unknowns.
     recording_of_segment = np.zeros(condensed.segment_count, dtype=int)
     recording_of_segment[condensed.segment_of_block] = recording
     recordings = range(int(blocks.recording.max()) + 1)
@@ -163,7 +167,16 @@ def _interval(
     replicates: Array,
     count: int,
 ) -> Array:
-    """(c, 2) hull of the formal interval, of the sandwich interval from `count` blocks, and of the bootstrap interval."""
+    """(c, 2) hull of the formal, the sandwich and the bootstrap interval.
+
+    Args:
+        theta: (c,) estimate.
+        formal: (c,) formal standard deviations.
+        sandwich: (c,) standard deviations of the sandwich covariance.
+        between: (c,) standard deviations between recordings.
+        replicates: (n, c) steps to the bootstrap estimates.
+        count: Number of blocks from which the sandwich covariance was computed.
+    """
     upper_tail = 0.5 + LEVEL / 2.0
     student_quantile = float(student.ppf(upper_tail, max(count - 1, 1)))
     normal_quantile = float(student.ppf(upper_tail, 1e9))
@@ -190,7 +203,7 @@ def block_length(correlation_rows: Sequence[float], rows: int) -> float:
         rows: Number of all rows.
 
     Returns:
-        Four autocorrelation times, one row for white noise; at most a twentieth of the rows.
+        Four autocorrelation times, or one row for white noise; at most a twentieth of all rows.
     """
     longest = max(correlation_rows, default=1.0)
     wanted = LENGTH_PER_CORRELATION_TIME * longest if longest > WHITE_TIME else 1.0
@@ -198,10 +211,9 @@ def block_length(correlation_rows: Sequence[float], rows: int) -> float:
 
 
 def merge_blocks(recording: np.ndarray, rows: np.ndarray, min_rows: float) -> np.ndarray:
-    """Merge blocks to longer ones: consecutive blocks of one recording with enough rows together.
+    """Merge consecutive blocks of a recording to longer blocks with enough rows.
 
-    The last one of a recording has at least half of the rows that are wanted, if the recording has
-    them.
+    The last block of a recording has at least half of `min_rows`, if the recording is that long.
 
     Args:
         recording: (b,) index of the recording of every block, ascending.
@@ -261,31 +273,39 @@ def _merged(
 
 
 def _bootstrap(blocks: _Blocks, draws: int, rng: np.random.Generator) -> Array:
-    """(n, c) Gauss-Newton steps to the estimates from drawn blocks; draws that do not determine all unknowns are left out."""
+    """(n, c) Gauss-Newton steps to the estimates from drawn blocks.
+
+    Draws that do not determine all unknowns are left out.
+    """
     count, c = blocks.scores.shape
     total = blocks.scores.sum(axis=0)
     prior_information = blocks.prior_information
     probabilities = np.full(count, 1.0 / count)
 
-    steps = []
+    steps = [np.zeros((0, c))]
     for first in range(0, draws, REPLICATES_AT_ONCE):
+        # Each replicate weights a block by the number of times that it was drawn.
         n = min(REPLICATES_AT_ONCE, draws - first)
         weights = rng.multinomial(count, probabilities, size=n).astype(np.float64)
         H = np.tensordot(weights, blocks.information, axes=1) + prior_information
+        g = weights @ blocks.scores - total
 
         # Priors are drawn as well, from their normal distribution.
         prior_noise = rng.standard_normal((n, len(blocks.prior_rows)))
-        g = weights @ blocks.scores - total + prior_noise @ blocks.prior_rows
+        g = g + prior_noise @ blocks.prior_rows
 
-        usable = _condition(H) < MAX_CONDITION_OF_DRAW
-        steps.append(-np.linalg.solve(H[usable], g[usable][..., None])[..., 0])
-    return np.concatenate(steps) if steps else np.zeros((0, c))
+        usable = _condition_number(H) < MAX_CONDITION_OF_DRAW
+        solved = np.linalg.solve(H[usable], g[usable][..., None])
+        steps.append(-solved[..., 0])
+    return np.concatenate(steps)
 
 
 def _compare_recordings(
     theta: Array, blocks: _Blocks, priors: Sequence[Array]
 ) -> tuple[Array, Array, tuple[int, ...]]:
-    """Estimates from each recording by itself, and how much they differ beyond their scatter (DerSimonian & Laird 1986).
+    """Separate estimates from each recording, and their differences beyond their scatter.
+
+    The variance between recordings is estimated by the method of DerSimonian & Laird (1986).
 
     Args:
         theta: (c,) estimate from all recordings.
@@ -298,8 +318,8 @@ def _compare_recordings(
     """
     single = _single_estimates(theta, blocks, priors)
 
-    # The scatter within a recording is at least that of all together: few blocks often scatter
-    # little by chance.
+    # The relative scatter within each recording is at least that of all recordings together,
+    # because a few blocks often scatter little by chance.
     inflation, freedom = _inflation(single)
     variance = np.maximum(single.variance, single.formal_variance * inflation)
 
@@ -310,7 +330,8 @@ def _compare_recordings(
         if estimated.sum() < 2:
             continue
 
-        # Weighted scatter of the estimates against what their variances explain.
+        # Compare the weighted scatter of the estimates with the scatter that their variances
+        # explain.
         y = single.theta[estimated, j]
         w = 1.0 / variance[estimated, j]
         mean = np.sum(w * y) / w.sum()
@@ -324,7 +345,13 @@ def _compare_recordings(
 
 
 def _single_estimates(theta: Array, blocks: _Blocks, priors: Sequence[Array]) -> _SingleEstimates:
-    """Estimates from each recording by itself, one Gauss-Newton step away from theta: (c,)."""
+    """Separate estimates from each recording, one Gauss-Newton step away from theta: (c,).
+
+    Args:
+        theta: (c,) estimate from all recordings.
+        blocks: Blocks of all recordings.
+        priors: (P_k, k, c+1) rows of the priors on the private unknowns of every recording.
+    """
     c = len(theta)
     count = len(priors)
     each = np.full((count, c), np.nan)
@@ -334,13 +361,15 @@ def _single_estimates(theta: Array, blocks: _Blocks, priors: Sequence[Array]) ->
     centred_scores = [np.zeros((0, c))]
 
     for k in range(count):
-        mine = blocks.recording == k
-        scores = blocks.scores[mine]
-        information = blocks.information[mine]
+        # Normal equations of the recording and of the priors on its private unknowns.
+        of_recording = blocks.recording == k
+        scores = blocks.scores[of_recording]
+        information = blocks.information[of_recording]
         rows = priors[k].reshape(-1, c + 1)
-        H = information.sum(axis=0) + rows[:, :-1].T @ rows[:, :-1]
-        g = scores.sum(axis=0) + rows[:, :-1].T @ rows[:, -1]
-        if _condition(H) > MAX_CONDITION_OF_RECORDING:
+        J = rows[:, :-1]
+        H = information.sum(axis=0) + J.T @ J
+        g = scores.sum(axis=0) + J.T @ rows[:, -1]
+        if _condition_number(H) > MAX_CONDITION_OF_RECORDING:
             continue
 
         inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
@@ -348,14 +377,17 @@ def _single_estimates(theta: Array, blocks: _Blocks, priors: Sequence[Array]) ->
         each[k] = theta + step
         formal[k] = np.diag(inverse)
 
-        # Scores at the recording's own estimate: differences between recordings are not scatter
-        # within one.
-        own = scores + information @ step
-        own = own - own.mean(axis=0)
-        scatter = own.T @ own * (len(own) / max(len(own) - 1, 1))
+        # Scores at the estimate from this recording, so that differences between recordings do not
+        # count as scatter within one.
+        scores = scores + information @ step
+        centred = scores - scores.mean(axis=0)
+        blocks_of_recording = len(centred)
+        correction = blocks_of_recording / max(blocks_of_recording - 1, 1)
+        scatter = centred.T @ centred * correction
         variance[k] = np.diag(inverse @ scatter @ inverse)
+
         total += H
-        centred_scores.append(own)
+        centred_scores.append(centred)
 
     return _SingleEstimates(
         theta=each,
@@ -368,18 +400,27 @@ def _single_estimates(theta: Array, blocks: _Blocks, priors: Sequence[Array]) ->
 
 
 def _inflation(single: _SingleEstimates) -> tuple[Array, int]:
-    """(c,) variances from the scatter within recordings over formal ones, at least 1, and their degrees of freedom."""
+    """(c,) ratio of the variances from the scatter within recordings to the formal variances.
+
+    The ratio is at least 1. The number of degrees of freedom of the scatter is returned as well.
+    """
     scores = single.scores
-    freedom = max(len(scores) - single.count, 1)
+    count = len(scores)
+    freedom = max(count - single.count, 1)
+    S = scores.T @ scores * (count / freedom)
+
     inverse = scaled_pseudo_inverse(single.information, INVERSE_TOLERANCE)
-    S = scores.T @ scores * (len(scores) / freedom)
-
     formal = np.maximum(np.diag(inverse), SMALLEST_VARIANCE)
-    ratio = np.diag(inverse @ S @ inverse) / formal
-    return np.asarray(np.maximum(ratio, 1.0)), freedom
+    variance = np.diag(inverse @ S @ inverse)
+
+    ratio = np.maximum(variance / formal, 1.0)
+    return np.asarray(ratio), freedom
 
 
-def _condition(H: Array) -> Array:
-    """(...) condition numbers of information matrices: (..., c, c), independent of the units of the unknowns."""
+def _condition_number(H: Array) -> Array:
+    """(...) condition numbers of information matrices: (..., c, c).
+
+    They do not depend on the units of the unknowns, because the diagonal is scaled to 1.
+    """
     scaled, _ = scaled_to_unit_diagonal(H)
     return np.asarray(np.linalg.cond(scaled))

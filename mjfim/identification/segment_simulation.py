@@ -1,4 +1,4 @@
-"""Simulation of all segments of recordings: predicted outputs at the times of the logs, and their derivatives."""
+"""Simulation of all segments: predicted outputs at the times of the recordings, and derivatives."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from mjfim.plant.delay import OutputDelay
 from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.trajectory import Trajectory
 
-# Number of simulated samples, summed over the two sides of all differences, from which differences
-# are one-sided.
+# Number of samples that one linearisation simulates, with two-sided differences, above which
+# differences are one-sided.
 SAMPLES_FOR_ONE_SIDED = 400_000
 
-# One-sided differences take this share of the step of two-sided ones.
+# Step of one-sided differences over that of two-sided ones.
 ONE_SIDED_STEP_FACTOR = 0.1
 
 
@@ -46,7 +46,11 @@ class SegmentRows:
 
     @property
     def jacobians(self) -> tuple[Array, Array]:
-        """Derivatives by theta and by the private unknowns; only for rows that were simulated with derivatives."""
+        """Derivatives by theta and by the private unknowns.
+
+        Raises:
+            ValueError: These rows were simulated without derivatives.
+        """
         if self.common is None or self.private is None:
             raise ValueError("these rows were simulated without derivatives")
         return self.common, self.private
@@ -57,7 +61,7 @@ class SegmentSimulation:
     """Predicted outputs of all segments as functions of the unknowns.
 
     Attributes:
-        system: The system, its difference steps calibrated along a recording.
+        system: The system, with difference steps calibrated along a recording.
         recordings: The K recordings on the sample grid.
         segments: The P segments.
         layout: Which parameters are common, and which are private.
@@ -111,7 +115,9 @@ class SegmentSimulation:
         return outputs
 
     def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
-        """The fitted motion of one recording on the sample grid, with its jumps from segment to segment.
+        """The fitted motion of one recording on the sample grid.
+
+        It may jump from one segment to the next.
 
         Args:
             at: The unknowns.
@@ -127,13 +133,13 @@ class SegmentSimulation:
         states = np.full((len(ctrl) + 1, plant.nominal_initial_state.size), np.nan)
         for i in self.segments_of(recording):
             segment = self.segments[i]
-            simulated = plant.simulator.rollout(
-                [model], self._initial_state(at, i)[None], self._control(i, segment.samples)[None]
-            )
+            start = self._initial_state(at, i)
+            held = self._control(i, segment.samples)
+            simulated = plant.simulator.rollout([model], start[None], held[None])
             if not simulated.finite[0]:
                 return None
 
-            # Where segments overlap by the delay of the outputs, the earlier one counts.
+            # Segments overlap where outputs are delayed; there, the earlier segment counts.
             part = states[segment.begin : segment.begin + segment.samples + 1]
             missing = np.isnan(part[:, 0])
             part[missing] = simulated.states[0][missing]
@@ -155,19 +161,18 @@ class SegmentSimulation:
         step: float = SENSITIVITY_STEP,
         by_all_parameters: bool = False,
     ) -> Iterator[SegmentRows | None]:
-        """Simulate all segments, batch by batch and stretch of time by stretch of time.
+        """Simulate all segments in batches, each batch over one interval of time after the other.
 
         Args:
             at: The unknowns.
             derivatives: Whether to compute derivatives.
             central: True for two-sided differences; default: two-sided unless there is much data.
             step: Relative step of two-sided differences.
-            by_all_parameters: Whether to differentiate by parameters that have no common columns as
-                well.
+            by_all_parameters: Whether to differentiate also by parameters without common columns.
 
         Yields:
-            Predictions of rows of one segment; None, and nothing after it, where a simulation
-            diverges.
+            Predictions of some rows of one segment. Where a simulation diverges, None is the last
+            item.
         """
         plant = self.system.plant
         wanted = self.layout.estimated
@@ -202,19 +207,30 @@ class SegmentSimulation:
                     yield None
                     return
                 for place, i in enumerate(batch):
-                    found = self._rows_of(theta, i, place, response)
+                    found = self._rows_of_segment(theta, i, place, response)
                     if found is not None:
                         yield found
 
     def _max_samples(self, simulations: int) -> int:
-        """Largest number of samples of a batch, so that its states fit into memory for that many simulations of each."""
+        """Largest number of samples of a batch whose states fit into memory.
+
+        Args:
+            simulations: Number of simulations of every segment.
+        """
         state_size = 1 + self.system.plant.nominal_initial_state.size
         numbers_per_sample = simulations * self.system.grid.substeps * state_size
         return max(MAX_NUMBERS_AT_ONCE // numbers_per_sample, 1)
 
     def _batches(self, max_samples: int) -> Iterator[tuple[int, list[int]]]:
-        """Indices of segments that are simulated together, and a recording whose parameters they have."""
-        # Without parameters of single recordings, segments of all recordings share a batch.
+        """Segments that are simulated together.
+
+        Args:
+            max_samples: Largest number of samples of a batch.
+
+        Yields:
+            Index of a recording whose parameters the segments have, and indices of the segments.
+        """
+        # Without parameters of single recordings, a batch may contain segments of all recordings.
         if not len(self.layout.per_recording):
             for batch in batches(self.segments, max_samples):
                 yield 0, batch
@@ -222,7 +238,8 @@ class SegmentSimulation:
 
         for recording in range(len(self.recordings)):
             indices = self.segments_of(recording)
-            for batch in batches([self.segments[i] for i in indices], max_samples):
+            segments = [self.segments[i] for i in indices]
+            for batch in batches(segments, max_samples):
                 yield recording, [indices[k] for k in batch]
 
     def _initial_state(self, at: UnknownValues, index: int) -> Array:
@@ -238,70 +255,90 @@ class SegmentSimulation:
         return space.plus(start, parameters.initial_state_derivative(space.nx) @ theta)
 
     def _control(self, index: int, samples: int) -> Array:
-        """(samples, nu) control from the begin of a segment; the last value is held beyond the end of the recording."""
+        """(samples, nu) control from the first sample of a segment on.
+
+        Beyond the end of the recording, the last value is held.
+        """
         segment = self.segments[index]
         recorded = self.recordings[segment.recording].ctrl
         ctrl = recorded[segment.begin : segment.begin + samples]
-        held = np.repeat(ctrl[-1:], samples - len(ctrl), axis=0)
+
+        missing = samples - len(ctrl)
+        held = np.repeat(ctrl[-1:], missing, axis=0)
         return np.concatenate([ctrl, held])
 
-    def _rows_of(
+    def _row_times(self, theta: Array, segment: Segment) -> Array:
+        """(M,) times at which the rows of a segment show its simulation [samples since its begin].
+
+        Outputs that are delayed show an earlier time. theta: (p,) parameters of the recording.
+        """
+        recording = self.recordings[segment.recording]
+        delay_samples = float(self.system.parameters.delay_derivative @ theta) / recording.dt
+        return recording.t[segment.rows] / recording.dt - segment.begin - delay_samples
+
+    def _rows_of_segment(
         self, theta: Array, index: int, place: int, response: Response
     ) -> SegmentRows | None:
-        """Predictions of the rows of a segment that lie in a stretch of time; None where there are none.
+        """Predictions of the rows of a segment inside a simulated interval; None without such rows.
 
         Args:
             theta: (p,) parameters of the recording.
             index: Index of the segment.
             place: Place of the segment in the batch.
-            response: Simulation of the batch over the stretch.
+            response: Simulation of the batch over the interval.
         """
         segment = self.segments[index]
         recording = self.recordings[segment.recording]
-        delay_derivative = self.system.parameters.delay_derivative
-        delayed = bool(delay_derivative.any())
+        times = self._row_times(theta, segment)
 
-        # Places of the rows in samples since the begin of the segment, earlier by the delay of the
-        # outputs.
-        delay_samples = float(delay_derivative @ theta) / recording.dt
-        wanted = recording.t[segment.rows] / recording.dt - segment.begin - delay_samples
-
-        # Rows in this stretch; the last stretch includes its end.
+        # Rows in this interval; the last interval includes its end.
         samples = response.y.shape[1] - 1
-        place_in_segment = np.clip(wanted, 0.0, segment.samples)
+        clipped = np.clip(times, 0.0, segment.samples)
         is_last = response.first + samples >= segment.samples
-        inside = place_in_segment >= response.first
-        inside &= (place_in_segment < response.first + samples) | is_last
+        inside = clipped >= response.first
+        inside &= (clipped < response.first + samples) | is_last
         if not inside.any():
             return None
 
-        rows = np.flatnonzero(inside) + segment.rows.start
-        wanted = wanted[inside]
+        y, common, private = self._at_times(response, place, recording, times[inside])
+        return SegmentRows(
+            segment=index,
+            rows=np.flatnonzero(inside) + segment.rows.start,
+            y=y,
+            common=common,
+            private=private,
+        )
+
+    def _at_times(
+        self, response: Response, place: int, recording: AlignedRecording, times: Array
+    ) -> tuple[Array, Array | None, Array | None]:
+        """(k, ny) outputs of a segment at some times, and their derivatives if there are any.
+
+        Args:
+            response: Simulation of a batch over an interval.
+            place: Place of the segment in the batch.
+            recording: Recording of the segment.
+            times: (k,) times of the rows [samples since the begin of the segment].
+        """
         y = response.y[place]
         common = None if response.common is None else response.common[place]
         private = None if response.private is None else response.private[place]
 
+        delay_derivative = self.system.parameters.delay_derivative
+        is_delayed = bool(delay_derivative.any())
+
         # Rows on the grid are samples of the simulation.
-        if recording.on_grid and not delayed:
-            sample = np.rint(wanted).astype(int) - response.first
-            return SegmentRows(
-                segment=index,
-                rows=rows,
-                y=y[sample],
-                common=None if common is None else common[sample],
-                private=None if private is None else private[sample],
-            )
+        if recording.on_grid and not is_delayed:
+            sample = np.rint(times).astype(int) - response.first
+            common = None if common is None else common[sample]
+            private = None if private is None else private[sample]
+            return y[sample], common, private
 
         # Other rows are interpolated between the samples; the derivative by the delay is added.
-        interpolation = OutputDelay.at(wanted - response.first, samples + 1, recording.dt)
+        interpolation = OutputDelay.at(times - response.first, len(y), recording.dt)
+        private = None if private is None else interpolation.apply(private)
         if common is not None:
             common = interpolation.apply(common)
-            if delayed:
+            if is_delayed:
                 common = common + interpolation.derivative(y)[..., None] * delay_derivative
-        return SegmentRows(
-            segment=index,
-            rows=rows,
-            y=interpolation.apply(y),
-            common=common,
-            private=None if private is None else interpolation.apply(private),
-        )
+        return interpolation.apply(y), common, private

@@ -1,8 +1,8 @@
-"""Segments of recordings for multiple shooting, and the initial state of each one.
+"""Segments of recordings for multiple shooting, and the initial state of each segment.
 
-A simulation over a whole recording amplifies what the model cannot know: chaos, slip, a push.
-Segments of a few time constants with initial states of their own do not. The state may jump from
-one segment to the next.
+A simulation over a whole recording amplifies unmodelled effects, for example chaos, slip or a push.
+Segments of a few time constants, each with a separate initial state, avoid that. The state may jump
+from one segment to the next.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording
 from mjfim.plant.outputs import outputs_by_state
 
-# Number of measured rows before and after a time through which a polynomial is fitted to find a
-# state.
+# Number of measured rows before and after a time to which a polynomial is fitted, to find the state
+# at that time.
 ROWS_PER_SIDE = 12
 
 # Smallest number of samples of a segment.
@@ -28,13 +28,13 @@ MIN_SAMPLES = 4
 # Largest ratio of the lengths of segments that are simulated in one batch.
 MAX_LENGTH_RATIO = 1.1
 
-# Smallest time [s] to which times around a segment's begin are scaled.
+# Smallest time unit [s] of the polynomial fit around the begin of a segment.
 SMALLEST_TIME = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segment:
-    """Consecutive samples of one recording that are simulated from an initial state of their own.
+    """Consecutive samples of one recording that are simulated from a separate initial state.
 
     Attributes:
         recording: Index of the recording.
@@ -76,7 +76,7 @@ def whole_recordings(recordings: Sequence[AlignedRecording], start: Array) -> tu
 def cut_into_segments(
     system: System, recordings: Sequence[AlignedRecording], length: float | None, lead: float
 ) -> tuple[Segment, ...]:
-    """Cut recordings into segments, each with the initial state that the measured values show.
+    """Cut recordings into segments, each with an initial state from the measured values.
 
     Args:
         system: System that was recorded.
@@ -86,7 +86,7 @@ def cut_into_segments(
             outputs [s].
 
     Returns:
-        The segments; parts of a recording without any row have none.
+        The segments. There is none where a recording has no rows.
 
     Raises:
         RecordingError: The length is too short.
@@ -141,9 +141,9 @@ def measured_initial_states(
 ) -> Array:
     """States at some samples according to the measured values.
 
-    Positions and velocities come from a polynomial through the rows nearby: a line through measured
-    velocities, a parabola through positions. Components that were not measured follow the model at
-    the guess.
+    Positions and velocities come from a polynomial fit to the rows nearby: a line for measured
+    velocities, a parabola for positions. Components that were not measured are those of the model
+    at the guess.
 
     Args:
         system: System that was recorded.
@@ -188,7 +188,7 @@ def measured_initial_states(
 def _local_fit(
     recording: AlignedRecording, column: int, t0: float, degree: int
 ) -> tuple[float, float]:
-    """Value and slope at time t0 [s] of a polynomial through the measured values of an output nearby."""
+    """Value and slope of an output at time t0 [s], from a polynomial fit to nearby values."""
     measured = recording.measured_rows[column]
     middle = int(np.searchsorted(measured, np.searchsorted(recording.t, t0)))
     rows = measured[max(middle - ROWS_PER_SIDE, 0) : middle + ROWS_PER_SIDE]
@@ -208,21 +208,26 @@ def _nearest_values(recording: AlignedRecording, columns: Sequence[int], t0: flo
     """Measured values of some outputs in the row nearest to time t0 [s]."""
     # Components of one quaternion are measured together.
     measured = recording.measured_rows[columns[0]]
-    after = int(np.searchsorted(measured, np.searchsorted(recording.t, t0)))
-    after = int(np.clip(after, 0, len(measured) - 1))
+    row_after = np.searchsorted(recording.t, t0)
+    after = int(np.searchsorted(measured, row_after))
+    after = min(after, len(measured) - 1)
+    before = max(after - 1, 0)
 
-    candidates = (measured[max(after - 1, 0)], measured[after])
+    candidates = (measured[before], measured[after])
     nearest = min(candidates, key=lambda row: abs(recording.t[row] - t0))
-    return np.asarray(recording.y[nearest][list(columns)])
+    return np.asarray(recording.y[nearest, list(columns)])
 
 
 def _nominal_states(system: System, recording: AlignedRecording, begins: np.ndarray) -> Array:
-    """(n, ns) states of the model at the guess from the stated start; that start itself where the model diverges."""
+    """(n, ns) states of the model at the guess, simulated from the stated initial state.
+
+    Where the model diverges, all of them are the initial state.
+    """
     start = system.plant.initial_state(system.parameters.guess)
     states = np.tile(start, (len(begins), 1))
 
-    # Nothing needs to be simulated where the whole state is measured or only the start is asked
-    # for.
+    # No simulation is needed where the whole state is measured, or where all segments begin at the
+    # first sample.
     measured = set(_measured_states(system, recording))
     if measured.issuperset(range(len(start))) or not begins.any():
         return states
@@ -234,11 +239,13 @@ def _nominal_states(system: System, recording: AlignedRecording, begins: np.ndar
 
 
 def _measured_states(system: System, recording: AlignedRecording) -> dict[int, int]:
-    """Output that measures a component of the state, by the component's address, where the recording has values of it."""
+    """Output that measures each component of the state, by the address of the component.
+
+    Outputs without any value in the recording are left out.
+    """
     outputs = outputs_by_state(system.model, system.outputs)
-    return {
-        state: output for state, output in outputs.items() if len(recording.measured_rows[output])
-    }
+    values = recording.measured_rows
+    return {state: output for state, output in outputs.items() if len(values[output])}
 
 
 def batches(segments: Sequence[Segment], max_samples: int) -> Iterator[list[int]]:

@@ -1,4 +1,4 @@
-"""The task of an identification: a system, recordings of it, and how its parameters are fitted to them."""
+"""The task of an identification: a system, its recordings, and the settings of the fit."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.residuals import FitProblem
 from mjfim.records.recording import Recording
 
-# least_squares: Levenberg-Marquardt inside the bounds; newton: the paper's Newton-Raphson without
-# bounds.
+# Method of the search. `least_squares` is Levenberg-Marquardt inside the bounds; `newton` is the
+# paper's Newton-Raphson iteration without bounds.
 Method = Literal["least_squares", "newton"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitTask:
-    """Everything that an identification needs: no horizon, no cost and no initial control.
+    """Everything that an identification needs.
+
+    It contains no horizon, no cost and no initial control, which only a design needs.
 
     Attributes:
         system: Model, parameters, outputs, noise and plant.
@@ -91,8 +93,8 @@ class FitTask:
         settings = system.experiment.fit
         if settings.noise == "estimated" and system.noise.correlated:
             raise ExperimentError(
-                f'{system.experiment.source}: fit.noise = "estimated" assumes uncorrelated outputs; '
-                "remove `correlated`"
+                f'{system.experiment.source}: fit.noise = "estimated" assumes uncorrelated '
+                "outputs; remove `correlated`"
             )
 
         return cls(
@@ -106,7 +108,7 @@ class FitTask:
 
     @property
     def noise_is_stated(self) -> bool:
-        """True where the noise is that of the experiment; False where it is estimated from the residuals."""
+        """True for the noise of the experiment; False where it is estimated from the residuals."""
         return self.settings.noise == "stated"
 
     def problem(self) -> FitProblem:

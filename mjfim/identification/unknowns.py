@@ -1,7 +1,8 @@
-"""Layout of the unknowns of a fit: shared by all recordings, of each recording, or private to each segment.
+"""Layout of the unknowns of a fit: shared by recordings, per recording, or private to segments.
 
-The common columns of a linearisation are the shared parameters, then those of the first recording,
-of the second, and so on. Deviations of initial states are the private unknowns of segments.
+The common columns of a linearisation are the parameters that all recordings share, then those of
+the first recording, then those of the second, and so on. Deviations of initial states are private
+unknowns of the segments.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class UnknownLayout:
     Attributes:
         parameters: The p parameters.
         shared: (s,) indices in theta of the parameters that all recordings share.
-        per_recording: (e,) indices in theta of the parameters that each recording has for itself.
+        per_recording: (e,) indices in theta of the parameters with a value for each recording.
         private: (n,) indices in theta of the nuisance deviations of the initial state.
         recordings: Number of recordings K.
         lower: (c,) lower bounds of the common unknowns [theta-unit].
@@ -108,7 +109,7 @@ class UnknownLayout:
         return mask
 
     def begin(self, theta: Array, segments: int, width: int) -> UnknownValues:
-        """Unknowns at given parameters, with the initial state of every segment as stated or measured.
+        """Unknowns at given parameters, with stated or measured initial states.
 
         Args:
             theta: (p,) parameter values.
@@ -131,7 +132,9 @@ class UnknownLayout:
         return np.concatenate([at.theta[self.shared], at.per_recording.ravel()])
 
     def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
-        """The unknowns after a fraction of a step; rounding does not take them out of the bounds.
+        """The unknowns after a fraction of a step.
+
+        Common unknowns are clipped to the bounds, which rounding might exceed.
 
         Args:
             at: The unknowns.
@@ -186,10 +189,14 @@ class UnknownLayout:
         return columns
 
     def prior_rows(self, at: UnknownValues) -> Array:
-        """(l, c+1) rows `[J, r]` of the stated priors on the common unknowns [standard deviations of the prior]."""
-        index = self.parameter_of_column
-        weight = np.sqrt(np.diag(self.parameters.prior_information))[index]
-        residual = weight * (self.common_values(at) - self.parameters.guess[index])
+        """(l, c+1) rows `[J, r]` of the stated priors on the common unknowns.
 
-        rows = np.column_stack([np.diag(weight), residual])
+        Residuals are in standard deviations of the prior.
+        """
+        index = self.parameter_of_column
+        information = np.diag(self.parameters.prior_information)[index]
+        weight = np.sqrt(information)
+
+        deviation = self.common_values(at) - self.parameters.guess[index]
+        rows = np.column_stack([np.diag(weight), weight * deviation])
         return np.asarray(rows[weight > 0.0])

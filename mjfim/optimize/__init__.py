@@ -3,13 +3,15 @@
 Modules:
     lq: Linear recursions, regulator and descent of time-varying linear-quadratic problems.
     projection_operator: Algorithm 1 of Wilson & Murphey, a generator of iterates on the trajectory
-    manifold. directions: Descent directions without limits: metric descent and limited-memory BFGS.
+        manifold.
+    directions: Descent directions without limits: metric descent and limited-memory BFGS.
     structured_bfgs: Descent direction under hard limits.
     quasi_newton: The two-loop recursion that both quasi-Newton directions share.
     barrier: Relaxed logarithmic barrier of numbers between bounds.
     eigenvalue_model: Model of the smooth E-criterion where eigenvalues meet.
     condensed_least_squares: Least squares with private unknowns of many segments, eliminated
-    segment by segment. levenberg_marquardt: Bounded Levenberg-Marquardt on condensed least squares.
+        segment by segment.
+    levenberg_marquardt: Bounded Levenberg-Marquardt on condensed least squares.
     robust_losses: Losses that grow more slowly than the square.
     bracketing: Search for the smallest feasible number of samples.
 """

@@ -1,11 +1,11 @@
-"""The relaxed logarithmic barrier (Hauser & Saccon 2006) of numbers between bounds.
+"""The relaxed logarithmic barrier of numbers between bounds (Hauser & Saccon 2006).
 
     beta(s) = -log s                                           for s > delta
               1/2 [((s - 2 delta) / delta)^2 - 1] - log delta  else
 
-It is twice differentiable and defined outside the bounds as well, so that a descent may begin
-there. s is the distance to a bound over half of the range: 1 in the middle of the range, where beta
-is zero.
+The relative distance s to a bound is the distance over half of the range; in the middle of the
+range, s is 1 and beta is 0. The barrier is twice differentiable, and it is defined outside the
+bounds, so that a descent may begin there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mjfim.optimize.lq import TangentCurve, Weights
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BarrierDerivatives:
-    """Barrier of some numbers r: (..., w) with its derivatives.
+    """Value and derivatives of the barrier of numbers: (..., w).
 
     Attributes:
         value: Sum of the barrier over all numbers.
@@ -163,7 +163,9 @@ class Bounds:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BarrierExpansion:
-    """Expansion of the barrier of all limits about a trajectory: its gradient and its Gauss-Newton Hessian.
+    """Expansion of the barrier of all limits about a trajectory.
+
+    It holds the gradient and the Gauss-Newton Hessian.
 
     Attributes:
         a: (N+1, nx) derivative by the state at every sample [1 / x-unit].
@@ -184,31 +186,43 @@ class BarrierExpansion:
     control_step_scale: Array
 
     def scaled(self, mu: float) -> BarrierExpansion:
-        """Expansion of mu times the barrier; the scales of the limits stay."""
+        """Expansion of mu times the barrier, with unchanged scales of the limits."""
         return replace(self, a=mu * self.a, b=mu * self.b, weights=self.weights.scaled(mu))
 
     def largest_relative_move(self, zeta: TangentCurve) -> float:
-        """Largest change of any limited quantity or control along a tangent curve, over half of its range."""
-        both = np.concatenate([zeta.z[:-1], zeta.v], axis=1)
-        observed = np.abs(np.einsum("kswi,ki->ksw", self.observations, both)).max(initial=0.0)
-        controls = np.abs(zeta.v / self.control_scale).max(initial=0.0)
-        return float(max(observed, controls))
+        """Largest change of any limited quantity or control along a tangent curve.
+
+        Changes are relative to half of the range of each quantity.
+        """
+        state_and_control = np.concatenate([zeta.z[:-1], zeta.v], axis=1)
+        changes = np.einsum("kswi,ki->ksw", self.observations, state_and_control)
+        largest_observed = np.abs(changes).max(initial=0.0)
+
+        control_changes = zeta.v / self.control_scale
+        largest_control = np.abs(control_changes).max(initial=0.0)
+        return float(max(largest_observed, largest_control))
 
     @cached_property
     def uniform_weights(self) -> Weights:
-        """Mean square over time of all relative changes along a tangent curve: the barrier's Hessian far from all bounds.
+        """Mean square over time of all relative changes along a tangent curve.
 
-        Changes of the control from sample to sample are included where they are limited.
+        It equals the barrier's Hessian far from all bounds. Changes of the control from sample to
+        sample are included where they are limited.
         """
-        N, looked, w, n = self.observations.shape
+        N, steps, w, n = self.observations.shape
         nu = len(self.control_scale)
         nx = n - nu
 
-        flat = self.observations.reshape(N, looked * w, n)
-        H = np.swapaxes(flat, 1, 2) @ flat / (N * looked)
+        # Mean over the engine steps of every sample.
+        rows = self.observations.reshape(N, steps * w, n)
+        H = np.swapaxes(rows, 1, 2) @ rows / (N * steps)
 
         Q = np.zeros((N + 1, nx, nx))
         Q[:-1] = H[:, :nx, :nx]
-        R = H[:, nx:, nx:] + np.diag(self.control_scale**-2.0 / N)
-        W = np.where(self.weights.W > 0.0, self.control_step_scale**-2.0 / N, 0.0)
+        control_weights = self.control_scale**-2.0 / N
+        R = H[:, nx:, nx:] + np.diag(control_weights)
+
+        is_limited = self.weights.W > 0.0
+        step_weights = self.control_step_scale**-2.0 / N
+        W = np.where(is_limited, step_weights, 0.0)
         return Weights(Q=Q, S=H[:, nx:, :nx], R=R, W=W)

@@ -9,30 +9,35 @@ import numpy as np
 
 from mjfim.budget import Budget
 
-# Factor between two numbers of samples where the ratio is infinite and says nothing about the
-# distance to feasibility.
+# Factor between two successive numbers of samples where the ratio is infinite, so that it does not
+# show the distance to feasibility.
 BLIND_FACTOR = 2.0
 
-# Smallest factor between the first two numbers of samples; it is squared from step to step.
+# Smallest factor between the first two numbers of samples. It is squared from step to step.
 MIN_FIRST_FACTOR = 1.05
 
-# Largest factor between two numbers of samples.
+# Largest factor between two successive numbers of samples.
 MAX_FACTOR = 4.0
 
-# Number of samples that rounding must not add or remove.
+# Number of samples by which round-off may change a number before it is rounded.
 ROUNDING_TOLERANCE = 1e-9
 
-# A candidate inside the bracket stays away from its ends by this share of the tolerance, so that
-# one evaluation may close the bracket.
+# Distance of a candidate from the ends of the bracket, relative to the tolerance. It is less than
+# 1, so that one evaluation can close the bracket.
 END_DISTANCE = 0.9
 
-# Of three candidates inside a bracket, this many come from the secant and the rest from the middle.
+# The secant and the middle of the bracket take turns in cycles of this length.
+CANDIDATE_CYCLE = 3
+
+# Number of candidates in every cycle that come from the secant; the others come from the middle.
 SECANT_TURNS = 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class SampleGrid:
-    """Numbers of samples that an experiment may have: all small ones, and multiples of a unit from some number on.
+    """Numbers of samples that an experiment may have.
+
+    Small numbers are all allowed. From `first_multiple` on, only multiples of a unit are allowed.
 
     Attributes:
         unit: Divisor of all numbers from `first_multiple` on.
@@ -71,13 +76,13 @@ def smallest_feasible(
 ) -> tuple[int | None, int | None]:
     """Find the smallest number of samples whose ratio is at most 1.
 
-    The ratio, e.g. of a reached to a required standard deviation, is assumed to fall at least like
-    the inverse square root of the number of samples. The search brackets the place where the ratio
-    is 1 and narrows the bracket by secants.
+    An example is the ratio of a reached to a required standard deviation. The ratio is assumed to
+    fall at least with the inverse square root of the number of samples. The search brackets the
+    number where the ratio is 1, and narrows the bracket by secants.
 
     Args:
-        ratio: Ratio of a number of samples; infinite where nothing is known, None where its
-            evaluation was stopped.
+        ratio: Ratio of a number of samples; infinite where a parameter is not identifiable, None
+            where its evaluation was stopped.
         first: Number of samples to begin with, on the grid.
         largest: Largest number of samples, on the grid.
         grid: Numbers that are allowed.
@@ -85,9 +90,9 @@ def smallest_feasible(
         budget: Asked before every evaluation; default: no limit.
 
     Returns:
-        The smallest number that was found feasible, or None, and the largest smaller one that was
-        found infeasible, or None. Where the search was stopped, the bracket may be wider than the
-        tolerance.
+        The smallest evaluated number that is feasible, and the largest evaluated number that is
+        infeasible; None where there is no such number. Where the search was stopped, the bracket
+        may be wider than the tolerance.
     """
     search = _Bracket(ratio, grid, Budget() if budget is None else budget)
     search.evaluate(first)
@@ -119,7 +124,7 @@ class _Bracket:
     stopped: bool = False
 
     def evaluate(self, n: int) -> None:
-        """Evaluate a number and move that end of the bracket to which it belongs."""
+        """Evaluate a number of samples and move one end of the bracket there."""
         value = None if self.budget.exhausted is not None else self.ratio(n)
         if value is None:
             self.stopped = True
@@ -132,23 +137,31 @@ class _Bracket:
             self.infeasible = n
 
     def expand(self, largest: int) -> None:
-        """Go down from a feasible number, or up from an infeasible one, until the other end of the bracket is found."""
+        """Search for the other end of the bracket.
+
+        The search goes down from a feasible number, or up from an infeasible one to the largest.
+        """
         while not self.stopped and self.infeasible is None and self.feasible is not None:
             n = self.feasible
             if n <= self.grid.minimum:
                 return
             factor = _factor(1.0 / self.known[n], len(self.known))
-            self.evaluate(self.grid.round_down(min(n * factor, n - 1)))
+            smaller = min(n * factor, n - 1)
+            self.evaluate(self.grid.round_down(smaller))
 
         while not self.stopped and self.feasible is None and self.infeasible is not None:
             n = self.infeasible
             if n >= largest:
                 return
             factor = _factor(1.0 / self.known[n], len(self.known))
-            self.evaluate(min(self.grid.round_up(max(n * factor, n + 1)), largest))
+            larger = max(n * factor, n + 1)
+            self.evaluate(min(self.grid.round_up(larger), largest))
 
     def narrow(self, tolerance: Callable[[int], int]) -> None:
-        """Evaluate numbers inside the bracket until it is as narrow as the tolerance or holds no other number."""
+        """Evaluate numbers inside the bracket until it is narrow enough.
+
+        The search ends as well where the grid has no other number inside the bracket.
+        """
         turn = 0
         while not self.stopped and self.feasible is not None and self.infeasible is not None:
             width = tolerance(self.feasible)
@@ -161,19 +174,24 @@ class _Bracket:
             turn += 1
 
     def _inside(self, low: int, high: int, width: int, turn: int) -> int | None:
-        """Next number inside the bracket, by the secant of logarithms or every third time its middle; None without any."""
-        x = float(np.sqrt(low * high))
-        secant = np.isfinite(self.known[low]) and self.known[high] < self.known[low]
-        if secant and turn % 3 < SECANT_TURNS:
-            share = np.log(self.known[low]) / np.log(self.known[low] / self.known[high])
-            x = float(low * (high / low) ** share)
+        """Next number inside the bracket; None where the grid has no number there.
 
-        # A candidate within one tolerance of an end closes the bracket if the ratio is on the
-        # expected side.
+        Args:
+            low: Lower end of the bracket, which is infeasible.
+            high: Upper end of the bracket, which is feasible.
+            width: Largest acceptable width of the bracket.
+            turn: Number of candidates before this one.
+        """
+        x = self._candidate(low, high, turn)
+
+        # A candidate that is closer to an end than the tolerance closes the bracket, if the ratio
+        # is 1 between the candidate and that end.
         if high - low > 2 * width:
-            x = float(np.clip(x, low + END_DISTANCE * width, high - END_DISTANCE * width))
+            distance = END_DISTANCE * width
+            x = float(np.clip(x, low + distance, high - distance))
 
-        n = self.grid.round_up(x) if x * x > low * high else self.grid.round_down(x)
+        is_upper_half = x * x > low * high
+        n = self.grid.round_up(x) if is_upper_half else self.grid.round_down(x)
         if n <= low:
             n = self.grid.round_up(low + 1)
         if n >= high:
@@ -181,11 +199,30 @@ class _Bracket:
 
         return n if low < n < high else None
 
+    def _candidate(self, low: int, high: int, turn: int) -> float:
+        """Root of the secant of logarithms, or the geometric mean of the bracket's ends.
+
+        The secant needs finite ratios that fall with the number of samples.
+        """
+        ratio_low = self.known[low]
+        ratio_high = self.known[high]
+        has_secant = np.isfinite(ratio_low) and ratio_high < ratio_low
+        if has_secant and turn % CANDIDATE_CYCLE < SECANT_TURNS:
+            share = np.log(ratio_low) / np.log(ratio_low / ratio_high)
+            return float(low * (high / low) ** share)
+
+        return float(np.sqrt(low * high))
+
 
 def _factor(margin: float, evaluations: int) -> float:
-    """Factor to the next number of samples: as the square root law demands, but with steps that grow with every evaluation.
+    """Factor from one number of samples to the next one.
 
-    margin: 1 over the ratio; 0 where the ratio is infinite
+    It follows the square root law, but it is at least as far from 1 as a factor that grows with
+    every evaluation.
+
+    Args:
+        margin: 1 over the ratio; 0 where the ratio is infinite.
+        evaluations: Number of evaluations so far.
     """
     if margin == 0.0:
         return BLIND_FACTOR

@@ -1,8 +1,9 @@
-"""Least squares over many segments with private unknowns, condensed so that all rows are never held at once.
+"""Condensed linear least squares over many segments with private unknowns.
 
 The whitened rows `[J_private, J_common, r]` of each block of data are reduced to a triangle with
-the same inner products (QR decomposition). The private unknowns are then eliminated segment by
-segment. The remaining problem is exact linear algebra of the size of the common unknowns.
+equal inner products (QR decomposition), so that all rows are never in memory at once. The private
+unknowns are then eliminated segment by segment. The remaining problem has the size of the common
+unknowns, and its solution is exact.
 """
 
 from __future__ import annotations
@@ -66,9 +67,10 @@ class Step:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Condensed:
-    """Linearised residuals of P segments in B blocks; every segment has n private unknowns, all share c common ones.
+    """Linearised residuals of P segments in B blocks of rows.
 
-    The number of columns is m = n + c + 1: private unknowns, common unknowns, residual.
+    Every segment has n private unknowns, and all segments share c common unknowns. The columns are
+    those of the private unknowns, of the common unknowns, and of the residual; m = n + c + 1.
 
     Attributes:
         blocks: (B, m, m) rows `[J_private, J_common, r]` of each block, condensed to a triangle.
@@ -102,28 +104,34 @@ class Condensed:
         """(P, m, m) triangle of all rows of each segment."""
         m = self.blocks.shape[1]
         counts = np.bincount(self.segment_of_block, minlength=self.segment_count)
-        most = max(int(counts.max(initial=0)), 1)
+        largest_count = max(int(counts.max(initial=0)), 1)
 
-        # Blocks sorted by segment, and the place of each one among the blocks of its segment.
+        # Blocks sorted by segment, and the place of each block among those of its segment.
         order = np.argsort(self.segment_of_block, kind="stable")
         first = np.cumsum(counts) - counts
         place = np.arange(len(order)) - np.repeat(first, counts)
+        segment = self.segment_of_block[order]
 
-        stacked = np.zeros((self.segment_count, most, m, m))
-        stacked[self.segment_of_block[order], place] = self.blocks[order]
+        stacked = np.zeros((self.segment_count, largest_count, m, m))
+        stacked[segment, place] = self.blocks[order]
 
         rows = stacked.reshape(self.segment_count, -1, m)
-        return triangle(np.concatenate([rows, self.private_rows], axis=1))
+        all_rows = np.concatenate([rows, self.private_rows], axis=1)
+        return triangle(all_rows)
 
     @cached_property
     def private_response(self) -> Array:
-        """(P, n, c) derivative of each segment's optimal private unknowns by the common unknowns."""
+        """(P, n, c) derivative of the optimal private unknowns by the common unknowns."""
         n = self.private_count
-        return np.asarray(-self._private_inverse @ self.triangles[:, :n, n:-1])
+        coupling = self.triangles[:, :n, n:-1]
+        return np.asarray(-self._private_inverse @ coupling)
 
     @cached_property
     def _private_inverse(self) -> Array:
-        """(P, n, n) pseudo-inverse of the private triangles, independent of the units of the unknowns."""
+        """(P, n, n) pseudo-inverse of the private triangles.
+
+        Columns are scaled, so that it does not depend on the units of the unknowns.
+        """
         n = self.private_count
         norms = np.maximum(self.column_norms[:n], SMALLEST_NORM)
         scaled = self.triangles[:, :n, :n] / norms
@@ -132,18 +140,17 @@ class Condensed:
         return np.asarray(inverse / norms[:, None])
 
     def reduced_rows(self) -> Array:
-        """Rows of the common unknowns after elimination of the private ones, without the `common_rows`.
+        """Rows of the common unknowns after elimination of the private ones.
 
         Returns:
-            (k, c+1) rows `[J_common, r]`.
+            (k, c+1) rows `[J_common, r]`, without the `common_rows`.
         """
         R = self.triangles
         n = self.private_count
         if not n:
             return np.asarray(R.reshape(-1, R.shape[2]))
 
-        # Rows that a segment without full rank leaves over: the least-squares step of its private
-        # unknowns does not cancel them.
+        # Where a segment has no full rank, the best private unknowns do not cancel these rows.
         private = R[:, :n, :n]
         residual = R[:, :n, -1:]
         remaining_jacobian = private @ self.private_response + R[:, :n, n:-1]
@@ -192,16 +199,23 @@ class Condensed:
 
     @cached_property
     def column_norms(self) -> Array:
-        """(n+c,) norms of the Jacobian's columns: root mean square over segments for private ones, then the common ones."""
-        squares = np.sum(self.triangles[:, :, :-1] ** 2, axis=1)
-        n = self.private_count
+        """(n+c,) norms of the Jacobian's columns, private ones first.
 
+        Those of the private unknowns are root mean squares over the segments.
+        """
+        n = self.private_count
+        J = self.triangles[:, :, :-1]
+        squares = np.sum(J**2, axis=1)
         private = squares[:, :n].mean(axis=0)
-        common = squares[:, n:].sum(axis=0) + np.sum(self.common_rows[:, :-1] ** 2, axis=0)
-        return np.asarray(np.concatenate([np.sqrt(private), np.sqrt(common)]))
+
+        common_J = self.common_rows[:, :-1]
+        common = squares[:, n:].sum(axis=0) + np.sum(common_J**2, axis=0)
+        return np.asarray(np.sqrt(np.concatenate([private, common])))
 
     def step(self, damping: float, scale: Array, lower: Array, upper: Array) -> Step:
-        """Levenberg-Marquardt step: minimiser of `|J d + r|^2 + damping |scale d|^2` with bounds on the common unknowns.
+        """Levenberg-Marquardt step, with bounds on the common unknowns.
+
+        The step d minimises `|J d + r|^2 + damping |scale d|^2`.
 
         Args:
             damping: Damping factor, 0 for a Gauss-Newton step.
@@ -239,7 +253,10 @@ class Condensed:
         return self._evaluated(common, private)
 
     def _evaluated(self, common: Array, private: Array) -> Step:
-        """A step with its lengths and the decrease that the linearisation predicts, damping left out."""
+        """A step with its lengths and the decrease that the linearisation predicts.
+
+        The damping does not count.
+        """
         R = self.triangles
         n = self.private_count
         residual = R[:, :, -1]
@@ -274,39 +291,54 @@ class Condensed:
 
     @cached_property
     def block_scores(self) -> Array:
-        """(B, c) gradient of half of each block's squares by the common unknowns, with the private ones following."""
+        """(B, c) gradient of half of each block's squares by the common unknowns.
+
+        The private unknowns follow the common ones at their optimum.
+        """
         J, r = self._reduced_blocks
-        return np.asarray((np.swapaxes(J, 1, 2) @ r)[..., 0])
+        gradient = np.swapaxes(J, 1, 2) @ r
+        return np.asarray(gradient[..., 0])
 
     @cached_property
     def block_information(self) -> Array:
-        """(B, c, c) information of each block about the common unknowns, with the private ones following."""
+        """(B, c, c) information of each block about the common unknowns.
+
+        The private unknowns follow the common ones at their optimum.
+        """
         J, _ = self._reduced_blocks
         return np.asarray(np.swapaxes(J, 1, 2) @ J)
 
     @property
     def reduced_private_rows(self) -> Array:
-        """(P, k, c+1) the `private_rows` as rows of the common unknowns, with the private ones following."""
+        """(P, k, c+1) the `private_rows` as rows of the common unknowns.
+
+        The private unknowns follow the common ones at their optimum.
+        """
         n = self.private_count
-        follow = self.private_rows[:, :, :n] @ self.private_response
-        J = self.private_rows[:, :, n:-1] + follow
-        return np.concatenate([J, self.private_rows[:, :, -1:]], axis=2)
+        rows = self.private_rows
+        through_private = rows[:, :, :n] @ self.private_response
+        J = rows[:, :, n:-1] + through_private
+        return np.concatenate([J, rows[:, :, -1:]], axis=2)
 
     @property
     def _reduced_blocks(self) -> tuple[Array, Array]:
-        """(B, m, c) Jacobian of each block by the common unknowns, the private ones following, and (B, m, 1) residuals."""
+        """(B, m, c) Jacobian of each block by the common unknowns, and its (B, m, 1) residuals.
+
+        The private unknowns follow the common ones at their optimum.
+        """
         n = self.private_count
-        follow = self.blocks[:, :, :n] @ self.private_response[self.segment_of_block]
-        J = self.blocks[:, :, n:-1] + follow
+        response = self.private_response[self.segment_of_block]
+        through_private = self.blocks[:, :, :n] @ response
+        J = self.blocks[:, :, n:-1] + through_private
         return J, self.blocks[:, :, -1:]
 
 
 def triangle(rows: Array) -> Array:
-    """Triangular factor R of the QR decomposition: few rows with the same inner products.
+    """Triangular factor R of the QR decomposition: few rows with equal inner products.
 
     Args:
-        rows: (..., k, m) rows; two-dimensional tall ones take two passes, the first over batches
-            that stay in the cache.
+        rows: (..., k, m) rows. A tall two-dimensional matrix takes two passes, the first one over
+            batches that stay in the cache.
 
     Returns:
         (..., min(k, m), m) factor R.
@@ -325,12 +357,12 @@ def _bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Ar
     """(c,) minimiser of `|A d - b|` between bounds that contain 0; A need not have full rank."""
     norms = np.maximum(np.linalg.norm(A, axis=0), SMALLEST_NORM)
 
-    # The unbounded minimum is the answer where it lies inside.
+    # The unbounded minimum is the solution where it lies inside the bounds.
     d = np.linalg.lstsq(A / norms, b)[0] / norms
     if (d >= lower).all() and (d <= upper).all():
         return np.asarray(d)
 
-    # Unknowns whose bounds coincide stay where they are: lsq_linear needs room between its bounds.
+    # Unknowns whose bounds coincide do not move: lsq_linear needs room between its bounds.
     low = np.minimum(lower, 0.0)
     high = np.maximum(upper, 0.0)
     fixed = high - low <= 0.0
@@ -350,8 +382,8 @@ def _bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Ar
         max_iter=MAX_EXCHANGES_PER_UNKNOWN * len(norms),
     )
 
-    # An unknown that the solver holds at a bound lies exactly there, whatever rounding the scaling
-    # by the norms leaves.
+    # An unknown that the solver holds at a bound is placed exactly there; the scaling by the norms
+    # has round-off.
     inside = np.clip(solved.x / norms, low, high)
     inside = np.where(solved.active_mask < 0, low, inside)
     inside = np.where(solved.active_mask > 0, high, inside)

@@ -1,4 +1,4 @@
-"""Descent directions of Algorithm 1 without limits: the paper's metric descent, its extended form, limited-memory BFGS."""
+"""Descent directions of Algorithm 1 without limits: metric descent and limited-memory BFGS."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ MIN_RELATIVE_CURVATURE = 1e-10
 
 @dataclass
 class MetricDescent:
-    """The paper's direction: it minimises `DJ.zeta + 1/2 <zeta, zeta>` over the tangent space (problem 8).
+    """The paper's direction, the solution of its problem (8).
 
-    The metric does not weigh psi. All weights are already multiplied by the sample period.
+    It minimises `DJ.zeta + 1/2 <zeta, zeta>` over the tangent space, with a metric that does not
+    weigh psi. All weights are already multiplied by the sample period.
 
     Attributes:
         Q: (nx, nx) metric on the state.
@@ -69,7 +70,10 @@ class ExtendedMetricDescent:
     terminal: Array
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """The direction, by the Riccati equations of the extended system; the projection recomputes its psi-part."""
+        """The direction, by the Riccati equations of the extended system.
+
+        Its psi-part is left out, because the projection computes psi anew.
+        """
         extended = expansion.extended
         if extended is None:
             raise ValueError(
@@ -113,10 +117,10 @@ class _Evaluated:
 
 @dataclass
 class LBFGS:
-    """Limited-memory BFGS in the curve coordinate `c = u + K x`, in which P(xi + gamma zeta) is affine in gamma.
+    """Limited-memory BFGS in the curve coordinate `c = u + K x`.
 
-    The initial Hessian is the control metric, so that the number of iterations does not depend on
-    the sample period.
+    In this coordinate, P(xi + gamma zeta) is affine in gamma. The initial Hessian is the control
+    metric, so that the number of iterations does not depend on the sample period.
 
     Attributes:
         R: (nu, nu) control metric, already multiplied by the sample period.
@@ -135,7 +139,10 @@ class LBFGS:
         return expansion.lift(K, c)
 
     def _initial(self, g: Array) -> Array:
-        """(N, nu) initial inverse Hessian times g: (N, nu): the inverse metric, scaled by the newest pair."""
+        """(N, nu) product of the initial inverse Hessian with g: (N, nu).
+
+        The initial inverse Hessian is the inverse metric, scaled by the newest pair.
+        """
         scaled = self._inverse_metric(g)
         if self._pairs:
             newest = self._pairs[-1]
@@ -178,8 +185,8 @@ class LBFGS:
     def refined(self, R: Array, factor: int) -> LBFGS:
         """A direction with this memory on a finer grid of samples.
 
-        A step s is held over the finer samples; y is an integral over a sample and is divided among
-        them.
+        A step s is held over the finer samples. The change of the gradient y is an integral over a
+        sample, so it is divided among the finer samples.
 
         Args:
             R: (nu, nu) control metric, multiplied by the finer sample period.

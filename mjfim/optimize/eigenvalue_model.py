@@ -1,13 +1,13 @@
-"""A model of the smooth E-criterion that knows how eigenvalues repel each other and exchange their eigenvectors.
+"""A model of the smooth E-criterion that includes the interaction of close eigenvalues.
 
-With the r smallest eigenvalues Lambda and their vectors w_i, a step s changes the information by
-`B_ij = d(w_i' I w_j).s`, also off the diagonal. The model takes `log I` as linear in the step,
+With the r smallest eigenvalues Lambda and their eigenvectors w_i, a step s changes the information
+by `B_ij = d(w_i' I w_j).s`, also off the diagonal. The model assumes that `log I` is linear in s:
 
     h(s) = 1/q log tr exp(-q (log Lambda + B(s))).
 
-It is exact to first order, convex, and stiff where the criterion is: where eigenvalues meet. Larger
-eigenvalues are left out: holding them constant would stop a step where the smallest ones reach
-them, although they change as well.
+It is exact to first order and convex. Its curvature is large where eigenvalues meet, like that of
+the criterion. Larger eigenvalues are left out. If the model held them constant, it would stop a
+step where the smallest eigenvalues reach them, although the larger ones change as well.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-# Off-diagonal entries count twice in the scalar product of symmetric matrices.
+# Weight of off-diagonal entries in the coordinates of a symmetric matrix; these entries count twice
+# in the scalar product of matrices.
 SQRT_2 = np.sqrt(2.0)
 
 # Largest number of Newton steps of the proximal problem.
@@ -27,7 +28,7 @@ MAX_NEWTON_STEPS = 50
 # Gradient of the proximal problem, relative to its solution, below which it is solved.
 NEWTON_TOLERANCE = 1e-10
 
-# Share of the predicted decrease that a Newton step has to reach (Armijo's rule).
+# Smallest accepted share of the predicted decrease of a Newton step (Armijo's rule).
 SUFFICIENT_DECREASE = 1e-4
 
 # Shortest fraction of a Newton step.
@@ -84,23 +85,26 @@ class EigenvalueModel:
 
     def _value_and_gradient(self, d: Array) -> tuple[float, Array]:
         """The model, up to a constant, and its gradient: (m,), at coordinates d: (m,)."""
-        # Eigenvalues relative to the smallest one, so that the exponentials neither overflow nor
-        # vanish.
         logs = np.log(self.eigenvalues / self.eigenvalues[0])
         changed = np.diag(logs) + symmetric_matrix(d, len(logs))
-        moved, vectors = np.linalg.eigh(changed)
-        shares = np.exp(-self.power * (moved - moved[0]))
-        total = shares.sum()
+        changed_logs, vectors = np.linalg.eigh(changed)
+        smallest = changed_logs[0]
 
-        value = self.weight * float(np.log(total) / self.power - moved[0])
-        P = (vectors * (shares / total)) @ vectors.T
-        return value, -self.weight * symmetric_coordinates(P)
+        # The smallest eigenvalue is factored out, so that the exponentials neither overflow nor
+        # vanish.
+        exponentials = np.exp(-self.power * (changed_logs - smallest))
+        total = exponentials.sum()
+        log_sum = float(np.log(total) / self.power - smallest)
+
+        shares = exponentials / total
+        P = (vectors * shares) @ vectors.T
+        return self.weight * log_sum, -self.weight * symmetric_coordinates(P)
 
     def minimising_gradient(self, d0: Array, spread: Array) -> Array:
         """Gradient of the model at the minimum of `h(d) + 1/2 (d - d0)' spread^-1 (d - d0)`.
 
-        There `d = d0 - spread w` with the returned gradient w. Newton's method in y with `d = d0 +
-        L y` and `L L' = spread` also works where spread is singular.
+        With the returned gradient w, the minimum is `d = d0 - spread w`. Newton's method is applied
+        to y in `d = d0 + L y`, with `L L' = spread`, which also works where spread is singular.
 
         Args:
             d0: (m,) centre of the proximal term.
@@ -125,7 +129,15 @@ class EigenvalueModel:
         return self.gradient(d0 + L @ y)
 
     def _line_search(self, y: Array, step: Array, slope: float, L: Array, d0: Array) -> Array:
-        """(m,) the point after a step: (m,) that is halved until the proximal objective falls sufficiently."""
+        """(m,) point after a step that is halved until the proximal objective falls sufficiently.
+
+        Args:
+            y: (m,) point at which the step begins.
+            step: (m,) Newton step.
+            slope: Directional derivative of the objective along the step, negative.
+            L: (m, m) square root of spread.
+            d0: (m,) centre of the proximal term.
+        """
         here = self._proximal_objective(y, L, d0)
         fraction = 1.0
         while fraction > MIN_NEWTON_FRACTION:
@@ -141,12 +153,15 @@ class EigenvalueModel:
         return self._value_and_gradient(d0 + L @ y)[0] + 0.5 * float(y @ y)
 
     def _hessian(self, d: Array) -> Array:
-        """(m, m) Hessian at d: (m,) by central differences of the gradient; with so few coordinates this is the fastest way."""
+        """(m, m) Hessian at d: (m,), by central differences of the gradient.
+
+        Differences are fast enough, because there are few coordinates.
+        """
         h = DIFFERENCE_STEP / max(1.0, self.power)
-        rows = [
-            (self.gradient(d + move) - self.gradient(d - move)) / (2.0 * h)
-            for move in h * np.eye(len(d))
-        ]
+        rows = []
+        for move in h * np.eye(len(d)):
+            change = self.gradient(d + move) - self.gradient(d - move)
+            rows.append(change / (2.0 * h))
         return np.stack(rows)
 
 
@@ -184,7 +199,9 @@ def symmetric_coordinates(full: Array) -> Array:
 
 
 def divided_log_differences(values: Array) -> Array:
-    """Divided differences of the logarithm, which turn a change of a matrix into the change of its logarithm.
+    """Divided differences of the logarithm of eigenvalues.
+
+    They turn the change of a matrix into the change of its logarithm.
 
     Args:
         values: (r,) positive eigenvalues.

@@ -1,8 +1,9 @@
-"""Levenberg-Marquardt within bounds on condensed least squares, and the undamped Gauss-Newton method of the paper.
+"""Levenberg-Marquardt inside bounds, and undamped Gauss-Newton, on condensed least squares.
 
-The module knows arrays and one protocol, not MuJoCo. The damping follows the ratio of the actual to
-the predicted decrease of the cost (Nielsen 1999). Bounds hold in every step, because each step is
-solved as a bounded linear least-squares problem.
+Gauss-Newton is the method of the paper. The damping of Levenberg-Marquardt follows the ratio of the
+actual to the predicted decrease of the cost (Nielsen 1999). Bounds hold in every step, because each
+step is the solution of a bounded linear least-squares problem. The module knows arrays and one
+protocol, not MuJoCo.
 """
 
 from __future__ import annotations
@@ -29,20 +30,21 @@ MAX_DAMPING = 1e12
 # Damping never falls below this value, so that it can still grow by multiplication.
 MIN_DAMPING = 1e-15
 
-# Smallest damping from which it grows after a rejected step.
+# Smallest value from which the damping grows after a rejected step.
 MIN_RAISED_DAMPING = 1e-12
 
 # Ratio of the actual to the predicted decrease below which a step is rejected.
 MIN_DECREASE_RATIO = 1e-4
 
-# Ratio of the actual to the predicted decrease beyond which it no longer changes the damping.
+# Ratio of the actual to the predicted decrease, above which a larger one does not change the
+# damping further.
 MAX_DECREASE_RATIO = 10.0
 
 # Decrease of the cost, relative to the cost, below which an iteration counts as stagnant.
 RELATIVE_STAGNATION = 1e-6
 
-# Decrease of the cost below which an iteration counts as stagnant; about a seventh of a standard
-# deviation, squared.
+# Decrease of the cost below which an iteration counts as stagnant. A step to the minimum that is
+# 0.14 standard deviations long lowers the cost by this much.
 ABSOLUTE_STAGNATION = 1e-2
 
 # Share of the predicted decrease below which an iteration counts as stagnant.
@@ -51,19 +53,21 @@ PREDICTED_STAGNATION = 0.1
 # Number of consecutive stagnant iterations after which the search ends.
 MAX_STAGNANT_ITERATIONS = 3
 
-# Length of a step [standard deviations] that the roughness of a simulation can explain: a step of
-# this length that is predicted but not found does not speak against convergence.
+# Length of a step [standard deviations] that the roughness of a simulation can explain. Where a
+# predicted step is shorter and does not lower the cost, the search has converged.
 SHORT_STEP = 0.3
 
-# A predicted step may exceed the step that was taken by this factor and still count as taken
-# completely.
+# A step is complete if the predicted step is shorter than this multiple of it.
 COMPLETE_STEP = 1.1
 
-# Private unknowns count as converged when their steps are below this multiple of the tolerance.
+# Private unknowns have converged when their steps are below this multiple of the tolerance.
 PRIVATE_TOLERANCE = 10.0
 
-# Fraction of a Gauss-Newton step below which halving it further is useless.
+# Smallest fraction of a Gauss-Newton step that is tried.
 MIN_FRACTION = 1e-8
+
+# Smallest predicted decrease in the denominator of the decrease ratio.
+SMALLEST_DECREASE = 1e-300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,7 +78,7 @@ class UnknownValues:
         theta: (p,) parameters that all recordings share; entries that are private or per recording
             are unused.
         private: (P, n) private unknowns of each segment, e.g. its initial state.
-        per_recording: (K, e) parameters that each recording has for itself.
+        per_recording: (K, e) parameters with a value for each recording.
     """
 
     theta: Array
@@ -83,7 +87,11 @@ class UnknownValues:
 
 
 class Problem(Protocol):
-    """Least-squares cost, half of the sum of squares, as a function of the unknowns."""
+    """Least-squares cost as a function of the unknowns.
+
+    The cost is half of the sum of squared residuals and priors; a robust loss may replace the
+    square.
+    """
 
     @property
     def lower(self) -> Array:
@@ -94,10 +102,10 @@ class Problem(Protocol):
         """(c,) upper bounds of the common unknowns, inf without a bound."""
 
     def cost(self, at: UnknownValues) -> float:
-        """Half of the loss of the residuals and of the squared priors; infinite where a simulation diverges."""
+        """Half of the sum of squares; infinite where a simulation diverges."""
 
     def condense(self, at: UnknownValues) -> Condensed | None:
-        """Linearisation of the residuals about the unknowns; None where a perturbed simulation diverges."""
+        """Linearisation about the unknowns; None where a perturbed simulation diverges."""
 
     def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
         """The unknowns after a fraction of a step, inside the bounds."""
@@ -129,7 +137,7 @@ class Solution:
         unknowns: Best values that were found.
         condensed: Linearisation at the unknowns, or less than one tolerance away from them.
         cost: Cost at the unknowns.
-        iterations: Number of iterations that were begun.
+        iterations: Number of iterations, including the last incomplete one.
         success: True where the search converged.
         status: Sentence that says why the search ended.
         interrupted: True where the stop token ended the search.
@@ -154,8 +162,7 @@ class SearchSettings:
         damped: True for Levenberg-Marquardt inside the bounds, False for Gauss-Newton without
             bounds.
         relinearise_at_end: Whether to linearise once more at the solution. False saves one
-            linearisation and lets the search end when the next step is predicted to be below the
-            tolerance.
+            linearisation: the search ends when the next step is expected to be below the tolerance.
     """
 
     max_iterations: int = 60
@@ -293,7 +300,10 @@ class _Search:
         return self._linearise()
 
     def _accepted_trial(self) -> _Trial | Solution:
-        """Raise the damping until a step lowers the cost; a solution where none does or the budget is exhausted."""
+        """Raise the damping until a step lowers the cost.
+
+        Return a solution where no step lowers it, or where the budget is exhausted.
+        """
         while True:
             trial = self._trial()
 
@@ -313,7 +323,10 @@ class _Search:
                 return self._stopped(reason)
 
     def _trial(self) -> _Trial:
-        """Evaluate a step with the current damping; without damping, halve it while it raises the cost."""
+        """Evaluate a step with the current damping.
+
+        Without damping, the step is halved while it raises the cost.
+        """
         step = self._step(self.damping)
         fraction = 1.0
 
@@ -326,7 +339,7 @@ class _Search:
                 break
             fraction *= 0.5
 
-        ratio = (self.cost - cost) / max(step.predicted_decrease, 1e-300)
+        ratio = (self.cost - cost) / max(step.predicted_decrease, SMALLEST_DECREASE)
         return _Trial(
             step=step,
             unknowns=unknowns,
@@ -348,9 +361,9 @@ class _Search:
         return self.condensed.step(damping, self.scale, lower, upper)
 
     def _predicted_step(self) -> Step:
-        """Step to the minimum of the linearised cost.
+        """Step to the minimum of the linearised cost, without damping.
 
-        Damped steps are short everywhere and do not show how far it is.
+        A damped step may be short far from the minimum, so its length does not show convergence.
         """
         return self._step(WEAK_DAMPING if self.settings.damped else 0.0)
 
@@ -362,7 +375,7 @@ class _Search:
         )
 
     def _stagnates(self, trial: _Trial, predicted: Step) -> bool:
-        """Count consecutive iterations that hardly lower the cost; True when there were too many."""
+        """Count consecutive iterations that hardly lower the cost; True after too many of them."""
         negligible = min(
             RELATIVE_STAGNATION * self.cost,
             ABSOLUTE_STAGNATION,
@@ -393,7 +406,10 @@ class _Search:
         )
 
     def _next_step_is_small(self, step: Step, predicted: Step) -> bool:
-        """Whether the next step will be below the tolerance: Gauss-Newton steps shrink quadratically near the minimum."""
+        """Whether the next step is expected to be below the tolerance.
+
+        Gauss-Newton steps shrink quadratically near the minimum.
+        """
         length = step.common_length
         next_length = np.inf
         if self.previous_length > 0.0:
@@ -415,7 +431,10 @@ class _Search:
             )
 
     def _relax_damping(self, ratio: float) -> None:
-        """Lower or raise the damping by the ratio of actual to predicted decrease (Nielsen 1999, eq. 2.5)."""
+        """Adapt the damping to the ratio of actual to predicted decrease.
+
+        Source: Nielsen (1999), eq. 2.5.
+        """
         if not self.settings.damped:
             return
 
@@ -424,7 +443,10 @@ class _Search:
         self.damping_growth = 2.0
 
     def _linearise(self) -> Solution | None:
-        """Linearise at the current point; a solution where that is impossible or the budget is exhausted."""
+        """Linearise at the current point.
+
+        Return a solution where a simulation diverges, or where the budget is exhausted.
+        """
         if (reason := self.budget.exhausted) is not None:
             return self._stopped(reason)
 

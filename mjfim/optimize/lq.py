@@ -1,7 +1,7 @@
-"""Time-varying linear-quadratic problems on arrays: linear recursions, regulator and constrained descent.
+"""Time-varying linear-quadratic problems: linear recursions, regulator and descent.
 
-A linear recursion over all samples is a unit-triangular banded system. One BLAS call solves it,
-without a Python loop.
+A linear recursion over all samples is a banded system with a unit triangular matrix. One BLAS call
+solves it, without a Python loop.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ class LinearRecursion:
 
     @cached_property
     def _banded_matrix(self) -> Array:
-        """(2n, (N+1) n) the recursion's unit lower triangular matrix, in LAPACK's storage of banded matrices."""
+        """(2n, (N+1) n) the unit lower triangular matrix of the recursion.
+
+        It is stored by diagonals, as LAPACK stores banded matrices.
+        """
         N, n, _ = self.A.shape
         band = np.zeros((2 * n, (N + 1) * n), order="F")
         band[0] = 1.0
@@ -66,11 +69,17 @@ class LinearRecursion:
         return self._solve(a, transposed=True)
 
     def _solve(self, rhs: Array, transposed: bool) -> Array:
-        """(N+1, n) solution of the banded system, or of its transpose, for a right-hand side: (N+1, n)."""
+        """(N+1, n) solution of the banded system, or of its transpose.
+
+        Args:
+            rhs: (N+1, n) right-hand side.
+            transposed: Whether to solve the transposed system.
+        """
         N, n, _ = self.A.shape
         if rhs.shape != (N + 1, n):
             raise ValueError(
-                f"a recursion over {N} samples of {n} needs {(N + 1, n)} numbers, got {rhs.shape}"
+                f"the right-hand side has shape {rhs.shape}; "
+                f"a recursion over {N} samples of {n} states needs {(N + 1, n)}"
             )
 
         flat = np.array(rhs, dtype=np.float64).reshape(-1)
@@ -88,13 +97,15 @@ class LinearRecursion:
 
 
 def largest_amplification(A: Array) -> float:
-    """Largest amplification of a unit deviation, from the start to any sample or from any sample to the end.
+    """Largest amplification of a deviation of the state.
+
+    Deviations from the first to any sample and from any to the last sample are examined.
 
     Args:
         A: (N, nx, nx) transition matrices.
 
     Returns:
-        The largest spectral norm of these transition matrices; at least 1.
+        The largest spectral norm of the products of these transition matrices; at least 1.
     """
     N, nx, _ = A.shape
     recursion = LinearRecursion(A)
@@ -112,7 +123,10 @@ def largest_amplification(A: Array) -> float:
 
 
 def _solve_positive_definite(S: Array, rhs: Array) -> Array:
-    """S^-1 rhs for a small symmetric positive definite matrix, without the overhead of NumPy's checks."""
+    """Product S^-1 rhs for a small symmetric positive definite matrix S.
+
+    LAPACK is called directly, because the checks of NumPy take longer than the solution.
+    """
     _, x, info = dposv(S, rhs)
     if info != 0:
         raise np.linalg.LinAlgError(
@@ -169,9 +183,13 @@ class TangentCurve:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Weights:
-    """A quadratic form on tangent curves: `sum_k z_k' Q_k z_k + 2 v_k' S_k z_k + v_k' R_k v_k + W_k (v_k - v_{k-1})^2`.
+    """A quadratic form on tangent curves (z, v).
 
-    The control before the first and after the last sample does not change.
+    It is the sum over all samples k of
+
+        z_k' Q_k z_k + 2 v_k' S_k z_k + v_k' R_k v_k + W_k (v_k - v_{k-1})^2,
+
+    where v is zero before the first and after the last sample.
 
     Attributes:
         Q: (N+1, nx, nx) weights of the state.
@@ -207,7 +225,9 @@ class Weights:
         return Weights(Q=factor * self.Q, S=factor * self.S, R=factor * self.R, W=factor * self.W)
 
     def half_gradient(self, zeta: TangentCurve) -> tuple[Array, Array]:
-        """Half of the form's gradient at a tangent curve: `<zeta, other> = sum a'z + b'v` for any other curve (z, v).
+        """Half of the form's gradient (a, b) at a tangent curve zeta.
+
+        The inner product of zeta with any tangent curve (z, v) is `sum a'z + b'v`.
 
         Args:
             zeta: The tangent curve.
@@ -220,16 +240,19 @@ class Weights:
 
         a = np.einsum("kij,kj->ki", self.Q, z)
         a[:-1] += np.einsum("kui,ku->ki", self.S, v)
-        b = np.einsum("kui,ki->ku", self.S, z[:-1]) + np.einsum("kuw,kw->ku", self.R, v)
+        b = np.einsum("kui,ki->ku", self.S, z[:-1])
+        b += np.einsum("kuw,kw->ku", self.R, v)
 
-        steps = self.W * np.diff(v, axis=0, prepend=0.0, append=0.0)
-        return a, b + steps[:-1] - steps[1:]
+        # A change of the control between two samples involves both of them.
+        changes = np.diff(v, axis=0, prepend=0.0, append=0.0)
+        weighted = self.W * changes
+        return a, b + weighted[:-1] - weighted[1:]
 
 
 def descent(
     A: Array, B: Array, a: Array, b: Array, *, Q: Array, R: Array, terminal: Array
 ) -> TangentCurve:
-    """Steepest descent on the tangent space: the paper's problem (8), solved by its Riccati equations.
+    """Steepest descent on the tangent space: the paper's problem (8), by Riccati equations.
 
     It minimises `sum a'z + b'v + 1/2 z'Qz + 1/2 v'Rv` subject to `z_{k+1} = A_k z_k + B_k v_k` and
     `z_0 = 0`.
@@ -258,11 +281,11 @@ def descent(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RiccatiSolution:
-    """Factored linear-quadratic problem with weights that vary over time, for any number of linear costs.
+    """Factored linear-quadratic problem with weights that vary over time.
 
-    After the Riccati equations are solved once, a descent needs two banded systems. With weights on
-    the control's changes, the state of the problem is extended by the control of the previous
-    sample; n is its size then, else nx.
+    The Riccati equations are solved once; the minimiser of any linear cost then needs only two
+    banded systems. With weights on the control's changes, the state of the problem is extended by
+    the control of the previous sample, and its size n is nx + nu; otherwise, n is nx.
 
     Attributes:
         K: (N, nu, n) feedback gain.
@@ -348,35 +371,48 @@ class RiccatiSolution:
 
 
 def _with_previous_control(A: Array, B: Array, weights: Weights) -> tuple[Array, Array, Weights]:
-    """The problem with the state extended by the previous control, which turns weights on its changes into ordinary ones.
+    """The problem with the state extended by the previous control.
 
-    A: (N, nx, nx);  B: (N, nx, nu). Returns matrices of the state (x_k, v_{k-1}) and weights
-    without W.
+    Weights on changes of the control become weights on the extended state.
+
+    Args:
+        A: (N, nx, nx) transition matrices.
+        B: (N, nx, nu) input matrices.
+        weights: Quadratic form with weights W on changes of the control.
+
+    Returns:
+        Transition and input matrices of the state (x_k, v_{k-1}), and the form without W.
     """
     N, nx, nu = B.shape
+    n = nx + nu
     unit = np.eye(nu)
-    steps = unit * weights.W[:, None]
+    change_weights = unit * weights.W[:, None]
 
-    wide_A = np.zeros((N, nx + nu, nx + nu))
+    # Dynamics of the extended state; its last part becomes the present control.
+    wide_A = np.zeros((N, n, n))
     wide_A[:, :nx, :nx] = A
-    wide_B = np.zeros((N, nx + nu, nu))
+    wide_B = np.zeros((N, n, nu))
     wide_B[:, :nx] = B
     wide_B[:, nx:] = unit
 
-    Q = np.zeros((N + 1, nx + nu, nx + nu))
+    # Terms of W (v_k - v_{k-1})^2 with the previous control, with both, and with the present one.
+    Q = np.zeros((N + 1, n, n))
     Q[:, :nx, :nx] = weights.Q
-    Q[:, nx:, nx:] = steps
-    S = np.zeros((N, nu, nx + nu))
+    Q[:, nx:, nx:] = change_weights
+    S = np.zeros((N, nu, n))
     S[:, :, :nx] = weights.S
-    S[:, :, nx:] = -steps[:-1]
+    S[:, :, nx:] = -change_weights[:-1]
+    R = weights.R + change_weights[:-1]
 
-    wide = Weights(Q=Q, S=S, R=weights.R + steps[:-1], W=np.zeros_like(weights.W))
+    wide = Weights(Q=Q, S=S, R=R, W=np.zeros_like(weights.W))
     return wide_A, wide_B, wide
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CurveCoordinates:
-    """Tangent curves in the curve coordinate `c = v + K z`, in which the projection operator is affine.
+    """Tangent curves in the curve coordinate `c = v + K z`.
+
+    In this coordinate, the projection operator is affine.
 
     Attributes:
         A: (N, nx, nx) transition matrices of the trajectory.
@@ -419,7 +455,8 @@ class CurveCoordinates:
         """
         inputs = np.einsum("kiu,ku->ki", self.B, c)
         z = self._closed_loop.forward(np.zeros(self.A.shape[1]), inputs)
-        return TangentCurve(z=z, v=c - np.einsum("kui,ki->ku", self.K, z[:-1]))
+        feedback = np.einsum("kui,ki->ku", self.K, z[:-1])
+        return TangentCurve(z=z, v=c - feedback)
 
     def coordinate(self, zeta: TangentCurve) -> Array:
         """(N, nu) curve coordinate `c = v + K z` of a tangent curve."""

@@ -1,7 +1,7 @@
 """Algorithm 1 of Wilson & Murphey: descent on the trajectory manifold with the projection operator.
 
-The module knows arrays and two protocols, neither MuJoCo nor Fisher information. The loop is a
-generator of iterates; progress bars, logs, checkpoints and early stops consume it.
+The loop is a generator of iterates, which progress bars, logs, checkpoints and early stops consume.
+The module knows arrays and two protocols, neither MuJoCo nor Fisher information.
 """
 
 from __future__ import annotations
@@ -20,33 +20,35 @@ from mjfim.records.design import Status
 
 P = TypeVar("P")
 
-# Predicted decrease, relative to the cost, that round-off hides.
+# Predicted decrease, relative to the cost, below which round-off hides the actual decrease.
 ROUND_OFF = 1e-12
 
-# A step is shortened at least to this fraction of its predecessor in the line search; the largest
-# fraction is a setting.
+# Smallest factor by which the line search shortens a rejected step; the largest factor is a
+# setting.
 MIN_SHORTENING = 0.1
 
-# Largest predicted decrease of the first step length that is tried, relative to the scale of the
-# cost.
+# Largest predicted decrease of the first trial step, relative to the scale of the cost.
 MAX_PREDICTED_DECREASE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Expansion:
-    """First-order model of the cost on the tangent space: `DJ.zeta = sum a'z + b'v` with `z_{k+1} = A_k z_k + B_k v_k`.
+    """First-order model of the cost on the tangent space.
+
+    The derivative of the cost along (z, v) is `DJ.zeta = sum a'z + b'v` with
+    `z_{k+1} = A_k z_k + B_k v_k`.
 
     Attributes:
         A: (N, nx, nx) derivative of the next state by the state.
         B: (N, nx, nu) derivative of the next state by the control [x-unit / u-unit].
         a: (N+1, nx) derivative of the cost by the state [1 / x-unit].
         b: (N, nu) derivative of the cost by the control [1 / u-unit].
-        extended: Expansion with psi among the states, nx (1+p) of them, for a metric with weight on
-            psi; else None.
-        barrier: The barrier's share of a and b, with its Gauss-Newton Hessian, or None without
-            limits.
-        eigenvalue_model: Model of the logarithm of the cost that is better than linear, where a and
-            b belong to that logarithm; else None.
+        extended: Expansion with psi among its nx (1+p) states, for a metric with weight on psi;
+            otherwise None.
+        barrier: Part of a and b that comes from the barrier, with the barrier's Gauss-Newton
+            Hessian; None without limits.
+        eigenvalue_model: Model of the logarithm of the cost that is better than linear, if a and b
+            are derivatives of that logarithm; otherwise None.
     """
 
     A: Array
@@ -88,11 +90,11 @@ class Expansion:
 class Problem(Protocol[P]):
     """Cost and dynamics as Algorithm 1 needs them.
 
-    A point P is a trajectory with all that was computed along it.
+    A point P is a trajectory together with everything that was computed along it.
     """
 
     def value(self, point: P) -> float:
-        """Cost J at a point; infinite where the trial diverged."""
+        """Cost J at a point; infinite where its simulation diverged."""
         ...
 
     def size(self, point: P) -> float:
@@ -112,7 +114,7 @@ class Problem(Protocol[P]):
         ...
 
     def refine(self, point: P) -> P | None:
-        """This trajectory with more accurate derivatives, or None where they are the most accurate already."""
+        """The point with more accurate derivatives; None where there are no more accurate ones."""
         ...
 
 
@@ -124,7 +126,13 @@ class Direction(Protocol):
         ...
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Learn from a step: the expansion at the new point, and the difference from the old point to it."""
+        """Learn from an accepted step.
+
+        Args:
+            expansion: Expansion at the new point.
+            K: (N, nu, nx) gain of the projection operator.
+            moved: Difference between the new and the old point.
+        """
         ...
 
     def reset(self) -> bool:
@@ -140,7 +148,7 @@ class Armijo:
     J(gamma), within [0.1, beta] gamma.
 
     Attributes:
-        sigma: Share of the predicted decrease that a step has to reach.
+        sigma: Smallest accepted share of the predicted decrease.
         beta: Largest factor by which a rejected step is shortened.
         trials: Largest number of steps that are tried.
     """
@@ -187,8 +195,8 @@ class Armijo:
             if new <= value + self.sigma * gamma * slope:
                 return trial, gamma
 
-            # Minimum of the parabola; a diverged trial gives none and is shortened as far as
-            # allowed.
+            # Minimum of the parabola. A diverged trial has none; its step is shortened as much as
+            # possible.
             excess = new - value - gamma * slope
             shorter = 0.0
             if np.isfinite(new) and excess > 0.0:
@@ -221,16 +229,15 @@ class Iterate(Generic[P]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Regulator:
-    """Makes the gain K of the projection operator as a linear-quadratic regulator along the trajectory.
+    """Linear-quadratic regulator along a trajectory, the gain K of the projection operator.
 
     Attributes:
         Q: (nx, nx) weight of the state, multiplied by the sample period.
         R: (nu, nu) weight of the control, multiplied by the sample period.
         terminal: (nx, nx) weight of the last state.
         period: Number of iterates after which K is renewed.
-        feedback_threshold: K is zero where no deviation is amplified by more than this along the
-            open-loop trajectory, because the projection needs no feedback there. 0 always gives
-            feedback.
+        feedback_threshold: Amplification of deviations along the open-loop trajectory, up to which
+            the projection needs no feedback and K is zero. With 0 there is always feedback.
     """
 
     Q: Array
@@ -310,14 +317,15 @@ def optimize(
 
         yield iterate
 
-        # The linear model is wrong for a step that predicts a decrease of more than twice J: begin
-        # with a shorter one.
+        # The linear model is wrong for a step that predicts a decrease of more than twice J. The
+        # line search begins with a shorter step then.
         found = None
         if slope < 0.0:
             first = min(1.0, -MAX_PREDICTED_DECREASE * size / slope)
             found = armijo.search(problem, point, zeta, slope, K, first)
 
-        # If no step length lowers J: refine the derivatives, then clear the memory, then end.
+        # If no step length lowers J: refine the derivatives; if that is impossible, clear the
+        # memory of the direction; if it is empty, end.
         if found is None:
             better = problem.refine(point)
             if better is not None:

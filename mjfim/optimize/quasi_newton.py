@@ -1,4 +1,7 @@
-"""The two-loop recursion of limited-memory BFGS (Nocedal & Wright, Numerical Optimization, algorithm 7.4)."""
+"""The two-loop recursion of limited-memory BFGS.
+
+Source: Nocedal & Wright, Numerical Optimization, algorithm 7.4.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ class CurvaturePair:
 
     @staticmethod
     def where_convex(s: Array, y: Array, tolerance: float) -> CurvaturePair | None:
-        """The pair of a step and a change of the gradient, or None where its curvature is not clearly positive.
+        """The pair of a step and a change of the gradient, if its curvature is clearly positive.
 
         Args:
             s: (...) step.

@@ -1,4 +1,7 @@
-"""Robust losses of whitened residuals, with the names and formulas of `scipy.optimize.least_squares`."""
+"""Robust losses of whitened residuals.
+
+Names and formulas are those of `scipy.optimize.least_squares`.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,11 @@ from scipy.stats import norm
 
 from mjfim.arrays import Array
 
-# Smallest threshold [standard deviations] beyond which a residual counts as an outlier; normal
-# noise hardly ever exceeds it.
+# Smallest threshold [standard deviations] above which a residual counts as an outlier; normal noise
+# rarely exceeds it.
 MIN_OUTLIER_THRESHOLD = 3.0
 
-# Smallest squared residual in a weight; protects a negative power of zero.
+# Smallest squared residual in a weight, because zero has no negative power.
 SMALLEST_SQUARE = 1e-300
 
 
@@ -23,9 +26,9 @@ class RobustLoss:
     """Loss `scale^2 rho((r / scale)^2)` of a whitened residual r.
 
     Attributes:
-        kind: Function rho: linear is ordinary least squares; huber, soft_l1 and cauchy grow more
-            slowly.
-        scale: Residual [standard deviations] at which the loss departs from the square.
+        kind: Function rho. With `linear`, the loss is the square; `huber`, `soft_l1` and `cauchy`
+            grow more slowly.
+        scale: Residual [standard deviations] above which the loss clearly differs from the square.
     """
 
     kind: Literal["linear", "huber", "soft_l1", "cauchy"] = "linear"
@@ -33,7 +36,10 @@ class RobustLoss:
 
     @property
     def outlier_threshold(self) -> float:
-        """Residual [standard deviations] beyond which it counts as an outlier; infinite without a robust loss."""
+        """Size above which a residual counts as an outlier [standard deviations].
+
+        It is infinite for the loss `linear`.
+        """
         return np.inf if self.kind == "linear" else max(self.scale, MIN_OUTLIER_THRESHOLD)
 
     @property
@@ -70,13 +76,13 @@ class RobustLoss:
         return float(self.scale**2 * rho.sum())
 
     def weight(self, r: Array) -> Array:
-        """Weights of the rows in iteratively reweighted least squares: square root of the derivative of rho.
+        """Weights of the rows in iteratively reweighted least squares.
 
         Args:
             r: (...) whitened residuals.
 
         Returns:
-            (...) weights between 0 and 1.
+            (...) square roots of the derivative of rho, between 0 and 1.
         """
         z = (r / self.scale) ** 2
         if self.kind == "huber":

@@ -1,4 +1,8 @@
-"""Descent direction under hard limits: exact curvature of their barrier, estimated curvature of the remaining cost."""
+"""Descent direction under hard limits: structured BFGS.
+
+The Hessian of the barrier is the Gauss-Newton one. The curvature of the remaining cost is estimated
+by BFGS.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +23,14 @@ from mjfim.optimize.quasi_newton import CurvaturePair, inverse_hessian_product
 # the gradient.
 MIN_RELATIVE_CURVATURE = 1e-8
 
-# Smallest damping that is not zero, in units of mu.
+# Smallest positive damping, in units of mu.
 MIN_DAMPING = 1e-4
 
 # Largest number of dampings that are tried for one step.
 MAX_DAMPED_TRIALS = 5
 
-# The damping is multiplied by this times (length of the step / trusted length), clipped.
+# The damping is multiplied by this gain times the ratio of the step's length to the trusted length,
+# within the limits below.
 DAMPING_GAIN = 1.5
 
 # Smallest and largest factor by which the damping rises after a step that is too long.
@@ -34,14 +39,14 @@ RAISE_LIMITS = (2.0, 10.0)
 # Smallest and largest factor by which the damping falls after a step that was taken.
 LOWER_LIMITS = (0.1, 1.0)
 
-# Fraction of a step that the line search has to take, so that the damping does not rise.
+# Fraction of a step above which the step counts as taken, so that the damping falls.
 MIN_TAKEN_FRACTION = 0.3
 
-# Predicted decrease above which a shortened step raises the damping; with a smaller one it would
-# look like convergence.
+# Predicted decrease above which a shortened step raises the damping. With a smaller one, short
+# damped steps would look like convergence.
 SIGNIFICANT_DECREASE = 0.01
 
-# Smallest squared norm of a step; protects a division by zero.
+# Smallest squared norm of a step in a denominator.
 SMALLEST_SQUARE = 1e-300
 
 
@@ -209,7 +214,9 @@ class BasisMetric:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _RemainderPair:
-    """A step, and the change of the cost's gradient along it that the model did not predict; limits are not included.
+    """A step, and the change of the cost's gradient along it that the model did not predict.
+
+    The barrier of the limits is not included.
 
     Attributes:
         s: (N, nu) step of the curve coordinate, or (M, nu) of the coefficients of a basis.
@@ -222,7 +229,9 @@ class _RemainderPair:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _LocalModel:
-    """Gradients and metrics at a point, in coordinates: (N, nu) curve coordinates or (M, nu) coefficients of a basis.
+    """Gradients and metrics at a point.
+
+    Coordinates are (N, nu) curve coordinates, or (M, nu) coefficients of a basis of controls.
 
     Attributes:
         expansion: Expansion at the point.
@@ -231,7 +240,7 @@ class _LocalModel:
         gradient: Gradient of cost and barrier.
         cost_gradient: Gradient of the cost without the barrier.
         eigenvalue_slopes: (m, ...) gradients of the coordinates of the eigenvalue model; m is 0
-            without one.
+            without such a model.
         basis: (N, M) basis of the controls, or None.
     """
 
@@ -258,12 +267,14 @@ class _LocalModel:
                 weights = weights.plus(_barrier(self.expansion).uniform_weights, damping)
             return CurveMetric(coordinates=self.coordinates, weights=weights)
 
-        matrix, uniform_matrix = self._matrices
-        return BasisMetric(H=matrix + damping * uniform_matrix if damping > 0.0 else matrix)
+        H, uniform_H = self._matrices
+        if damping > 0.0:
+            H = H + damping * uniform_H
+        return BasisMetric(H=H)
 
     @cached_property
     def _matrices(self) -> tuple[Array, Array]:
-        """(M nu, M nu) matrices of the weights and of the uniform weights, on the coefficients of the basis."""
+        """(M nu, M nu) matrices of the weights and of the uniform weights on the coefficients."""
         if self.basis is None:
             raise ValueError("without a basis there are no coefficients")
 
@@ -272,7 +283,14 @@ class _LocalModel:
         return response.matrix(self.weights), response.matrix(uniform)
 
     def predicted_change(self, s: Array) -> Array:
-        """Change of the cost's gradient that the eigenvalue model predicts along a step s; zero without such a model."""
+        """Change of the cost's gradient along a step s that the eigenvalue model predicts.
+
+        Args:
+            s: (N, nu) or (M, nu) step in these coordinates.
+
+        Returns:
+            Change of the gradient, shaped like s; zero without an eigenvalue model.
+        """
         model = self.expansion.eigenvalue_model
         if model is None:
             return np.zeros_like(s)
@@ -284,18 +302,22 @@ class _LocalModel:
 
 @dataclass
 class StructuredBFGS:
-    """BFGS of the remaining cost, on top of the barrier's Gauss-Newton Hessian and the eigenvalue model of the criterion.
+    """Quasi-Newton direction with a structured Hessian.
 
-    Both are exact at every point. The curvature pairs hold the remainder alone, so that they stay
-    valid for a sharper barrier. Steps that are too long are damped by
-    `BarrierExpansion.uniform_weights` (Levenberg & Marquardt). That shortens directions that have
-    little curvature, and not the way back inside the limits.
+    The Hessian is the sum of the barrier's Gauss-Newton Hessian, the Hessian of the eigenvalue
+    model, and a BFGS approximation of the remainder. The first two are computed at every point. The
+    curvature pairs contain the remainder only, so that they stay valid for a sharper barrier.
+
+    Steps that are too long are damped by `BarrierExpansion.uniform_weights` (Levenberg &
+    Marquardt). This shortens directions with little curvature, but not the step back inside the
+    limits, where the barrier's curvature is large.
 
     Attributes:
         ridge: (nu,) weight of the control at every sample, which keeps the metric positive.
         basis: (N, M) basis of the controls, or None where the controls are free.
         memory: Largest number of stored pairs.
-        reach: Largest change of any limited quantity in one step, over half of its range.
+        reach: Trusted length of a step: largest change of any limited quantity, over half of its
+            range.
         damping: Factor of the uniform weights in the next step, in units of mu.
     """
 
@@ -337,11 +359,15 @@ class StructuredBFGS:
         return self._proposed
 
     def _damped_curve(self, here: _LocalModel) -> tuple[TangentCurve, float]:
-        """Tangent curve of the model's minimum with the present damping, and its length over the trusted length."""
+        """Tangent curve of the model's minimum, and its length over the trusted length."""
         step = self._step(here)
         c = step if self.basis is None else self.basis @ step
         zeta = here.coordinates.lift(c)
-        return zeta, _barrier(here.expansion).largest_relative_move(zeta) / self.reach
+        return zeta, self._relative_length(here.expansion, zeta)
+
+    def _relative_length(self, expansion: Expansion, zeta: TangentCurve) -> float:
+        """Length of a tangent curve over the trusted length."""
+        return _barrier(expansion).largest_relative_move(zeta) / self.reach
 
     def _step(self, here: _LocalModel) -> Array:
         """Minimum of the model, in its coordinates, with the present damping."""
@@ -350,17 +376,19 @@ class StructuredBFGS:
         if model is None:
             return -inverse(here.gradient)
 
-        # Step of all but the eigenvalue model.
+        # Step without the eigenvalue model.
         slopes = here.eigenvalue_slopes
         m = len(slopes)
-        rest = here.gradient - np.tensordot(model.gradient(np.zeros(m)), slopes, axes=1)
-        step = -inverse(rest)
+        model_gradient = np.tensordot(model.gradient(np.zeros(m)), slopes, axes=1)
+        step = -inverse(here.gradient - model_gradient)
 
-        # The model depends on the step through m numbers d: solve for these, and correct the step.
+        # The model depends on the step through m numbers d only. Solve for these numbers, then
+        # correct the step.
         responses = np.stack([inverse(slope) for slope in slopes])
         flat = slopes.reshape(m, -1)
+        d = flat @ step.reshape(-1)
         spread = flat @ responses.reshape(m, -1).T
-        w = model.minimising_gradient(flat @ step.reshape(-1), 0.5 * (spread + spread.T))
+        w = model.minimising_gradient(d, 0.5 * (spread + spread.T))
         return np.asarray(step - np.tensordot(w, responses, axes=1))
 
     def _inverse_hessian(self, metric: CurveMetric | BasisMetric) -> Callable[[Array], Array]:
@@ -375,7 +403,7 @@ class StructuredBFGS:
         return partial(inverse_hessian_product, pairs=pairs, initial=metric.solve)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Adapt the damping to an accepted step and store the change of the gradient that the model did not predict.
+        """Adapt the damping to an accepted step, and store a curvature pair.
 
         Args:
             expansion: Expansion at the new point.
@@ -400,17 +428,17 @@ class StructuredBFGS:
     def _adapt_damping(
         self, before: _LocalModel, proposed: TangentCurve, moved: TangentCurve
     ) -> None:
-        """Lower the damping after a step that was taken, raise it after one that the line search shortened."""
+        """Lower the damping after a step that was taken, raise it after a shortened one."""
         square = max(float(np.vdot(proposed.v, proposed.v)), SMALLEST_SQUARE)
-        taken = float(np.vdot(proposed.v, moved.v)) / square
+        taken_fraction = float(np.vdot(proposed.v, moved.v)) / square
 
-        if taken > MIN_TAKEN_FRACTION:
-            barrier = _barrier(before.expansion)
-            relative_length = barrier.largest_relative_move(proposed) / self.reach
+        if taken_fraction > MIN_TAKEN_FRACTION:
+            relative_length = self._relative_length(before.expansion, proposed)
             factor = float(np.clip(DAMPING_GAIN * relative_length, *LOWER_LIMITS))
             self.damping = self.damping * factor if self.damping > MIN_DAMPING else 0.0
+            return
 
-        elif before.expansion.slope(proposed) < -SIGNIFICANT_DECREASE:
+        if before.expansion.slope(proposed) < -SIGNIFICANT_DECREASE:
             self.damping = RAISE_LIMITS[0] * max(self.damping, MIN_DAMPING)
 
     def reset(self) -> bool:
@@ -435,16 +463,15 @@ class StructuredBFGS:
         coordinates = CurveCoordinates(A=expansion.A, B=expansion.B, K=K)
 
         gradient = self._gradient(coordinates, expansion.a, expansion.b)
-        cost_gradient = self._gradient(
-            coordinates, expansion.a - barrier.a, expansion.b - barrier.b
-        )
+        cost_a = expansion.a - barrier.a
+        cost_b = expansion.b - barrier.b
+        cost_gradient = self._gradient(coordinates, cost_a, cost_b)
+
         slopes: Array = np.zeros((0, *gradient.shape))
         model = expansion.eigenvalue_model
         if model is not None:
-            gradients = [
-                self._gradient(coordinates, a, b) for a, b in zip(model.a, model.b, strict=True)
-            ]
-            slopes = np.stack(gradients)
+            derivatives = zip(model.a, model.b, strict=True)
+            slopes = np.stack([self._gradient(coordinates, a, b) for a, b in derivatives])
 
         self._last = _LocalModel(
             expansion=expansion,
@@ -458,9 +485,17 @@ class StructuredBFGS:
         return self._last
 
     def _gradient(self, coordinates: CurveCoordinates, a: Array, b: Array) -> Array:
-        """Gradient by the coordinates of a linear cost: (N, nu), or (M, nu) with a basis. a: (N+1, nx);  b: (N, nu)."""
+        """(N, nu) gradient of a linear cost by the coordinates; (M, nu) with a basis.
+
+        Args:
+            coordinates: Curve coordinates of the trajectory.
+            a: (N+1, nx) derivative of the cost by the state.
+            b: (N, nu) derivative of the cost by the control.
+        """
         gradient = coordinates.gradient(a, b)
-        return gradient if self.basis is None else np.asarray(self.basis.T @ gradient)
+        if self.basis is None:
+            return gradient
+        return np.asarray(self.basis.T @ gradient)
 
 
 def _barrier(expansion: Expansion) -> BarrierExpansion:

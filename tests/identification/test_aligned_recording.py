@@ -46,7 +46,7 @@ def stamps(rng: np.random.Generator, mean: float) -> Array:
 
 
 def reference(t: Array, ctrl: Array, edges: Array) -> Array:
-    """Integral of the held control up to each edge, interval by interval; the last value is held."""
+    """Integral of the held control up to each edge; beyond the end, the last value is held."""
     total = np.zeros((len(edges), ctrl.shape[1]))
     for i, value in enumerate(ctrl):
         end = t[i + 1] if i < len(ctrl) - 1 else np.inf

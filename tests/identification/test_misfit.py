@@ -35,7 +35,7 @@ def place(times: list[Array], z: list[Array]) -> WorstResidual:
 
 @pytest.mark.parametrize(("recording", "output"), [(0, 2), (1, 0), (2, 1)])
 def test_a_planted_burst_is_found(recording: int, output: int) -> None:
-    """Output, recording and time to within two windows; size and share are those of the interval."""
+    """Output, recording and time agree within two windows; size and share are the interval's."""
     times, z = white()
     t = times[recording]
     begin, end = 0.55 * t[-1], 0.67 * t[-1]

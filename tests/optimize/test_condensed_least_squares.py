@@ -139,7 +139,7 @@ def test_a_step_solves_the_full_stacked_problem(
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int]) -> None:
-    """Against scipy's other method on the full problem, where only the common unknowns are bounded."""
+    """Compare with another method of scipy on the full problem; common unknowns are bounded."""
     active = 0
     for seed in range(10):
         dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
@@ -333,7 +333,7 @@ def test_a_problem_without_common_unknowns() -> None:
 
 
 def test_step_lengths_are_standard_deviations() -> None:
-    """Common steps by the marginal information, private steps by the information at constant theta."""
+    """Common steps use the marginal information, private ones that at constant theta."""
     dense = problem(4, inner=3)
     C = dense.condensed
     step = C.step(0.0, np.ones(5), np.full(3, -FREE), np.full(3, FREE))

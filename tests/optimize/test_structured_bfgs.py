@@ -200,15 +200,15 @@ class Toy:
         return Expansion(A=A, B=B, a=a + barrier_a, b=b + barrier_b, extended=None, barrier=barrier)
 
     def project(self, point: ToyPoint, zeta: TangentCurve, gamma: float, K: Array) -> ToyPoint:
-        """The plant is linear: with feedback or without, a tangent curve is a move of the control."""
+        """Move the control along a tangent curve, which is exact for this linear plant."""
         return self.point(point.u + gamma * zeta.v)
 
     def difference(self, new: ToyPoint, old: ToyPoint) -> TangentCurve:
-        """Linear."""
+        """Difference of states and controls, which is a tangent curve of this linear plant."""
         return TangentCurve(z=new.x - old.x, v=new.u - old.u)
 
     def refine(self, point: ToyPoint) -> ToyPoint | None:
-        """It is exact."""
+        """None, because derivatives are exact."""
         return None
 
 

@@ -1,4 +1,4 @@
-"""The paper's study: reference numbers, its optima from an independent solver, mesh independence."""
+"""The paper's study: reference numbers, optima of an independent solver, mesh independence."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def experiment(name: str) -> mjfim.Experiment:
 
 
 def standalone_models() -> list[Path]:
-    """Every MJCF that compiles alone: it is not included by another file and needs no mesh files."""
+    """MJCF files that compile alone: not included by another file, and without mesh files."""
     files = sorted(SHARED_MODELS.glob("*/*.xml"))
     texts = [path.read_text(encoding="utf-8") for path in files]
     return [
