@@ -25,7 +25,8 @@ from mjfim.output.summaries import robustness_sentences
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
 from mjfim.records.robustness import RobotConditions, Robustness
-from mjfim.studies.robustness import RobotBench, summarize_runs
+from mjfim.studies.robot_bench import RobotBench
+from mjfim.studies.robustness import summarize_runs
 from tests.support.cli import misused, run, run_script
 from tests.support.numerics import Array, body_task, cart_task, filtered_task
 
@@ -378,7 +379,7 @@ def test_a_robot_is_what_a_bare_loop_says(
     stands = ("initial qpos:slide", "initial qpos:hinge") if feedback else ("initial qpos:hinge",)
     assert bench.task.parameters.names == ("mass", "damping", "spring", *stands, "delay")
     theta = np.array([0.8 * 1.2, 0.1 * 0.8, 4.0 * 1.2, *np.zeros(len(stands)), 0.015])
-    recording, margins, start = bench.play(theta, noise, feedback)
+    recording, margins, start = bench.play(theta, noise, bench.controller)
     model = mujoco.MjModel.from_xml_string(CART)
     model.body_mass[model.body("bob").id] = theta[0]
     model.dof_damping[1], model.jnt_stiffness[0] = theta[1], theta[2]

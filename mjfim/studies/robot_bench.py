@@ -1,0 +1,549 @@
+"""A bench of simulated robots that differ from the model, on which a design is played.
+
+A delay of the control acts like a delay of the measurement: the robot stands still before it
+begins, so that it makes the motion without delay at a later time. This also holds with feedback,
+provided that the recorded control is the one that was sent, not the one that has arrived.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.excitation.constraints import SUBSTEP_KINDS, constraint_set_of
+from mjfim.excitation.limits import Limit
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.identification.identify import identify_system
+from mjfim.information.marginal import standard_deviations
+from mjfim.model.coordinates import tangent_names
+from mjfim.plant.batch import BatchSimulator
+from mjfim.recordings.design_table import read_playback
+from mjfim.records.estimate import Estimate
+from mjfim.records.recording import Recording
+from mjfim.records.robustness import RobotConditions, RobotRun
+from mjfim.studies.planned_controller import PlannedController, sensed_entries
+
+# Largest number of attempts to draw a robot whose bodies are physical.
+MAX_DRAWS = 500
+
+# Largest acceleration of a robot that counts as standing still [unit of the coordinate / s²].
+MAX_REST_ACCELERATION = 1e-5
+
+# Largest number of Newton steps in the search for the equilibrium.
+MAX_REST_STEPS = 50
+
+# Length of a Newton step below which the search for the equilibrium ends.
+REST_STEP_TOLERANCE = 1e-12
+
+# Perturbation of the state for the derivative of the acceleration.
+REST_PERTURBATION = 1e-6
+
+# Delays at which further fits start where the first fit ends in a misfit [s].
+FURTHER_DELAYS = (2e-3, 4e-3, 8e-3, 16e-3)
+
+# Smallest deviation of an initial position that makes it an unknown.
+MIN_START_DEVIATION = 1e-9
+
+# Factor by which the errors of the parameters are reduced after as many unphysical draws as there
+# are parameters.
+DRAW_SHRINKAGE = 0.9
+
+
+class RobotBench:
+    """A design, and simulated robots on which it is played.
+
+    Attributes:
+        conditions: Differences between the robots and the model.
+        stated: The task as the experiment states it.
+        task: The task for the recordings, with the delay and the initial positions as unknowns. Its
+            samples are the steps of the engine, where a delay is exact.
+        plan: Rows of design.csv.
+        timestep: Timestep of the engine [s].
+        steps_per_row: Number of engine steps per row of the plan.
+        late_steps: Number of engine steps by which the control is late.
+        constraints: Constraints of the stated task.
+        limits: All l limits that are checked.
+        controller: The controller that plays the plan.
+    """
+
+    def __init__(self, experiment: Experiment, table: Path, conditions: RobotConditions) -> None:
+        """Read the design and resolve the experiment.
+
+        Args:
+            experiment: The experiment of the design.
+            table: The design.csv.
+            conditions: Differences between the robots and the model.
+
+        Raises:
+            ExperimentError: The duration of the design is not that of the experiment, or the
+                conditions cannot be simulated.
+            RecordingError: The design cannot be read.
+        """
+        self.conditions = conditions
+        self.stated = DesignTask.resolve(experiment, threads=1)
+        self.plan = read_playback(table, self.stated.system.channels)
+        self.timestep = float(self.stated.system.model.opt.timestep)
+
+        duration = float(self.plan.t[-1])
+        if abs(duration - self.stated.horizon) > 0.5 * self.timestep:
+            raise ExperimentError(
+                f"{table}: the design lasts {duration:g} s, the experiment "
+                f"{self.stated.horizon:g} s; give the design of this experiment"
+            )
+
+        self.steps_per_row = round(self.plan.period / self.timestep)
+        self.late_steps = round(conditions.latency / self.timestep)
+        remainder = abs(conditions.latency - self.late_steps * self.timestep)
+        if self.late_steps < 0 or remainder > 1e-6 * self.timestep:
+            raise ExperimentError(
+                f"latency: {conditions.latency:g} s is no whole number of timesteps of "
+                f"{self.timestep:g} s; state a multiple of the timestep"
+            )
+
+        self.constraints = constraint_set_of(self.stated)
+        self.limits = _assessed_limits(self.stated)
+        self._simulator = BatchSimulator(
+            self.stated.system.model_at(self.stated.theta),
+            sensors=self.stated.system.outputs.needs_sensors,
+            threads=1,
+        )
+
+        self.controller = PlannedController(
+            plan=self.plan,
+            space=self.stated.space,
+            bounds=self.constraints.control.bounds,
+            rest=self._rest_control(),
+            sensed=sensed_entries(self.stated),
+            steps_per_row=self.steps_per_row,
+            late_steps=self.late_steps,
+            feedback=conditions.feedback,
+        )
+        if conditions.feedback and (self.controller.sensed < 0).all():
+            raise ExperimentError(
+                "--feedback: the gains need a measured position or velocity of a joint, and the "
+                "experiment measures none"
+            )
+
+        # Robots are first drawn with the stated unknowns, to find the initial positions that depend
+        # on the parameters. These become unknowns of the task for the recordings.
+        self.task = self.stated
+        self.task = DesignTask.resolve(self._experiment_of_recordings(experiment), threads=1)
+
+    # ---- the experiment for the recordings
+
+    def _rest_control(self) -> Array | None:
+        """Control before the motion begins.
+
+        Returns:
+            (nu,) control [unit of the actuator]; None where the experiment begins in motion.
+
+        Raises:
+            ExperimentError: The experiment begins in motion, but the conditions have a latency.
+        """
+        try:
+            return self.stated.initial_hold
+        except ExperimentError as error:
+            if self.late_steps:
+                raise ExperimentError(
+                    f"{error}; the design can be played without a latency only (--latency 0)"
+                ) from None
+            return None
+
+    def _experiment_of_recordings(self, stated: Experiment) -> Experiment:
+        """The experiment with one sample per engine step, and with the unknowns of the robots."""
+        nuisance = stated.nuisance.model_dump(exclude_unset=True)
+        if self.late_steps:
+            nuisance["delay"] = nuisance.get("delay") or True
+
+        movable = self._movable_positions()
+        if nuisance.get("initial") is None and movable:
+            nuisance["initial"] = dict.fromkeys(movable, True)
+
+        return stated.replace(
+            nuisance=nuisance,
+            rate=1.0 / self.timestep,
+            measure_rate=stated.measure_rate or stated.rate,
+            playback_rate=None,
+        )
+
+    def _movable_positions(self) -> list[str]:
+        """Names of the initial positions that depend on the parameters of a robot.
+
+        They are found from robots that are drawn at random.
+        """
+        task = self.stated
+        moved = np.zeros(task.space.nv, dtype=bool)
+
+        for seed in range(2 * len(task.parameters)):
+            theta = self._drawn(np.random.default_rng(seed))
+            start = self._start(task.system.model_at(theta), theta, self.controller)
+            deviation = task.space.minus(start, task.plant.nominal_initial_state)
+            moved |= np.abs(deviation[: task.space.nv]) > MIN_START_DEVIATION
+
+        names = tangent_names(task.system.model)[: task.space.nv]
+        return [name for name, has_moved in zip(names, moved, strict=True) if has_moved]
+
+    # ---- robots
+
+    def _drawn(self, rng: np.random.Generator) -> Array:
+        """Draw the parameters of a robot whose bodies are physical.
+
+        No error of a parameter is larger than the standard deviation of its prior. Errors are
+        reduced where the bodies would be unphysical.
+
+        Args:
+            rng: Random numbers.
+
+        Returns:
+            (p,) parameters, with delay and biases, but without deviations of the initial state
+            [theta-unit].
+
+        Raises:
+            ExperimentError: No physical robot was found.
+        """
+        p = self.task.parameters
+        wrong = self.conditions.wrong
+        size = np.where(p.guess == 0.0, p.scale, np.abs(p.guess))
+        prior = np.array([0.0 if q.prior is None else q.prior for q in p.parameters])
+        reach = np.where(prior > 0.0, np.minimum(wrong * size, prior), wrong * size)
+
+        for attempt in range(MAX_DRAWS):
+            shrinkage = DRAW_SHRINKAGE ** (attempt // len(p))
+            error = rng.choice([-1.0, 1.0], len(p)) * reach * shrinkage
+            theta = np.where(p.changes_model, p.guess + error, prior * rng.standard_normal(len(p)))
+            theta = self._with_delay(np.clip(theta, p.lower, p.upper))
+            if not p.writer.unphysical_bodies(self.task.plant.source, theta):
+                return theta
+
+        raise ExperimentError(
+            f"errors of {wrong:.0%} in the parameters lead to unphysical bodies; state a smaller "
+            "error"
+        )
+
+    def _with_delay(self, theta: Array) -> Array:
+        """(p,) parameters with the true delay [theta-unit]."""
+        is_delay = self.task.parameters.delay_derivative != 0.0
+        return np.asarray(np.where(is_delay, self.late_steps * self.timestep, theta))
+
+    def _start(self, model: Any, theta: Array, controller: PlannedController) -> Array:
+        """Initial state of a robot: its equilibrium near the initial state of the model.
+
+        Args:
+            model: Model of the robot.
+            theta: (p,) parameters of the robot [theta-unit].
+            controller: The controller.
+
+        Returns:
+            (ns,) initial state; that of the model where there is no equilibrium and no latency.
+
+        Raises:
+            SimulationDivergedError: There is no equilibrium, and the control is late.
+        """
+        if controller.rest is None:
+            return self.task.plant.initial_state(theta)
+
+        state, acceleration = self._equilibrium(model, controller)
+        if acceleration <= MAX_REST_ACCELERATION:
+            return state
+        if self.late_steps == 0:
+            return np.array(self.stated.plant.nominal_initial_state)
+
+        advice = (
+            "play without a latency"
+            if controller.feedback
+            else "play with --feedback, or without a latency"
+        )
+        raise SimulationDivergedError(
+            "a robot with other parameters does not stand still at the start "
+            f"(it accelerates by {acceleration:.2g} per s²): {advice}"
+        )
+
+    def _equilibrium(self, model: Any, controller: PlannedController) -> tuple[Array, float]:
+        """Find an equilibrium of a robot by Newton's method.
+
+        Args:
+            model: Model of the robot.
+            controller: The controller.
+
+        Returns:
+            (ns,) state with the smallest acceleration, and its largest acceleration there [unit of
+            the coordinate / s²].
+        """
+        space = self.stated.space
+        data = mujoco.MjData(model)
+        state = np.array(self.stated.plant.nominal_initial_state)
+
+        # Positions and activations may change; velocities stay zero.
+        directions = np.delete(np.eye(space.nx), np.arange(space.nv, 2 * space.nv), axis=0)
+
+        def acceleration(x: Array) -> Array:
+            """Accelerations and rates of the activations at a state."""
+            data.qpos[:], data.qvel[:], data.act[:] = space.split(x)
+            data.ctrl[:] = controller.before_start(x)
+            mujoco.mj_forward(model, data)
+            return np.concatenate([data.qacc, data.act_dot])
+
+        for _ in range(MAX_REST_STEPS):
+            current = acceleration(state)
+            columns = []
+            for direction in directions:
+                ahead = acceleration(space.plus(state, REST_PERTURBATION * direction))
+                behind = acceleration(space.plus(state, -REST_PERTURBATION * direction))
+                columns.append(ahead - behind)
+
+            slope = np.stack(columns, 1) / (2.0 * REST_PERTURBATION)
+            step = np.linalg.lstsq(slope, -current, rcond=1e-9)[0]
+            state = space.plus(state, step @ directions)
+            if np.abs(step).max(initial=0.0) < REST_STEP_TOLERANCE:
+                break
+
+        return state, float(np.abs(acceleration(state)).max(initial=0.0))
+
+    # ---- one robot
+
+    def run(self, number: int) -> RobotRun:
+        """Play the design on one robot, check the limits, and identify the robot.
+
+        Args:
+            number: Number of the robot. This number and the seed of the conditions determine all
+                random numbers.
+        """
+        rng = np.random.default_rng([self.conditions.seed, number])
+        theta = self._drawn(rng)
+        noise = self.conditions.loudness * self.task.system.noise.sample(len(self.plan.t), rng)
+
+        try:
+            recording, margins, start = self.play(theta, noise, self.controller)
+            system = self._system_from(start)
+            self._put_start(theta, start, system)
+            estimate, restarted = self._identified(recording, system)
+        except SimulationDivergedError as error:
+            return RobotRun(
+                theta=theta,
+                estimate=np.full(len(theta), np.nan),
+                covariance=np.full((len(theta), len(theta)), np.nan),
+                margins=np.full(len(self.limits), -np.inf),
+                fit=np.nan,
+                misfit=True,
+                trouble=str(error),
+            )
+
+        return RobotRun(
+            theta=theta,
+            estimate=estimate.theta,
+            covariance=estimate.covariance,
+            margins=margins,
+            fit=estimate.chi2 / estimate.dof,
+            misfit=estimate.misfit,
+            restarted=restarted,
+            trouble="" if estimate.success else estimate.status,
+        )
+
+    def _system_from(self, start: Array) -> System:
+        """System for the recording of a robot that begins at start: (ns,).
+
+        It begins with the activations of the robot. These are no unknowns, because they follow from
+        the control before the motion begins.
+        """
+        system, na = self.task.system, self.task.space.na
+        if na == 0:
+            return system
+
+        state = np.array(system.plant.nominal_initial_state)
+        state[-na:] = start[-na:]
+        return replace(
+            system, nominal_initial_state=state, plant=system.plant.with_initial_state(state)
+        )
+
+    def _put_start(self, theta: Array, start: Array, system: System) -> None:
+        """Write the true deviations of the initial state into theta: (p,), in place.
+
+        Only deviations that are unknowns are written. start: (ns,) initial state of the robot.
+        """
+        matrix = system.parameters.initial_state_derivative(system.space.nx)
+        used = matrix.any(axis=0)
+
+        deviation = system.space.minus(start, system.plant.nominal_initial_state)
+        solution = np.linalg.lstsq(matrix[:, used], deviation)
+        theta[used] = solution[0]
+
+    def _identified(self, recording: Recording, system: System) -> tuple[Estimate, bool]:
+        """Identify a robot from its recording.
+
+        Where the fit from the guess is a misfit, further fits start at other delays.
+
+        Returns:
+            The best estimate, and True if there were further fits.
+        """
+        best = identify_system(system, [recording])
+        if not best.misfit:
+            return best, False
+
+        p = system.parameters
+        starts = [p.guess]
+        if p.delay_derivative.any():
+            is_delay = p.delay_derivative != 0.0
+            starts += [np.where(is_delay, delay, p.guess) for delay in FURTHER_DELAYS]
+
+        for start in starts:
+            try:
+                other = identify_system(system, [recording], method="newton", start=start)
+            except SimulationDivergedError:
+                continue
+
+            if other.success and other.chi2 < best.chi2:
+                best = other
+            if not best.misfit:
+                break
+
+        return best, True
+
+    def play(
+        self, theta: Array, noise: Array, controller: PlannedController
+    ) -> tuple[Recording, Array, Array]:
+        """Play the plan on one robot.
+
+        Args:
+            theta: (p,) parameters of the robot [theta-unit].
+            noise: (M+1, ny) noise of the outputs at the rows of the plan [y-unit].
+            controller: The controller.
+
+        Returns:
+            The recording, (l,) margins divided by half of their ranges, and (ns,) initial state of
+            the robot.
+
+        Raises:
+            SimulationDivergedError: The simulation diverges, or the robot does not stand still at
+                the start.
+        """
+        task, rows = self.task, len(self.plan.ctrl)
+        model = task.system.model_at(theta)
+        start = self._start(model, theta, controller)
+        before = controller.before_start(start)
+        noise = noise + task.parameters.bias_derivative(len(task.system.outputs)) @ theta
+        sent = controller.sent(model, start, before, noise)
+
+        # The control arrives late. Until then the robot gets the control before the motion begins.
+        held = np.repeat(sent, self.steps_per_row, axis=0)
+        applied = np.concatenate([np.tile(before, (self.late_steps, 1)), held])
+        out = self._simulator.rollout(
+            [model], start[None], applied[None], self.constraints.observations
+        )
+        if not out.finite[0] or out.observed is None:
+            raise SimulationDivergedError("the robot's simulation diverges")
+
+        # Noise is added at the rows of the plan; samples that are not measured are NaN.
+        last = rows * self.steps_per_row + 1
+        sensors = None if out.sensors is None else out.sensors[0, :last]
+        y = task.system.outputs(out.states[0, :last], sensors)
+        y[:: self.steps_per_row] += noise
+        y[task.system.noise.measured(last - 1) == 0.0] = np.nan
+
+        recording = Recording(
+            t=np.arange(last, dtype=np.float64) * self.timestep,
+            ctrl=held,
+            y=y,
+            outputs=task.system.outputs.names,
+            name="robot",
+        )
+        qpos = out.states[0][:, : task.space.nq]
+        margins = self._margins(out.observed[0, :, 0], sent, before, qpos, controller.feedback)
+        return recording, margins, start
+
+    def _margins(
+        self, observed: Array, sent: Array, before: Array, qpos: Array, feedback: bool
+    ) -> Array:
+        """Smallest margins of all limits.
+
+        Args:
+            observed: (n, w) observations at every engine step.
+            sent: (M, nu) controls that were sent [unit of the actuator].
+            before: (nu,) control before the motion begins [unit of the actuator].
+            qpos: (n+1, nq) positions at every engine step.
+            feedback: True where the controller uses the gains.
+
+        Returns:
+            (l,) margins, divided by half of their ranges.
+        """
+        constraints = self.constraints
+        bounds = constraints.substeps.bounds
+        inside = bounds.margin(observed).min(axis=0, initial=np.inf) / bounds.scale
+        rates = self._control_rates(sent, before, feedback)
+
+        margins = []
+        for i, limit in enumerate(self.limits):
+            if limit.kind in SUBSTEP_KINDS:
+                margins.append(float(inside[i]))
+            elif limit.kind == "clearance" and constraints.clearance is not None:
+                nearest = constraints.clearance.distances.nearest(qpos)[0]
+                margins.append(nearest / constraints.clearance.least - 1.0)
+            else:
+                values = (sent if limit.kind == "control" else rates)[:, limit.index]
+                margin = np.minimum(values - limit.lower, limit.upper - values).min()
+                margins.append(float(margin) / limit.scale)
+
+        return np.array(margins)
+
+    def _control_rates(self, sent: Array, before: Array, feedback: bool) -> Array:
+        """Rates of the control over one sample [unit of the actuator / s].
+
+        They include the change from the control before the motion, and the change to the control
+        after its end.
+        """
+        rows_per_sample = round(self.stated.dt / self.plan.period)
+        rate = self.constraints.rate
+        after = sent[-1] if feedback or rate is None else rate.control_after
+        if after is None:
+            after = sent[-1]
+
+        controls = np.concatenate(
+            [np.tile(before, (rows_per_sample, 1)), sent, np.tile(after, (rows_per_sample, 1))]
+        )
+        changes = controls[rows_per_sample:] - controls[:-rows_per_sample]
+        return np.asarray(changes / self.stated.dt)
+
+    # ---- predictions of the model
+
+    def planned(self) -> Array:
+        """(l,) margins of the plan on the model, divided by half of their ranges.
+
+        They are computed without noise and without feedback.
+        """
+        no_noise = np.zeros((len(self.plan.t), len(self.task.system.outputs)))
+        theta = self._with_delay(self.task.parameters.guess)
+        open_loop = replace(self.controller, feedback=False)
+        _, margins, _ = self.play(theta, no_noise, open_loop)
+        return margins
+
+    def predicted(self) -> Array:
+        """(p,) predicted standard deviations at the guess with the true delay [theta-unit]."""
+        task = self.task
+        theta = self._with_delay(task.parameters.guess)
+        control = np.repeat(self.plan.ctrl, self.steps_per_row, axis=0)
+        found = task.plant.derivatives.predict(theta, control)
+        if found is None:
+            raise SimulationDivergedError("the plan diverges at the guess")
+
+        J = task.system.noise.whitened_rows(found[1])
+        return standard_deviations(J.T @ J + task.parameters.prior_information)
+
+
+def _assessed_limits(task: DesignTask) -> tuple[Limit, ...]:
+    """All limits; first those on observed quantities, in the order of the observations."""
+    within = [limit for kind in SUBSTEP_KINDS for limit in task.limits if limit.kind == kind]
+    others = [limit for limit in task.limits if limit.kind not in SUBSTEP_KINDS]
+
+    clearance = task.experiment.limits.clearance
+    if clearance is not None:
+        others.append(
+            Limit(kind="clearance", name="nearest pair", index=0, lower=clearance, upper=np.inf)
+        )
+    return (*within, *others)
