@@ -21,6 +21,28 @@ from mjfim.cli import (  # noqa: F401 - each registers its verbs
 )
 from mjfim.cli.common import app
 
+# Verbs in the order of an experiment, in which the help lists them; further ones come last.
+ORDER = (
+    "check",
+    "design",
+    "simulate",
+    "identify",
+    "montecarlo",
+    "compare",
+    "robustness",
+    "campaign",
+    "export-sysid",
+    "replay",
+)
+
+
+def _place(name: str | None) -> int:
+    """Return the place of a verb in the help."""
+    return ORDER.index(name) if name in ORDER else len(ORDER)
+
+
+app.registered_commands.sort(key=lambda command: _place(command.name))
+
 
 def main() -> NoReturn:
     """Entry point."""

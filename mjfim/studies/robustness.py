@@ -93,9 +93,9 @@ def assess_robustness(
             event = StudyEvent(
                 study="robustness",
                 part="robots",
-                index=0,
-                count=1,
-                share=len(found) / runs,
+                index=len(found) - 1,
+                count=runs,
+                share=1.0,
                 message=f"{len(found)} of {runs} robots",
             )
             callback(event)
