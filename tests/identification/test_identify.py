@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Callable
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 import mjfim
+from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
@@ -18,6 +21,8 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.identify import identify, identify_system, least_squares, newton_raphson
 from mjfim.identification.residuals import FitProblem
+from mjfim.optimize.condensed_least_squares import Condensed
+from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.campaign import identify_all
@@ -220,67 +225,94 @@ def test_an_interrupted_search_keeps_the_best_result_so_far(
     assert found.predictions == ()
 
 
-@pytest.mark.parametrize(
-    "place",
-    [
-        "report.find_missing_terms",
-        "cross_validation.minimise",
-        "cross_validation._prediction_errors",
-    ],
-)
-def test_an_interruption_after_the_search_keeps_the_estimate(
-    task: DesignTask, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Ctrl-C during the tests for missing terms, or during the predictions."""
-    whole = identify_system(task.system, [recording])
+class CtrlC:
+    """Presses Ctrl-C at one of the checks of a stop token.
 
-    pressed: list[bool] = []
+    Attributes:
+        number: Number of the check, from 1; 0: never.
+        checks: Number of checks so far.
+        checks_of_search: Number of checks before the last iteration of a search.
+    """
 
-    def interrupt(*_: object, **__: object) -> None:
-        if not pressed:
-            pressed.append(True)
+    def __init__(self, number: int = 0) -> None:
+        self.number = number
+        self.checks = 0
+        self.checks_of_search = 0
+
+    def check(self) -> bool:
+        """Count a check; Ctrl-C sets the token."""
+        self.checks += 1
+        if self.checks == self.number:
             signal.raise_signal(signal.SIGINT)
+        return False
 
-    monkeypatch.setattr(f"mjfim.identification.{place}", interrupt)
-    found = identify_system(task.system, [recording])
+    def count_iteration(self, event: FitEvent) -> None:
+        """Note an iteration of a search."""
+        self.checks_of_search = self.checks
+
+
+@pytest.mark.parametrize("number", [1, 4, 7])
+def test_an_interruption_after_the_search_keeps_the_estimate(
+    task: DesignTask, recording: Recording, number: int
+) -> None:
+    """Ctrl-C during the test for missing terms, and at two places during the predictions."""
+    never = CtrlC()
+    whole = identify_system(
+        task.system,
+        [recording],
+        stop=StopToken(never.check),
+        callback=never.count_iteration,
+    )
+    pressed = CtrlC(never.checks_of_search + number)
+    found = identify_system(task.system, [recording], stop=StopToken(pressed.check))
+    assert pressed.number < never.checks
     assert whole.predictions and not whole.interrupted
     assert found.interrupted and found.predictions == ()
     np.testing.assert_array_equal(found.theta, whole.theta)
     assert any(sentence.startswith("interrupted after the search") for sentence in found.warnings)
 
 
+@pytest.mark.parametrize("method", [least_squares, newton_raphson])
 def test_functions_without_a_budget_give_no_partial_result(
-    task: DesignTask, recording: Recording, monkeypatch: pytest.MonkeyPatch
+    task: DesignTask, recording: Recording, method: Callable[..., Solution]
 ) -> None:
-    """Ctrl-C interrupts them as usual; a round of a campaign is complete or not kept."""
-    fit, count = FitProblem.of(task.system, [recording]), [0]
-    condense = FitProblem.condense
+    """Ctrl-C at the third linearisation interrupts them as usual."""
+    count = 0
 
-    def interrupt(self: FitProblem, at: object) -> object:
-        count[0] += 1
-        if count[0] == 3:
+    class InterruptedProblem(FitProblem):
+        def condense(self, at: UnknownValues) -> Condensed | None:
+            nonlocal count
+            count += 1
+            if count == 3:
+                signal.raise_signal(signal.SIGINT)
+            return super().condense(at)
+
+    fit = FitProblem.of(task.system, [recording])
+    values = {field.name: getattr(fit, field.name) for field in fields(fit)}
+    with pytest.raises(KeyboardInterrupt):
+        method(InterruptedProblem(**values), task.parameters.guess)
+    assert count == 3
+
+
+def test_an_interrupted_round_of_a_campaign_is_not_kept(
+    task: DesignTask, recording: Recording
+) -> None:
+    """Ctrl-C in the second iteration."""
+
+    def interrupt(event: FitEvent) -> None:
+        if event.iteration == 2:
             signal.raise_signal(signal.SIGINT)
-        return condense(self, at)
 
-    monkeypatch.setattr(FitProblem, "condense", interrupt)
-    for work in (
-        lambda: least_squares(fit, task.parameters.guess),
-        lambda: newton_raphson(fit, task.parameters.guess),
-    ):
-        count[0] = 0
-        with pytest.raises(KeyboardInterrupt):
-            work()
-    count[0] = 0
-    assert identify_all(task, [recording], task.parameters.guess) is None
-    count[0] = 0
-    assert identify_system(task.system, [recording]).interrupted
+    guess = task.parameters.guess
+    assert identify_all(task, [recording], guess, callback=interrupt) is None
 
 
 def test_an_interruption_between_starts_keeps_the_earlier_ones(
     task: DesignTask, recording: Recording
 ) -> None:
-    """Earlier starts count; no later one is searched."""
-    several, seen = DesignTask.resolve(task.experiment.replace(fit={"starts": 6})), list[str]()
+    """Results of earlier starts count; there is no search from a later start."""
+    several = DesignTask.resolve(task.experiment.replace(fit={"starts": 6}))
+    seen: list[str] = []
 
     def show(event: FitEvent) -> None:
         seen.append(event.phase)
@@ -289,7 +321,7 @@ def test_an_interruption_between_starts_keeps_the_earlier_ones(
 
     found = identify_system(several.system, [recording], callback=show)
     assert found.interrupted
-    assert not any(what.startswith("start 4") or what == "all data" for what in seen)
+    assert not any(phase.startswith("start 4") or phase == "all data" for phase in seen)
     np.testing.assert_allclose(
         found.theta, identify_system(task.system, [recording]).theta, rtol=1e-3
     )
@@ -298,7 +330,7 @@ def test_an_interruption_between_starts_keeps_the_earlier_ones(
 def test_an_interruption_before_the_last_search_ends_all_searches(
     task: DesignTask, recording: Recording
 ) -> None:
-    pieces = DesignTask.resolve(task.experiment.replace(fit={"segments": 1.0}))
+    segmented = DesignTask.resolve(task.experiment.replace(fit={"segments": 1.0}))
     seen: list[str] = []
 
     def show(event: FitEvent) -> None:
@@ -306,19 +338,17 @@ def test_an_interruption_before_the_last_search_ends_all_searches(
         if event.phase == "initial states":
             signal.raise_signal(signal.SIGINT)
 
-    found = identify_system(pieces.system, [recording], callback=show)
+    found = identify_system(segmented.system, [recording], callback=show)
     assert found.interrupted and not found.success
     assert set(seen) == {"initial states"}
     np.testing.assert_array_equal(found.theta, task.parameters.guess)
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])
-def test_a_robust_fit_judges_the_size_of_its_residuals(
+def test_a_robust_fit_tests_the_size_of_its_residuals(
     task: DesignTask, recording: Recording, scale: float
 ) -> None:
-    """Noise as stated is neither too large nor too small, whatever counts as an outlier; three
-    times the noise is a misfit.
-    """
+    """The stated noise is no misfit for any threshold of outliers; three times the noise is."""
     robust = DesignTask.resolve(
         task.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale})
     )
@@ -339,9 +369,7 @@ def test_a_robust_fit_judges_the_size_of_its_residuals(
 
 
 def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
-    """Their covariance is infinite; correlations of the others are computed without a warning
-    (warnings are errors here).
-    """
+    """Their covariance is infinite; other correlations are computed without a warning of NumPy."""
     task = DesignTask.resolve(Experiment.from_file(ROOT / "models" / "ball_pendulum.toml"))
     estimate = identify_system(
         task.system,
