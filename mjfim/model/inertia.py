@@ -154,10 +154,13 @@ def from_logcholesky(values: Array) -> BodyInertia:
     U[1, 2] = values[5]
     U[0, 2] = values[6]
 
+    # U is scaled by e^alpha, so that the mass is e^(2 alpha).
     mass = float(np.exp(2.0 * values[0]))
+    com = np.array(values[7:])
+
     second_moments = mass * (U @ U.T)
     inertia = np.trace(second_moments) * np.eye(3) - second_moments
-    return BodyInertia(mass=mass, com=np.array(values[7:]), inertia=inertia)
+    return BodyInertia(mass=mass, com=com, inertia=inertia)
 
 
 def _entries(matrix: Array) -> Array:

@@ -221,8 +221,8 @@ class ParameterSet:
     @property
     def interest(self) -> np.ndarray:
         """Indices of the parameters of interest, which are no nuisance."""
-        wanted = [j for j, p in enumerate(self.parameters) if not p.nuisance]
-        return np.array(wanted, dtype=np.intp)
+        nuisance = np.array([p.nuisance for p in self.parameters], dtype=bool)
+        return np.flatnonzero(~nuisance)
 
     def initial_state_derivative(self, nx: int) -> Array:
         """(nx, p) derivative of the initial state, in the tangent space."""
@@ -303,7 +303,8 @@ class ParameterSet:
 
     def _targets(self) -> Iterator[tuple[int, Target, TargetField]]:
         """Every target with the index of its parameter and the field that it leads to."""
-        for j, (parameter, fields) in enumerate(zip(self.parameters, self.fields, strict=True)):
+        for j, parameter in enumerate(self.parameters):
+            fields = self.fields[j]
             for target, target_field in zip(parameter.targets, fields, strict=True):
                 yield j, target, target_field
 

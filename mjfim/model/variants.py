@@ -48,7 +48,7 @@ LAYOUT = (
 
 @dataclass(frozen=True, kw_only=True)
 class ModelVariant:
-    """How the plant of a search differs from the user's model.
+    """Differences between the plant of a search and the user's model.
 
     Attributes:
         sample_factor: Factor by which timestep and sample period are longer than stated.

@@ -232,8 +232,8 @@ class BatchSimulator:
         share = len(states) // len(models)
         parts = []
         for i, model in enumerate(models):
-            mine = slice(i * share, (i + 1) * share)
-            parts.append(self._step_model(model, states[mine], ctrl[mine], observations))
+            rows = slice(i * share, (i + 1) * share)
+            parts.append(self._step_model(model, states[rows], ctrl[rows], observations))
 
         sensors = [part.sensors for part in parts if part.sensors is not None]
         observed = [part.observed for part in parts if part.observed is not None]
@@ -390,10 +390,13 @@ class BatchSimulator:
         """Write the poses of the mocap bodies of each model into its simulations."""
         mocap_pos = batch.bind("mocap_pos")
         mocap_quat = batch.bind("mocap_quat")
+        bodies = self._mocap_bodies
+
         for i, model in enumerate(models):
-            mine = slice(None, count) if len(models) == 1 else i
-            mocap_pos[mine] = model.body_pos[self._mocap_bodies]
-            mocap_quat[mine] = model.body_quat[self._mocap_bodies]
+            # A single model belongs to all simulations.
+            simulations = slice(None, count) if len(models) == 1 else i
+            mocap_pos[simulations] = model.body_pos[bodies]
+            mocap_quat[simulations] = model.body_quat[bodies]
 
     def _step_model(
         self, model: Any, states: Array, ctrl: Array, observations: SubstepObservations | None

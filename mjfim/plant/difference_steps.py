@@ -1,4 +1,4 @@
-"""Steps of the differences from which the derivatives of a plant are made."""
+"""Steps of the finite differences from which the derivatives of a plant are computed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class DifferenceSteps:
     """
 
     def __init__(self, plant: Plant, step_factors: Array | None = None) -> None:
-        """Build the derivatives of a plant.
+        """Set the plant and the factors of its difference steps.
 
         Args:
             plant: The plant.

@@ -1,7 +1,7 @@
 """Mixed second derivatives of F and h along directions (psi w, w), by differences of MuJoCo steps.
 
-They are the part of the gradient of a criterion that needs second derivatives; the first
-derivatives come out of the same steps.
+The gradient of a criterion needs these second derivatives. The steps also give all first
+derivatives by state and control.
 """
 
 from __future__ import annotations

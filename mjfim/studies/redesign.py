@@ -243,4 +243,7 @@ def _are_determined(base: DesignTask, members: Sequence[int], estimate: Estimate
     indices = np.asarray(members)
     information = np.diag(estimate.data)[indices]
     size = base.parameters.magnitude[indices]
-    return bool((information * size**2 > 1.0).all())
+
+    # A standard deviation below the size means an information above 1 / size^2.
+    relative_information = information * size**2
+    return bool((relative_information > 1.0).all())

@@ -230,8 +230,9 @@ class RobotBench:
 
     def _with_delay(self, theta: Array) -> Array:
         """(p,) parameters with the true delay [theta-unit]."""
+        delay = self.late_steps * self.timestep
         is_delay = self.task.parameters.delay_derivative != 0.0
-        return np.asarray(np.where(is_delay, self.late_steps * self.timestep, theta))
+        return np.asarray(np.where(is_delay, delay, theta))
 
     def _start(self, model: Any, theta: Array, controller: PlannedController) -> Array:
         """Initial state of a robot: its equilibrium near the initial state of the model.
