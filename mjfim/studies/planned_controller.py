@@ -73,7 +73,11 @@ class PlannedController:
             return np.stack([self._command(start, k) for k in range(rows)])
 
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:], data.act[:] = self.space.split(start)
+        qpos, qvel, act = self.space.split(start)
+        data.qpos[:] = qpos
+        data.qvel[:] = qvel
+        data.act[:] = act
+
         sent = np.zeros((rows, len(before)))
         read = np.flatnonzero(self.sensed >= 0)
 
@@ -117,11 +121,13 @@ def sensed_entries(task: DesignTask) -> np.ndarray:
     # Entry of the state that each sensor of a joint measures, by the address of the sensor.
     encoders = {}
     for i in range(model.nsensor):
-        kind, joint = int(model.sensor_type[i]), int(model.sensor_objid[i])
+        kind = int(model.sensor_type[i])
+        joint = int(model.sensor_objid[i])
+        address = int(model.sensor_adr[i])
         if kind == position:
-            encoders[int(model.sensor_adr[i])] = int(model.jnt_qposadr[joint])
+            encoders[address] = int(model.jnt_qposadr[joint])
         elif kind == velocity:
-            encoders[int(model.sensor_adr[i])] = space.nq + int(model.jnt_dofadr[joint])
+            encoders[address] = space.nq + int(model.jnt_dofadr[joint])
 
     found = np.full(space.nq + space.nv + space.na, -1)
     for i, output in enumerate(task.system.outputs.outputs):

@@ -287,7 +287,10 @@ class RobotBench:
 
         def acceleration(x: Array) -> Array:
             """Accelerations and rates of the activations at a state."""
-            data.qpos[:], data.qvel[:], data.act[:] = space.split(x)
+            qpos, qvel, act = space.split(x)
+            data.qpos[:] = qpos
+            data.qvel[:] = qvel
+            data.act[:] = act
             data.ctrl[:] = controller.before_start(x)
             mujoco.mj_forward(model, data)
             return np.concatenate([data.qacc, data.act_dot])
