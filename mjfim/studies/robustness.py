@@ -25,7 +25,7 @@ from mjfim.errors import (
 from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.parallel import results_in_order
+from mjfim.parallel import pool_stop_token, results_in_order
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.robustness import (
     CONFIDENCE,
@@ -222,15 +222,26 @@ class _RobotStudy:
 _worker_benches: dict[str, RobotBench] = {}
 
 
-def _run_in_worker(study: _RobotStudy, number: int) -> RobotRun:
-    """Play one robot in a worker process, with one thread."""
+def _run_in_worker(study: _RobotStudy, number: int) -> RobotRun | None:
+    """Play one robot in a worker process."""
     if study.key not in _worker_benches:
         _worker_benches.clear()
         bench = RobotBench(study.experiment, study.table, study.conditions)
         _worker_benches[study.key] = bench
 
-    with threadpool_limits(1):
-        return _worker_benches[study.key].run(number)
+    return _run_until_stopped(_worker_benches[study.key], number, pool_stop_token())
+
+
+def _run_until_stopped(bench: RobotBench, number: int, stop: StopToken) -> RobotRun | None:
+    """Play one robot, with one thread.
+
+    A request to stop also ends the fit of the robot early. Its estimate is then not used, and the
+    result is None.
+    """
+    with threadpool_limits(1), stop_on_interrupt(stop):
+        run = bench.run(number)
+
+    return None if stop.requested else run
 
 
 def _play_all(
@@ -246,18 +257,13 @@ def _play_all(
     """
     if executor is not None:
         futures = [executor.submit(_run_in_worker, study, number) for number in range(count)]
-        yield from results_in_order(executor, futures, Budget(stop=stop))
+        for finished in results_in_order(executor, futures, Budget(stop=stop)):
+            if finished is not None:
+                yield finished
         return
 
-    budget = Budget(stop=stop)
     for number in range(count):
-        if budget.exhausted is not None:
-            return
-        with threadpool_limits(1):
-            run = bench.run(number)
-
-        # A request to stop also ends the fit of the current robot early, whose estimate is
-        # therefore not used.
-        if stop.requested:
+        run = _run_until_stopped(bench, number, stop)
+        if run is None:
             return
         yield run
