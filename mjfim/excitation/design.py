@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -23,7 +23,7 @@ from mjfim.excitation.initial_controls import InitialControl, initial_controls_o
 from mjfim.excitation.levels import DescentLevel, coarse_level, easier_level
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.objective import DesignPoint
-from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import Verification, require_feasible_start, verify
@@ -35,10 +35,7 @@ from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import ParameterGroup, join_names
 from mjfim.records.design import Design, Evaluation, Status
-from mjfim.records.events import DesignCallback, DesignEvent
-
-# Generator of a search with several runs: yields every iterate and returns one result per run.
-Runs = Generator[DesignEvent, None, list[RunResult]]
+from mjfim.records.events import DesignCallback
 
 
 @explain_renamed_arguments

@@ -8,7 +8,7 @@ is evaluated; then it is optimised again within tighter limits.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +23,7 @@ from mjfim.excitation.feasibility import shrink_until_feasible
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.run_result import RunResult
+from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.verification import verify
 from mjfim.parallel import results_in_order, workers_of
 from mjfim.records.design import HistoryRow, Status
@@ -56,9 +56,6 @@ TIGHTENED_RUN_MU = 1e-3
 
 # Largest number of iterations of a run within tighter limits.
 TIGHTENED_RUN_ITERATIONS = 60
-
-# Generator of a search with several runs: yields every iterate and returns one result per run.
-Runs = Generator[DesignEvent, None, list[RunResult]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

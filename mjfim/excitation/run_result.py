@@ -56,6 +56,10 @@ class RunResult:
         )
 
 
+# Generator of a search with several runs: yields every iterate and returns one result per run.
+Runs = Generator[DesignEvent, None, list[RunResult]]
+
+
 def consume(
     events: Generator[DesignEvent, None, T], callback: Callable[[DesignEvent], None] | None
 ) -> T:

@@ -18,7 +18,7 @@ from mjfim.excitation.extended_system import ExtendedDesignProblem
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
-from mjfim.excitation.run_result import RunResult
+from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
@@ -143,9 +143,7 @@ class UnconstrainedSearch:
     constraints: ConstraintSet | None
     steps_before: int
 
-    def run_all(
-        self, starts: Iterable[InitialControl]
-    ) -> Generator[DesignEvent, None, list[RunResult]]:
+    def run_all(self, starts: Iterable[InitialControl]) -> Runs:
         """Descend from one initial control after the other.
 
         The search ends when the budget is exhausted, or when a descent leaves the limits.

@@ -301,7 +301,7 @@ def _require_held(task: DesignTask, where: str, state: Array, hold: Array) -> No
         value = needed[limit.kind][limit.index]
         if not limit.lower <= value <= limit.upper:
             raise ExperimentError(
-                f"{where}: holding still takes {limit.name} = {value:.4g}, outside "
+                f"{where}: standing still requires {limit.name} = {value:.4g}, outside "
                 f"{_key_of(limit)} [{limit.lower:g}, {limit.upper:g}]"
             )
 

@@ -108,12 +108,12 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     ),
     "hold outside the control's range": (
         '[boundary]\nstart = "rest"\n[limits]\ncontrol = { force = [0.5, 2.0] }',
-        ["boundary.start: holding still takes force =", "outside limits.control [0.5, 2]"],
+        ["boundary.start: standing still requires force =", "outside limits.control [0.5, 2]"],
         [],
     ),
     "hold beyond the actuator's force": (
         '[boundary]\nstart = "rest"\n[limits]\nforce = { force = 2.0 }',
-        ["boundary.start: holding still takes force = -5, outside limits.force [-2, 2]"],
+        ["boundary.start: standing still requires force = -5, outside limits.force [-2, 2]"],
         [('type="slide" axis="1 0 0"', 'type="slide" axis="1 0 0" stiffness="10" springref="0.5"')],
     ),
     "start in collision": (
