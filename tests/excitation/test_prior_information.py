@@ -135,7 +135,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     ),
     "strangers": (
         '{"parameters": ["x", "y"], "final": {"information": [[1, 0], [0, 1]]}}',
-        r"knows x, y, but .* a, b",
+        r"information about x, y, but .* a, b",
     ),
 }
 

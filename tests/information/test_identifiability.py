@@ -135,7 +135,7 @@ def test_a_combination_that_only_the_initial_control_hides_is_refused_with_advic
     assert coefficients["mass"] / coefficients["drag"] == pytest.approx(-0.3, rel=1e-5)
     with pytest.raises(
         UnidentifiableError,
-        match=r"initial control does not excite: .* mass and drag only as .* multisine",
+        match=r"initial control does not excite: mass and drag only as .* multisine",
     ):
         require_designable(task, seen)
 
@@ -176,7 +176,7 @@ def test_several_parameters_without_effect_are_all_named(tmp_path) -> None:
     }
     task = cart_task(tmp_path, parameters={**CART_PARAMETERS, **dead})
     with pytest.raises(
-        UnidentifiableError, match=r"parameters\.y, parameters\.i change nothing .* take them out"
+        UnidentifiableError, match=r"parameters\.y, parameters\.i change nothing .* remove them"
     ):
         require_designable(task, look(task))
 
