@@ -1,5 +1,6 @@
-"""Recordings on the sample grid: the control keeps its impulse, measured values stay unchanged,
-faults are named.
+"""Recordings on the sample grid.
+
+The control keeps its impulse, measured values stay unchanged, and messages name faults.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def reference(t: Array, ctrl: Array, edges: Array) -> Array:
 
 @pytest.mark.parametrize("mean", [0.11 * DT, 0.5 * DT, DT, 2.3 * DT, 17.0 * DT])
 def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
-    """Every integral of the log from the start to a sample, and so the whole impulse, is kept."""
+    """The integral of the control from the first row to any sample is that of the recording."""
     rng = np.random.default_rng(round(mean / DT * 100))
     for _ in range(60):
         t = stamps(rng, mean)
@@ -72,7 +73,7 @@ def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
 
 
 def test_control_on_the_grid_is_unchanged() -> None:
-    """To the last bit, also after a million samples; a row holds until the next one."""
+    """It is exactly equal, also after a million samples; a row holds until the next one."""
     rng = np.random.default_rng(0)
     for count in (2, 7, 200_000):
         ctrl = rng.standard_normal((count, 3))
@@ -101,39 +102,41 @@ def log(task: DesignTask, **changes: Any) -> Recording:
 
 
 def test_a_recording_on_the_grid_is_unchanged(task: DesignTask) -> None:
-    """Any first time, stamps within a hundredth of a sample, columns in any order, some absent, one
-    more control.
+    """Such a recording may have any first time, and its columns any order.
+
+    Time stamps may deviate by a hundredth of a sample. Columns may be missing, and the last row may
+    have a control.
     """
     plain = log(task)
     jitter = np.random.default_rng(1).uniform(-4e-5, 4e-5, len(plain.t))
     for t in (plain.t, plain.t + 1.7e9, plain.t + jitter):
-        track = align(task.system, log(task, t=t))
-        assert track.on_grid
-        np.testing.assert_allclose(track.t, plain.t, rtol=0, atol=1e-15)
-        np.testing.assert_array_equal(track.ctrl, plain.ctrl)
-        np.testing.assert_array_equal(track.y, plain.y)
+        aligned = align(task.system, log(task, t=t))
+        assert aligned.on_grid
+        np.testing.assert_allclose(aligned.t, plain.t, rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(aligned.ctrl, plain.ctrl)
+        np.testing.assert_array_equal(aligned.y, plain.y)
     swapped = log(task, y=plain.y[:, [3, 0]], outputs=("qvel:hinge", "qpos:slide"))
-    track = align(task.system, swapped)
-    np.testing.assert_array_equal(track.y[:, [3, 0]], swapped.y)
-    assert np.isnan(track.y[:, 1:3]).all()
-    assert track.measured.sum() == 2 * len(plain.t)
+    aligned = align(task.system, swapped)
+    np.testing.assert_array_equal(aligned.y[:, [3, 0]], swapped.y)
+    assert np.isnan(aligned.y[:, 1:3]).all()
+    assert aligned.measured.sum() == 2 * len(plain.t)
     more = log(task, ctrl=np.concatenate([plain.ctrl, np.full((1, 1), np.nan)]))
     np.testing.assert_array_equal(align(task.system, more).ctrl, plain.ctrl)
 
 
 def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> None:
-    """Its values stay as well; only the control is averaged.
+    """Its values do not change either; only the control is averaged.
 
-    A log on the grid stays on it where rows are missing.
+    A recording on the grid stays there where rows are missing.
     """
     plain = log(task)
     t = np.sort(np.random.default_rng(2).uniform(0.0, 0.3, len(plain.t)))
-    track = align(task.system, log(task, t=t + 5.0))
-    assert not track.on_grid
-    np.testing.assert_allclose(track.t, t - t[0], rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(track.y, plain.y)
+    aligned = align(task.system, log(task, t=t + 5.0))
+    assert not aligned.on_grid
+    np.testing.assert_allclose(aligned.t, t - t[0], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(aligned.y, plain.y)
     np.testing.assert_allclose(
-        track.ctrl, resample_control(t - t[0], plain.ctrl, task.dt), rtol=0, atol=1e-9
+        aligned.ctrl, resample_control(t - t[0], plain.ctrl, task.dt), rtol=0, atol=1e-9
     )
     kept = np.delete(np.arange(31), [4, 5, 20])
     sparse = align(
@@ -146,15 +149,16 @@ def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> No
 
 
 def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> None:
-    """A repeated stamp and a missing row: the numbers of rows and samples agree, but not every
-    sample has a row.
+    """One time stamp is repeated and one row is missing.
+
+    The numbers of rows and samples agree then, but not every sample has a row.
     """
     plain = log(task)
     t = np.array(plain.t)
     t[8] = t[7] + 0.005 * task.dt
-    track = align(task.system, log(task, t=t))
-    np.testing.assert_allclose(track.ctrl[8], plain.ctrl[8], rtol=0, atol=0.05)
-    np.testing.assert_allclose(track.ctrl[7], plain.ctrl[8], rtol=0, atol=0.05)
+    aligned = align(task.system, log(task, t=t))
+    np.testing.assert_allclose(aligned.ctrl[8], plain.ctrl[8], rtol=0, atol=0.05)
+    np.testing.assert_allclose(aligned.ctrl[7], plain.ctrl[8], rtol=0, atol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +188,7 @@ def test_faults_are_named(task: DesignTask, changes: dict[str, Any], words: str)
 
 
 def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
-    """A log with random signs and gaps becomes the continuous curve that the model predicts."""
+    """Random signs and gaps are replaced by the continuous curve that the model predicts."""
     ctrl = body.control
     y = body.plant.measure(body.parameters.guess[None], ctrl)[0][0]
     names, flipped = body.system.outputs.names, np.array(y)
@@ -193,31 +197,31 @@ def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
         columns = [names.index(f"qpos:{joint}.q{a}") for a in "wxyz"]
         flipped[:, columns] *= rng.choice([-1.0, 1.0], (len(y), 1))
         flipped[10:20, columns] = np.nan
-    track = align(
+    aligned = align(
         body.system,
         Recording(t=np.arange(len(y)) * body.dt, ctrl=ctrl, y=flipped, outputs=names, name="x.csv"),
     )
     seen = np.isfinite(flipped)
-    np.testing.assert_array_equal(track.y[seen], y[seen])
-    assert np.isnan(track.y[~seen]).all()
+    np.testing.assert_array_equal(aligned.y[seen], y[seen])
+    assert np.isnan(aligned.y[~seen]).all()
 
 
 def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
-    """A single component may cross zero: it does not show whether q or -q was logged."""
+    """A single component may cross zero; it does not show whether q or -q was recorded."""
     some = body_task(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
     y = some.plant.measure(some.parameters.guess[None], some.control)[0][0]
     assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
-    track = align(
+    aligned = align(
         some.system,
         Recording(
             t=np.arange(len(y)) * some.dt, ctrl=some.control, y=y, outputs=some.system.outputs.names
         ),
     )
-    np.testing.assert_array_equal(track.y, y)
+    np.testing.assert_array_equal(aligned.y, y)
 
 
 def test_measured_trajectory_bridges_gaps(task: DesignTask, body: DesignTask) -> None:
-    """All positions, gaps bridged; None where one was never measured."""
+    """Gaps are interpolated; the result is None where a position was never measured."""
     plain = log(task)
     y = np.array(plain.y)
     y[10:13, 1] = np.nan
@@ -234,9 +238,9 @@ def test_measured_trajectory_bridges_gaps(task: DesignTask, body: DesignTask) ->
 
 
 def test_interpolation_between_samples_is_exact_for_cubics() -> None:
-    """At any times, in any order, several at one sample; values and slopes.
+    """Values and slopes are exact at any times, in any order, also several at one sample.
 
-    A quartic shows that the test can fail.
+    They are not exact for a quartic, which shows that the test can fail.
     """
     rng = np.random.default_rng(0)
     wanted = rng.uniform(0.0, 29.0, 200)
@@ -256,8 +260,9 @@ def test_interpolation_between_samples_is_exact_for_cubics() -> None:
 
 @pytest.mark.parametrize("delay", [0.0, 0.4 * DT, 3.7 * DT, -1.2 * DT])
 def test_interpolation_at_the_samples_is_the_delay_on_the_grid(delay: float) -> None:
-    """`of` is `at` every sample, and any rows of it are `at` those; before the start is the start,
-    without a slope.
+    """The delay on the grid equals the interpolation at every sample, for any rows.
+
+    Before the first sample, its value is held.
     """
     all_of_them, y = (
         OutputDelay.on_grid(40, delay, DT),
@@ -284,7 +289,7 @@ def test_an_aligned_recording_does_not_change(task: DesignTask) -> None:
     """Its arrays are read-only, and those of the recording stay unchanged."""
     plain = log(task)
     before = np.array(plain.y)
-    track: AlignedRecording = align(task.system, plain)
+    aligned: AlignedRecording = align(task.system, plain)
     with pytest.raises(ValueError, match="read-only"):
-        track.y[0, 0] = 1.0
+        aligned.y[0, 0] = 1.0
     np.testing.assert_array_equal(plain.y, before)

@@ -210,7 +210,7 @@ def test_unknown_method_and_wrong_start_are_refused(task: DesignTask, recording:
 def test_an_interrupted_search_keeps_the_best_result_so_far(
     task: DesignTask, recording: Recording
 ) -> None:
-    """Ctrl-C in the second iteration."""
+    """Ctrl-C is pressed in the second iteration."""
     costs: list[float] = []
 
     def show(event: FitEvent) -> None:
@@ -255,7 +255,7 @@ class CtrlC:
 def test_an_interruption_after_the_search_keeps_the_estimate(
     task: DesignTask, recording: Recording, number: int
 ) -> None:
-    """Ctrl-C during the test for missing terms, and at two places during the predictions."""
+    """Ctrl-C is pressed during the test for missing terms, or during the predictions."""
     never = CtrlC()
     whole = identify_system(
         task.system,
@@ -276,7 +276,7 @@ def test_an_interruption_after_the_search_keeps_the_estimate(
 def test_functions_without_a_budget_give_no_partial_result(
     task: DesignTask, recording: Recording, method: Callable[..., Solution]
 ) -> None:
-    """Ctrl-C at the third linearisation interrupts them as usual."""
+    """Ctrl-C at the third linearisation raises KeyboardInterrupt as usual."""
     count = 0
 
     class InterruptedProblem(FitProblem):
@@ -297,7 +297,7 @@ def test_functions_without_a_budget_give_no_partial_result(
 def test_an_interrupted_round_of_a_campaign_is_not_kept(
     task: DesignTask, recording: Recording
 ) -> None:
-    """Ctrl-C in the second iteration."""
+    """Ctrl-C is pressed in the second iteration."""
 
     def interrupt(event: FitEvent) -> None:
         if event.iteration == 2:

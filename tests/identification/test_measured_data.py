@@ -1,7 +1,6 @@
-"""Measured data of other groups: parameters from some recordings predict the others, and poor data
-are named.
+"""Measured data of other groups: parameters from some recordings predict the others.
 
-The data are not in the repository; without them, these tests are skipped.
+Poor data are named. The data are not in the repository; without them, these tests are skipped.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ PUBLISHED_DOUBLE = {
 def servo_values(
     kt: float, R: float, armature: float, offset: float, base: float, viscous: float
 ) -> dict[str, float]:
-    """BAM's parameters as those of models/bam_xl330.toml."""
+    """Parameters published by BAM, in the units of models/bam_xl330.toml."""
     values = {
         "gain": kt / R,
         "brake": kt**2 / R,
@@ -125,10 +124,10 @@ def test_poor_data_are_named() -> None:
     poor = identified(
         experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "sysid_measured.csv"], []
     )
-    said = [s for s in poor.warnings if s.startswith("poor data in sysid_measured.csv")]
-    assert any("jumps from row to row" in s and "'torque'" in s for s in said)
-    assert any("speed is rough" in s for s in said)
-    assert any("ctrlrange" in s for s in said)
+    remarks = [s for s in poor.warnings if s.startswith("poor data in sysid_measured.csv")]
+    assert any("jumps from row to row" in s and "'torque'" in s for s in remarks)
+    assert any("speed is rough" in s for s in remarks)
+    assert any("ctrlrange" in s for s in remarks)
     good = identified(
         experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "dircol_measured.csv"], []
     )
@@ -155,7 +154,7 @@ def test_double_pendulum_in_base_parameters_and_its_held_out_file() -> None:
 
 @pytest.mark.slow
 def test_servo_predicts_held_out_logs_as_well_as_published() -> None:
-    """Two logs at each gain of the firmware; mean absolute errors of whole rollouts."""
+    """Mean absolute errors of whole rollouts, of two recordings at each gain of the firmware."""
     stem = "2026-01-15_10h"
     fitted = [SERVO / f"{stem}{t}.json" for t in ("28m10", "28m17", "28m57", "29m04")]
     others = [SERVO / f"{stem}{t}.json" for t in ("28m24", "28m32", "28m42", "28m49")]

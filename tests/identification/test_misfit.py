@@ -64,7 +64,7 @@ def test_an_output_with_uniformly_large_residuals_is_named_as_a_whole() -> None:
 
 
 def test_gaps_and_outputs_that_are_not_measured() -> None:
-    """They do not count; a burst beside them is found."""
+    """Missing values do not count; a burst next to a gap is found."""
     times, z = white()
     z[0][:, 1] = np.nan
     z[0][200:700, 0] = np.nan
@@ -81,8 +81,9 @@ def test_gaps_and_outputs_that_are_not_measured() -> None:
 
 
 def test_a_single_value_is_not_an_interval() -> None:
-    """A rarely measured output, one value of which is large by chance, does not outdo a burst of a
-    hundred values.
+    """A burst of a hundred values is worse than a single value that is large by chance.
+
+    The single value belongs to a rarely measured output.
     """
     for seed in range(20):
         times, z = white(seed)
@@ -106,13 +107,13 @@ def test_short_recordings(count: int) -> None:
 
 
 def test_a_worst_residual_in_words() -> None:
-    """Output, time, recording, size and share."""
-    said = str(
+    """The sentence has output, time, recording, size and share."""
+    sentence = str(
         WorstResidual(
             output="angle", recording="run.csv", begin=1.25, end=2.5, size=7.93, share=0.412
         )
     )
-    assert said == "worst in angle, 1.25 to 2.5 s of run.csv: 7.9 sigmas, 41 % of all squares"
+    assert sentence == "worst in angle, 1.25 to 2.5 s of run.csv: 7.9 sigmas, 41 % of all squares"
 
 
 def seen(
@@ -135,8 +136,9 @@ def seen(
 
 
 def test_larger_and_smaller_need_probability_and_size() -> None:
-    """Chi-square beyond its 0.1 % tail, and a ratio that matters; with much data the tail alone is
-    not enough.
+    """The probability is below 0.1 %, and the ratio is relevant.
+
+    With much data, a small probability alone is not enough.
     """
     for dof in (10, 300, 10_000):
         top, bottom = chi2.isf(1e-3, dof), chi2.ppf(1e-3, dof)
@@ -154,8 +156,9 @@ def test_larger_and_smaller_need_probability_and_size() -> None:
 
 
 def test_autocorrelation_matters_where_it_is_large_enough() -> None:
-    """Significant, corrected for the number of outputs, and large against the noise; strongest
-    first.
+    """It is significant for the number of outputs, and relevant against the noise.
+
+    The strongest autocorrelation comes first.
     """
     assert [
         w.output
@@ -171,7 +174,7 @@ def test_autocorrelation_matters_where_it_is_large_enough() -> None:
 
 
 def test_reasons_in_sentences() -> None:
-    """One sentence for each cause; none for noise as stated."""
+    """There is one sentence for each cause, and none for the stated noise."""
     assert misfit_reasons(1000.0, 1000, True, [seen()], ()) == ()
     assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (
         "residuals are 2.00 x the stated noise",
@@ -179,8 +182,8 @@ def test_reasons_in_sentences() -> None:
     assert misfit_reasons(4000.0, 1000, False, [seen()], ()) == (), (
         "where sigmas are estimated, size tells nothing"
     )
-    said = misfit_reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
-    assert said == ("residuals are autocorrelated: speed (lag-1 correlation +0.30)",)
+    reasons = misfit_reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
+    assert reasons == ("residuals are autocorrelated: speed (lag-1 correlation +0.30)",)
     slow = misfit_reasons(1000.0, 1000, True, [seen("speed", 1e-9, 16.0, correlation=0.001)], ())
     assert slow == (
         "residuals are autocorrelated: speed (long-run variance is 16.0 times that of white noise)",

@@ -29,7 +29,7 @@ def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N
 
 @pytest.mark.parametrize("lengths", [(40,), (400,), (3000,), (700, 90, 1300), tuple([60] * 30)])
 def test_white_noise_rarely_fails(lengths: tuple[int, ...]) -> None:
-    """At each level no more often than the level, within the scatter of the number of draws."""
+    """The rate of false alarms is at most the level, within the scatter of the draws."""
     rng = np.random.default_rng(len(lengths))
     draws = 400
     p = np.array(
@@ -56,7 +56,7 @@ def test_gaps_do_not_make_white_noise_coloured() -> None:
 
 @pytest.mark.parametrize("phi", [0.15, -0.15, 0.5, 0.95])
 def test_correlated_noise_is_seen(phi: float) -> None:
-    """Also of small correlation, which is reported."""
+    """A small correlation is found as well, and reported."""
     found = [seen(seed, phi=phi) for seed in range(20)]
     assert sum(w.p < 1e-3 for w in found) >= 19
     assert np.mean([w.correlation for w in found]) == pytest.approx(phi, abs=0.02)
@@ -74,14 +74,15 @@ def test_correlated_noise_is_seen(phi: float) -> None:
     ],
 )
 def test_small_signals_in_noise_are_found(extra: Array | float) -> None:
-    """All are small against the noise, so small that short lags alone would miss the slow ones."""
+    """All signals are smaller than the noise; short lags alone would miss the slow ones."""
     assert sum(seen(seed, extra).p < 1e-3 for seed in range(20)) >= 18
     assert seen(0, extra).variance < 1.2
 
 
 def test_long_runs_see_what_short_lags_do_not() -> None:
-    """A drift far below the noise: the runs bring it out, and their inflation says how much
-    averaging is lost.
+    """Means over runs find a drift far below the noise.
+
+    Their inflation shows how much less accurate an average is.
     """
     drift = 0.15 * np.sign(np.sin(2 * np.pi * np.arange(N) / 2000))
     found = [seen(seed, drift) for seed in range(20)]
@@ -91,7 +92,7 @@ def test_long_runs_see_what_short_lags_do_not() -> None:
 
 
 def test_several_recordings_are_seen_together() -> None:
-    """Each too short by itself, with one correlation in all of them, or with different offsets."""
+    """Each recording is too short; all have one correlation, or different offsets."""
     rng = np.random.default_rng(7)
     parts = [autoregressive(0.3, 60, rng) for _ in range(40)]
     assert whiteness_of("y", parts).p < 1e-4
@@ -101,16 +102,16 @@ def test_several_recordings_are_seen_together() -> None:
 
 
 def test_borders_of_recordings_are_not_crossed() -> None:
-    """Products reach from one value to another of the same recording only."""
+    """Only products of two values of one recording count."""
     a, b = np.array([1.0, 2.0, -1.0, 0.5] * 5), np.array([3.0, -2.0, 1.0, 4.0] * 5)
     rho = (np.sum(a[1:] * a[:-1]) + np.sum(b[1:] * b[:-1])) / (a @ a + b @ b)
     assert whiteness_of("y", [a, b]).correlation == pytest.approx(rho, rel=1e-10)
 
 
 def test_the_statistic_is_that_of_ljung_and_box() -> None:
-    """From its formula, in plain sums; p is its tail, times the number of looks.
+    """The statistic equals plain sums; p is its tail times the number of tests.
 
-    A fast oscillation leaves means small.
+    A fast oscillation keeps means over runs small.
     """
     rng = np.random.default_rng(0)
     for phi in (-0.06, -0.1):
@@ -134,7 +135,7 @@ def test_the_statistic_is_that_of_ljung_and_box() -> None:
 
 @pytest.mark.parametrize("phi", [0.3, 0.7, 0.9, 0.97])
 def test_the_integrated_time_is_that_of_theory(phi: float) -> None:
-    """(1 + phi) / (1 - phi), in the mean over draws."""
+    """The mean over draws is (1 + phi) / (1 - phi)."""
     times = [seen(seed, phi=phi, count=30_000).time for seed in range(12)]
     assert np.mean(times) == pytest.approx((1.0 + phi) / (1.0 - phi), rel=0.12)
 
@@ -146,7 +147,7 @@ def test_white_and_alternating_noise_has_no_memory() -> None:
 
 
 def test_variance_and_inflation() -> None:
-    """In squares of the sigmas; the inflation of white noise is not far from one."""
+    """The variance is relative to the noise; the inflation of white noise is close to 1."""
     rng = np.random.default_rng(0)
     found = whiteness_of("speed", [2.0 * rng.standard_normal(20_000)])
     assert found.output == "speed"
@@ -161,6 +162,6 @@ def test_variance_and_inflation() -> None:
     [[], [np.zeros(0)], [np.full(9, np.nan)], [np.ones(5)], [np.zeros(100)], [np.ones(1)] * 50],
 )
 def test_too_few_residuals_pass(parts: list[Array]) -> None:
-    """No values, few values, or only zeros."""
+    """There are no values, few values, or only zeros."""
     found = whiteness_of("y", parts)
     assert (found.p, found.inflation, found.time) == (1.0, 1.0, 1.0)

@@ -1,5 +1,4 @@
-"""Robust uncertainty of an estimate against the spread of many repetitions of a simulated
-experiment.
+"""Robust uncertainty against the spread of many repetitions of a simulated experiment.
 
 The models are linear and the truth is known, so that every part of `robust_uncertainty` can be
 compared with that spread.
@@ -20,21 +19,28 @@ from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 from tests.support.numerics import Array
 
-FINE = 8  # rows of a block
+# Rows of a block of the linearisation.
+FINE = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Recordings of `y = X theta + noise`; X: (K, N, c); own: every recording has an offset."""
+    """Recordings of `y = X theta + noise`.
+
+    Attributes:
+        X: (K, N, c) regressors of K recordings.
+        with_offsets: Whether every recording has an unknown offset.
+        prior: Standard deviation of the prior on theta.
+    """
 
     X: Array
-    own: bool = False
+    with_offsets: bool = False
     prior: float = np.inf
 
     def fitted(self, y: Array) -> tuple[Array, Condensed]:
-        """Estimate from y: (K, N), and the blocks there."""
+        """Estimate from y: (K, N), and the linearisation there."""
         K, N, c = self.X.shape
-        n = int(self.own)
+        n = int(self.with_offsets)
         ahead = np.kron(np.eye(K), np.ones((N, 1))) if n else np.zeros((K * N, 0))
         wide = np.concatenate([ahead, self.X.reshape(K * N, c)], axis=1)
         rows = np.eye(wide.shape[1])[K * n :] / self.prior
@@ -56,12 +62,12 @@ class Linear:
             common_rows=known,
         )
 
-    def judged(self, y: Array, length: float, draws: int = 0) -> tuple[Array, Array, Uncertainty]:
-        """Estimate, its formal deviations and what is said of it."""
+    def assessed(self, y: Array, length: float, draws: int = 0) -> tuple[Array, Array, Uncertainty]:
+        """Estimate, its formal standard deviations and its robust uncertainty."""
         theta, condensed = self.fitted(y)
         rows = np.full(len(condensed.segment_of_block), float(FINE))
         formal = np.sqrt(np.diag(np.linalg.inv(condensed.information())))
-        said = robust_uncertainty(
+        result = robust_uncertainty(
             condensed,
             theta,
             condensed.segment_of_block,
@@ -70,7 +76,7 @@ class Linear:
             draws=draws,
             rng=np.random.default_rng(0),
         )
-        return theta, formal, said
+        return theta, formal, result
 
 
 def waves(K: int, N: int, c: int, slow: float = 3.0) -> Array:
@@ -90,8 +96,15 @@ def noise(phi: float, shape: tuple[int, int], rng: np.random.Generator) -> Array
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Many repetitions. theta, formal, sandwich, bootstrap: (n, c);  covered: (n, c) the interval
-    holds the truth, 0
+    """Results of n repetitions.
+
+    Attributes:
+        theta: (n, c) errors of the estimates.
+        formal: (n, c) formal standard deviations.
+        sandwich: (n, c) standard deviations of the sandwich covariance.
+        bootstrap: (n, c) standard deviations of the bootstrap.
+        covered: (n, c) True where the interval contains the truth.
+        apart: (n,) True where recordings disagree.
     """
 
     theta: Array
@@ -103,61 +116,63 @@ class Study:
 
 
 @cache
-def study(phi: float, own: bool = False, prior: float = np.inf, repetitions: int = 150) -> Study:
-    """One recording, or four with offsets."""
-    K, N = (4, 480) if own else (1, 1600)
-    model, rng = Linear(waves(K, N, 2), own, prior), np.random.default_rng(11)
+def study(
+    phi: float, with_offsets: bool = False, prior: float = np.inf, repetitions: int = 150
+) -> Study:
+    """Repetitions with one recording, or with four recordings that have offsets."""
+    K, N = (4, 480) if with_offsets else (1, 1600)
+    model, rng = Linear(waves(K, N, 2), with_offsets, prior), np.random.default_rng(11)
     length = block_length([(1 + phi) / (1 - phi)], K * N)
     found = []
     for _ in range(repetitions):
         truth = prior * rng.standard_normal(2) if np.isfinite(prior) else np.zeros(2)
-        offsets = 3.0 * rng.standard_normal((K, 1)) * own
-        theta, formal, said = model.judged(
+        offsets = 3.0 * rng.standard_normal((K, 1)) * with_offsets
+        theta, formal, result = model.assessed(
             model.X @ truth + offsets + noise(phi, (K, N), rng), length, draws=150
         )
-        low, high = said.interval.T
+        low, high = result.interval.T
         covered = (low <= truth) & (truth <= high)
         found.append(
             (
                 theta - truth,
                 formal,
-                said.sandwich,
-                said.draws.std(axis=0),
+                result.sandwich,
+                result.draws.std(axis=0),
                 covered,
-                bool(said.apart),
+                bool(result.apart),
             )
         )
     return Study(*(np.array(column) for column in zip(*found, strict=True)))
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("with_offsets", [False, True])
 def test_with_correlated_noise_the_sandwich_is_right_and_the_formal_deviation_is_not(
-    own: bool,
+    with_offsets: bool,
 ) -> None:
-    """Against the spread of the estimates themselves: the formal one is several times too small."""
-    s = study(0.9, own)
+    """Compare with the spread of the estimates: the formal deviation is much too small."""
+    s = study(0.9, with_offsets)
     true = s.theta.std(axis=0)
     assert (s.formal.mean(axis=0) < 0.4 * true).all()
     np.testing.assert_allclose(s.sandwich.mean(axis=0), true, rtol=0.25)
     np.testing.assert_allclose(s.bootstrap.mean(axis=0), true, rtol=0.25)
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test_with_white_noise_all_deviations_agree(own: bool) -> None:
-    """Formal, sandwich, bootstrap and the spread of the estimates."""
-    s = study(0.0, own)
+@pytest.mark.parametrize("with_offsets", [False, True])
+def test_with_white_noise_all_deviations_agree(with_offsets: bool) -> None:
+    """Formal, sandwich and bootstrap deviations agree with the spread of the estimates."""
+    s = study(0.0, with_offsets)
     true = s.theta.std(axis=0)
-    for said in (s.formal, s.sandwich, s.bootstrap):
-        np.testing.assert_allclose(said.mean(axis=0), true, rtol=0.15)
+    for deviation in (s.formal, s.sandwich, s.bootstrap):
+        np.testing.assert_allclose(deviation.mean(axis=0), true, rtol=0.15)
     np.testing.assert_allclose(s.sandwich.mean(axis=0), s.formal.mean(axis=0), rtol=0.05)
 
 
 @pytest.mark.parametrize(
-    ("phi", "own"), [(0.0, False), (0.0, True), (0.6, False), (0.9, False), (0.9, True)]
+    ("phi", "with_offsets"), [(0.0, False), (0.0, True), (0.6, False), (0.9, False), (0.9, True)]
 )
-def test_the_interval_covers_the_truth(phi: float, own: bool) -> None:
-    """Nearly as often as 95 % and not always; without the allowance it would not."""
-    s = study(phi, own)
+def test_the_interval_covers_the_truth(phi: float, with_offsets: bool) -> None:
+    """The coverage is nearly 95 % and not 100 %; formal intervals cover less."""
+    s = study(phi, with_offsets)
     draws = s.covered.size
     assert s.covered.sum() >= binom.ppf(0.001, draws, 0.92)
     naive = (np.abs(s.theta) < 1.96 * s.formal).mean()
@@ -167,18 +182,19 @@ def test_the_interval_covers_the_truth(phi: float, own: bool) -> None:
 
 
 def test_priors_count_as_scatter() -> None:
-    """Truths drawn from the prior: sandwich and bootstrap are the spread about them, not the spread
-    of the data alone.
+    """Sandwich and bootstrap are the spread about truths that are drawn from the prior.
+
+    The spread due to the data alone is smaller.
     """
     s = study(0.0, prior=0.03)
     true = s.theta.std(axis=0)
     assert (true < 0.03).all()
-    for said in (s.formal, s.sandwich, s.bootstrap):
-        np.testing.assert_allclose(said.mean(axis=0), true, rtol=0.15)
+    for deviation in (s.formal, s.sandwich, s.bootstrap):
+        np.testing.assert_allclose(deviation.mean(axis=0), true, rtol=0.15)
 
 
 def test_recordings_that_disagree_are_found() -> None:
-    """Their spread is found and the interval allows for it; equal recordings agree."""
+    """The interval includes the spread of recordings that differ; equal recordings agree."""
     rng, K, N = np.random.default_rng(5), 8, 480
     model = Linear(waves(K, N, 2))
     apart, between, equal = [], [], []
@@ -186,15 +202,15 @@ def test_recordings_that_disagree_are_found() -> None:
         truth = np.array([0.4, 0.0]) * rng.standard_normal((K, 2))
         y = np.einsum("knc,kc->kn", model.X, truth)
         for other, found in ((0.0, equal), (1.0, apart)):
-            theta, _, said = model.judged(
+            theta, _, result = model.assessed(
                 other * y + noise(0.5, (K, N), rng), block_length([3.0], K * N)
             )
-            found.append(said.apart)
+            found.append(result.apart)
             if other:
-                between.append(said.between)
-                own = np.linalg.lstsq(model.X[3], (y + 0.0)[3])[0]
-                assert abs(said.each[3, 0] - own[0]) < 1.0
-                assert said.interval[0, 1] - theta[0] >= 1.95 * said.between[0]
+                between.append(result.between)
+                single = np.linalg.lstsq(model.X[3], (y + 0.0)[3])[0]
+                assert abs(result.each[3, 0] - single[0]) < 1.0
+                assert result.interval[0, 1] - theta[0] >= 1.95 * result.between[0]
     assert sum(0 in names for names in apart) >= 58
     assert sum(1 in names for names in apart) <= 3
     assert sum(bool(names) for names in equal) <= 3
@@ -203,21 +219,23 @@ def test_recordings_that_disagree_are_found() -> None:
 
 
 def test_few_blocks_of_each_recording_give_no_false_alarms() -> None:
-    """Strongly coloured noise leaves five or so blocks a recording, whose own scatter is often
-    small by chance.
+    """Strongly coloured noise leaves about five blocks per recording.
+
+    Their scatter is often small by chance.
     """
     rng, K, N = np.random.default_rng(6), 10, 480
     model = Linear(waves(K, N, 3, slow=1.0))
-    said = [
-        model.judged(noise(0.92, (K, N), rng), block_length([24.0], K * N))[2] for _ in range(150)
+    results = [
+        model.assessed(noise(0.92, (K, N), rng), block_length([24.0], K * N))[2] for _ in range(150)
     ]
-    assert max(s.blocks for s in said) <= 50
-    assert sum(bool(s.apart) for s in said) <= 7
+    assert max(s.blocks for s in results) <= 50
+    assert sum(bool(s.apart) for s in results) <= 7
 
 
 def test_differences_between_recordings_do_not_count_as_scatter() -> None:
-    """At the common estimate the difference is in all residuals; it must not pass for the scatter
-    of each recording.
+    """Residuals at the common estimate contain the difference between recordings.
+
+    It must not count as scatter within each recording.
     """
     rng, K, N = np.random.default_rng(8), 5, 1200
     model = Linear(waves(K, N, 3, slow=0.7))
@@ -225,27 +243,27 @@ def test_differences_between_recordings_do_not_count_as_scatter() -> None:
     for _ in range(40):
         truth = 0.5 * rng.standard_normal((K, 3))
         y = np.einsum("knc,kc->kn", model.X, truth) + noise(0.0, (K, N), rng)
-        apart += bool(model.judged(y, block_length([60.0], K * N))[2].apart)
+        apart += bool(model.assessed(y, block_length([60.0], K * N))[2].apart)
     assert apart >= 39
 
 
 def test_estimates_from_single_recordings_are_their_fits() -> None:
-    """Exactly for a linear model; NaN for a recording that does not determine all unknowns."""
+    """Exact for a linear model; NaN for a recording that does not determine all unknowns."""
     rng = np.random.default_rng(1)
     X = waves(4, 240, 3)
     X[2, :, 1] = X[2, :, 0]
     y = rng.standard_normal((4, 240))
-    _, _, said = Linear(X).judged(y, 16.0)
+    _, _, result = Linear(X).assessed(y, 16.0)
     for k in (0, 1, 3):
-        np.testing.assert_allclose(said.each[k], np.linalg.lstsq(X[k], y[k])[0], rtol=1e-6)
-    assert np.isnan(said.each[2]).all()
+        np.testing.assert_allclose(result.each[k], np.linalg.lstsq(X[k], y[k])[0], rtol=1e-6)
+    assert np.isnan(result.each[2]).all()
 
 
 def test_units_of_the_unknowns_do_not_matter() -> None:
-    """Twenty orders of magnitude between two of them: all deviations and draws follow."""
+    """All deviations and draws scale with units that differ by twenty orders of magnitude."""
     unit = np.array([1e10, 1.0, 1e-10])
     X, y = waves(3, 480, 3), noise(0.8, (3, 480), np.random.default_rng(2))
-    _, _, one = Linear(X).judged(y, 36.0, draws=50)
+    _, _, one = Linear(X).assessed(y, 36.0, draws=50)
     theta, condensed = Linear(X).fitted(y)
     wide = np.append(unit, 1.0)
     other = Condensed(
@@ -272,27 +290,27 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
 
 
 def test_the_interval_is_the_hull() -> None:
-    """The hull of the formal interval, the sandwich interval and the 2.5 and 97.5 % draws."""
+    """It contains the formal interval, the sandwich interval and the 2.5 and 97.5 % draws."""
     y = noise(0.9, (1, 1600), np.random.default_rng(4))
-    theta, formal, said = Linear(waves(1, 1600, 2)).judged(y, 80.0, draws=400)
-    low, high = said.interval.T
-    tails = np.quantile(said.draws, [0.025, 0.975], axis=0)
+    theta, formal, result = Linear(waves(1, 1600, 2)).assessed(y, 80.0, draws=400)
+    low, high = result.interval.T
+    tails = np.quantile(result.draws, [0.025, 0.975], axis=0)
     low, high = low - 1e-12, high + 1e-12
     assert (
         low
-        <= np.minimum(theta - 1.96 * said.sandwich, np.minimum(theta - 1.959 * formal, tails[0]))
+        <= np.minimum(theta - 1.96 * result.sandwich, np.minimum(theta - 1.959 * formal, tails[0]))
     ).all()
     assert (
         high
-        >= np.maximum(theta + 1.96 * said.sandwich, np.maximum(theta + 1.959 * formal, tails[1]))
+        >= np.maximum(theta + 1.96 * result.sandwich, np.maximum(theta + 1.959 * formal, tails[1]))
     ).all()
-    assert said.blocks == 20
-    assert said.draws.shape == (400, 2)
-    np.testing.assert_array_equal(said.between, 0.0)
+    assert result.blocks == 20
+    assert result.draws.shape == (400, 2)
+    np.testing.assert_array_equal(result.between, 0.0)
 
 
 def test_blocks_are_four_autocorrelation_times_long() -> None:
-    """One row for white residuals, and never more than a twentieth of the data."""
+    """A block has one row for white residuals, and at most a twentieth of the data."""
     assert block_length([1.0, 1.2], 10_000) == 1.0
     assert block_length([2.0, 9.0], 10_000) == 36.0
     assert block_length([1000.0], 10_000) == 500.0
@@ -301,8 +319,9 @@ def test_blocks_are_four_autocorrelation_times_long() -> None:
 
 
 def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
-    """Random recordings: blocks do not cross recordings, keep their order and are as short as
-    possible.
+    """Merged blocks of random recordings do not cross recordings and keep their order.
+
+    They are as short as possible.
     """
     rng = np.random.default_rng(3)
     for _ in range(200):
@@ -315,14 +334,14 @@ def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
         assert merged[0] == 0
         assert set(np.diff(merged).tolist()) <= {0, 1}, "runs, numbered in order"
         for label in range(merged[-1] + 1):
-            mine = merged == label
-            assert len(set(recording[mine].tolist())) == 1
-            total, whole = rows[mine].sum(), rows[recording == recording[mine][0]].sum()
-            last = np.flatnonzero(mine)[-1] + 1
+            in_block = merged == label
+            assert len(set(recording[in_block].tolist())) == 1
+            total, whole = rows[in_block].sum(), rows[recording == recording[in_block][0]].sum()
+            last = np.flatnonzero(in_block)[-1] + 1
             final = last == len(rows) or recording[last] != recording[last - 1]
             assert total >= min((0.5 if final else 1.0) * length, whole)
             if not final:
-                assert total - rows[mine][-1] < length, "longer than needed"
+                assert total - rows[in_block][-1] < length, "longer than needed"
             else:
                 assert total < 1.5 * length + 20.0
     assert merge_blocks(np.zeros(0, int), np.zeros(0), 5.0).shape == (0,)

@@ -1,4 +1,4 @@
-"""Recordings cut into segments: every row once, every segment with a measured initial state."""
+"""Segments of recordings: every row belongs to one segment with a measured initial state."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ def body(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
 
 
 def truth(task: DesignTask, factor: float = 1.1) -> Array:
-    """(N+1, ny) of parameters that are not the guess."""
+    """(N+1, ny) outputs at parameters that are a multiple of the guess."""
     return np.asarray(task.plant.measure(factor * task.parameters.guess[None], task.control)[0][0])
 
 
-def track(
+def aligned_log(
     task: DesignTask,
     y: Array | None = None,
     rows: Array | None = None,
     hidden: tuple[str, ...] = (),
 ) -> AlignedRecording:
-    """A noise-free log of some rows, some columns taken out."""
+    """A noise-free recording of some rows, without the hidden columns."""
     y = np.array(truth(task) if y is None else y)
     rows = np.arange(len(y)) if rows is None else rows
     kept = (
@@ -68,8 +68,10 @@ def track(
     )
 
 
-def covered(segments: tuple[Segment, ...], recordings: list[AlignedRecording]) -> None:
-    """Every row of every track belongs to exactly one segment, which simulates it."""
+def require_rows_covered_once(
+    segments: tuple[Segment, ...], recordings: list[AlignedRecording]
+) -> None:
+    """Require that every row belongs to exactly one segment, which simulates its time."""
     for i, one in enumerate(recordings):
         rows = np.concatenate([np.arange(len(one.t))[p.rows] for p in segments if p.recording == i])
         np.testing.assert_array_equal(rows, np.arange(len(one.t)))
@@ -82,8 +84,9 @@ def covered(segments: tuple[Segment, ...], recordings: list[AlignedRecording]) -
 @pytest.mark.parametrize("length", [0.04, 0.05, 0.17, 0.33, 1.0, 1.5, 9.0, None])
 @pytest.mark.parametrize("lead", [0.0, 0.004, 0.03])
 def test_every_row_is_in_one_segment(task: DesignTask, length: float | None, lead: float) -> None:
-    """Even logs, logs with missing rows, logs off the grid; segments of nearly the length asked
-    for.
+    """Recordings may be complete, have missing rows or lie off the grid.
+
+    Segments have nearly the requested length.
     """
     rng = np.random.default_rng(0)
     y = truth(task)
@@ -96,31 +99,33 @@ def test_every_row_is_in_one_segment(task: DesignTask, length: float | None, lea
         outputs=task.system.outputs.names,
         name="off.csv",
     )
-    recordings = [track(task), track(task, rows=some), align(task.system, off)]
+    recordings = [aligned_log(task), aligned_log(task, rows=some), align(task.system, off)]
     assert [t.on_grid for t in recordings] == [True, True, False]
     segments = cut_into_segments(task.system, recordings, length, lead)
-    covered(segments, recordings)
+    require_rows_covered_once(segments, recordings)
     ahead = int(np.ceil(lead / task.dt))
     for i, one in enumerate(recordings):
-        mine = [p for p in segments if p.recording == i]
-        sizes = np.array([p.samples - min(ahead, p.begin + ahead) * (p.begin > 0) for p in mine])
+        of_recording = [p for p in segments if p.recording == i]
+        sizes = np.array(
+            [p.samples - min(ahead, p.begin + ahead) * (p.begin > 0) for p in of_recording]
+        )
         if length is None or length >= one.t[-1]:
-            assert len(mine) == 1
-            assert mine[0].samples == len(one.ctrl)
+            assert len(of_recording) == 1
+            assert of_recording[0].samples == len(one.ctrl)
         if i == 0 and length is not None and length < one.t[-1]:
-            assert len(mine) == round(len(one.ctrl) * one.dt / length)
-            inner = np.diff([p.rows.start for p in mine])
+            assert len(of_recording) == round(len(one.ctrl) * one.dt / length)
+            inner = np.diff([p.rows.start for p in of_recording])
             assert inner.max(initial=0) - inner.min(initial=9999) <= 1 or not len(inner)
             assert min(sizes) >= MIN_SAMPLES
-        for p in mine[1:]:
+        for p in of_recording[1:]:
             first = round(one.t[p.rows.start] / one.dt - 0.5)
             assert p.begin == 0 or first - p.begin >= ahead - 1
             assert p.start.shape == (task.space.nq + task.space.nv,)
 
 
 def test_a_segment_begins_earlier_by_the_delay(task: DesignTask) -> None:
-    """So that what its first row shows is simulated; the first segment cannot."""
-    segments = cut_into_segments(task.system, [track(task)], 0.5, 0.025)
+    """Its first row shows an earlier state; the first segment cannot begin earlier."""
+    segments = cut_into_segments(task.system, [aligned_log(task)], 0.5, 0.025)
     assert [p.begin for p in segments] == [0, 47, 97, 147]
     assert [p.rows.start for p in segments] == [0, 50, 100, 150]
     assert [p.begin + p.samples for p in segments] == [50, 100, 150, 200]
@@ -128,27 +133,27 @@ def test_a_segment_begins_earlier_by_the_delay(task: DesignTask) -> None:
 
 
 def test_gaps_have_no_segments(task: DesignTask) -> None:
-    """A hole longer than a segment."""
+    """A gap in the rows is longer than a segment."""
     rows = np.concatenate([np.arange(60), np.arange(140, 201)])
-    recordings = [track(task, rows=rows)]
+    recordings = [aligned_log(task, rows=rows)]
     segments = cut_into_segments(task.system, recordings, 0.2, 0.0)
-    covered(segments, recordings)
+    require_rows_covered_once(segments, recordings)
     assert [p.begin for p in segments] == [0, 20, 40, 140, 160, 180]
 
 
 def test_segments_that_are_too_short_are_refused(task: DesignTask) -> None:
-    """In one sentence with the file, the key and what it takes."""
+    """The message has the file, the key, its value and the smallest length."""
     with pytest.raises(
         RecordingError, match=r"x\.csv: fit\.segments = 0\.03 s is too short.*4 samples of 0\.01 s"
     ):
-        cut_into_segments(task.system, [track(task)], 0.03, 0.0)
+        cut_into_segments(task.system, [aligned_log(task)], 0.03, 0.0)
 
 
 def test_whole_recordings_start_as_stated(task: DesignTask) -> None:
-    recordings = [track(task), track(task, rows=np.arange(80))]
+    recordings = [aligned_log(task), aligned_log(task, rows=np.arange(80))]
     start = np.array([0.1, 3.0, 0.0, 0.4])
     segments = whole_recordings(recordings, start)
-    covered(segments, recordings)
+    require_rows_covered_once(segments, recordings)
     assert [(p.recording, p.begin, p.samples) for p in segments] == [(0, 0, 200), (1, 0, 79)]
     for p in segments:
         np.testing.assert_array_equal(p.start, start)
@@ -159,41 +164,42 @@ def test_whole_recordings_start_as_stated(task: DesignTask) -> None:
 def test_measured_starts_are_where_the_motion_was(
     task: DesignTask, hidden: tuple[str, ...], gaps: bool
 ) -> None:
-    """A slide and a hinge; velocities measured, or read off the positions.
+    """Initial states of a slide and a hinge agree with the simulated motion.
 
-    Against the motion itself.
+    Velocities are measured, or computed from the positions.
     """
     y = truth(task)
     begins = np.array([0, 3, 60, 117, 199])
     shown = np.array(y)
     if gaps:
         shown[np.random.default_rng(0).random(shown.shape) < 0.3] = np.nan
-    states = measured_initial_states(task.system, track(task, shown, hidden=hidden), begins)
+    states = measured_initial_states(task.system, aligned_log(task, shown, hidden=hidden), begins)
     position, speed = np.ptp(y[:, :2], axis=0), np.ptp(y[:, 2:], axis=0)
     assert (np.abs(states[:, :2] - y[begins, :2]) < 0.02 * position).all()
     assert (np.abs(states[:, 2:] - y[begins, 2:]) < (0.15 if hidden else 0.1) * speed).all()
     inner = slice(2, 4)
     assert (np.abs(states[inner, 2:] - y[begins[inner], 2:]) < 0.05 * speed).all()
-    assert np.abs(states[2:, :2] - y[0, :2]).max() > 0.1, "a motion that goes nowhere shows nothing"
+    assert np.abs(states[2:, :2] - y[0, :2]).max() > 0.1, "the motion is too small for this test"
 
 
 def test_noise_is_averaged_over_the_rows_around(task: DesignTask) -> None:
-    """Starts are several times better than the rows that they are read off."""
+    """Initial states are more accurate than single rows."""
     y, begins = truth(task), np.arange(15, 185, 2)
     noisy = y + 0.02 * np.random.default_rng(0).standard_normal(y.shape)
-    states = measured_initial_states(task.system, track(task, noisy), begins)
+    states = measured_initial_states(task.system, aligned_log(task, noisy), begins)
     assert np.std((states - y[begins])[:, :2]) < 0.5 * 0.02
 
 
 def test_a_free_body_starts_with_its_orientation(body: DesignTask) -> None:
-    """Position, measured quaternion (the nearest, of unit length), velocities; for a ball joint
-    too.
+    """The quaternion is that of the nearest row, scaled to unit length.
+
+    This holds for a free joint and for a ball joint.
     """
     y = truth(body)
     begins = np.array([0, 50, 133])
     noisy = np.array(y)
     noisy[:, 3:11] *= 1.01
-    states = measured_initial_states(body.system, track(body, noisy), begins)
+    states = measured_initial_states(body.system, aligned_log(body, noisy), begins)
     for first in (3, 7):
         np.testing.assert_allclose(
             np.linalg.norm(states[:, first : first + 4], axis=1), 1.0, rtol=1e-12
@@ -206,30 +212,31 @@ def test_a_free_body_starts_with_its_orientation(body: DesignTask) -> None:
 
 
 def test_unmeasured_states_follow_the_model_at_the_guess(body: DesignTask) -> None:
-    """Velocities of rotations that the log does not hold; all of it where orientations are missing
-    too.
+    """Rotational velocities come from the model if the recording has only orientations.
+
+    Without orientations, these come from the model as well.
     """
     y, guess = truth(body), truth(body, 1.0)
     begins = np.array([0, 40, 120])
-    slow = measured_initial_states(body.system, track(body, y, hidden=("qvel",)), begins)
+    slow = measured_initial_states(body.system, aligned_log(body, y, hidden=("qvel",)), begins)
     np.testing.assert_allclose(slow[:, 14:], guess[begins, 14:], rtol=0, atol=1e-9)
     np.testing.assert_allclose(
         slow[:, 11:14], y[begins, 11:14], rtol=0, atol=0.1 * np.ptp(y[:, 11:14])
     )
     ball = measured_initial_states(
-        body.system, track(body, y, hidden=("qpos:ball", "qvel")), begins
+        body.system, aligned_log(body, y, hidden=("qpos:ball", "qvel")), begins
     )
     np.testing.assert_allclose(ball[:, 7:11], guess[begins, 7:11], rtol=0, atol=1e-9)
     np.testing.assert_allclose(ball[:, 3:7], y[begins, 3:7], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("hidden", [("qpos:slide",), ("qvel:hinge",), ("qpos:slide", "qvel")])
-def test_an_output_that_a_recording_lacks_does_not_spoil_its_starts(
+def test_initial_states_without_one_output_come_from_the_model(
     task: DesignTask, hidden: tuple[str, ...]
 ) -> None:
-    """One of several recordings without that column: the model stands in."""
+    """The missing component of the initial state comes from the model."""
     y, guess, begins = truth(task), truth(task, 1.0), np.array([0, 70, 150])
-    states = measured_initial_states(task.system, track(task, y, hidden=hidden), begins)
+    states = measured_initial_states(task.system, aligned_log(task, y, hidden=hidden), begins)
     assert np.isfinite(states).all()
     names = task.system.outputs.names
     if "qpos:slide" in hidden:
@@ -241,21 +248,26 @@ def test_an_output_that_a_recording_lacks_does_not_spoil_its_starts(
 
 @pytest.mark.parametrize("fit", [{"start": "measured"}, {"segments": 0.5}])
 @pytest.mark.parametrize("names", [("qpos:hinge",), ("qvel:hinge",)])
-def test_a_start_that_nothing_shows_does_no_harm(
+def test_an_initial_position_that_no_output_shows_does_not_disturb_the_fit(
     tmp_path: Path, fit: dict[str, object], names: tuple[str, ...]
 ) -> None:
-    """Where the cart stands is in no output: only round-off of differences speaks of it, and must
-    not steer the search.
+    """No output depends on the position of the cart.
+
+    Its derivatives are round-off, which must not influence the search.
     """
     noise = dict.fromkeys(names, 0.01)
-    blind = cart_task(tmp_path, horizon=3.0, noise=noise, fit={**fit, "bootstrap": 0})
-    theta, y = 1.1 * blind.parameters.guess, truth(blind)
+    unseen = cart_task(tmp_path, horizon=3.0, noise=noise, fit={**fit, "bootstrap": 0})
+    theta, y = 1.1 * unseen.parameters.guess, truth(unseen)
     y = y + 0.01 * np.random.default_rng(0).standard_normal(y.shape)
     found = identify_system(
-        blind.system,
+        unseen.system,
         [
             Recording(
-                t=np.arange(len(y)) * blind.dt, ctrl=blind.control, y=y, outputs=names, name="x.csv"
+                t=np.arange(len(y)) * unseen.dt,
+                ctrl=unseen.control,
+                y=y,
+                outputs=names,
+                name="x.csv",
             )
         ],
     )
@@ -268,8 +280,8 @@ def segment(samples: int) -> Segment:
     return Segment(recording=0, begin=0, samples=samples, rows=slice(0, 1), start=np.zeros(1))
 
 
-def test_batches_hold_every_segment_once_within_the_limit() -> None:
-    """Of like length, within the limit unless one alone is longer, and not one by one."""
+def test_batches_contain_every_segment_once_within_the_limit() -> None:
+    """Segments of a batch have similar length; only a single segment may exceed the limit."""
     rng = np.random.default_rng(0)
     for most in (10, 200, 5000):
         segments = [segment(int(n)) for n in rng.integers(4, 120, 60)]

@@ -68,7 +68,7 @@ def test_a_minimal_experiment_identifies_its_parameters(
 def test_a_minimal_experiment_can_be_checked_on_recordings(
     experiment: mjfim.Experiment, recording: Recording
 ) -> None:
-    """Its standard deviations at the estimate are the formal ones of the estimate."""
+    """Standard deviations of the check at the estimate are the formal ones of the estimate."""
     estimate = mjfim.identify(experiment, [recording])
     guesses = zip(estimate.parameters, estimate.theta.tolist(), strict=True)
     at_estimate = experiment.replace(parameters={name: {"guess": value} for name, value in guesses})
@@ -112,9 +112,7 @@ def test_a_stop_token_ends_the_search_with_the_best_result_so_far(
 def test_variants_of_a_problem_leave_the_problem_unchanged(
     experiment: mjfim.Experiment, recording: Recording
 ) -> None:
-    """Variants share what they do not change, and nothing of them shows in the problem that they
-    were made from.
-    """
+    """Variants share unchanged parts; the original problem does not change."""
     task = FitTask.resolve(experiment.replace(fit={"segments": 0.5}), [recording])
     problem = task.problem()
     begin = problem.begin(task.start)

@@ -1,5 +1,6 @@
-"""The relaxed barrier: twice differentiable, defined outside the bounds, and checked by hand on
-bounds of every kind.
+"""The relaxed barrier on bounds of every kind.
+
+It is twice differentiable and defined outside the bounds.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def test_the_grid_rounds_to_multiples_from_its_first_multiple_on() -> None:
 
 
 def test_a_stopped_search_returns_the_bracket_so_far() -> None:
-    """Stopped by the budget between two evaluations, or by an evaluation that gives no ratio."""
+    """The budget stops it between two evaluations, or an evaluation gives no ratio."""
     grid = SampleGrid(unit=1, first_multiple=0)
     stop = StopToken()
 

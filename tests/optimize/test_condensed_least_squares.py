@@ -17,7 +17,14 @@ from tests.support.numerics import Array
 class Dense:
     """A problem in condensed and in dense form.
 
-    J: (rows, P n + c), r: (rows,) all rows;  blocks: rows `[private, common, r]`.
+    Attributes:
+        condensed: Condensed form.
+        J: (rows, P n + c) derivatives by all unknowns.
+        r: (rows,) residuals.
+        blocks: Rows `[private, common, r]` of every block.
+        P: Number of segments.
+        n: Number of private unknowns of a segment.
+        c: Number of common unknowns.
     """
 
     condensed: Condensed
@@ -45,21 +52,22 @@ class Dense:
 
 
 def condense(rows: Array) -> Array:
-    """(m, m) matrix with the inner products of (k, m) rows, by singular values; the package uses
-    QR.
+    """(m, m) matrix with the inner products of (k, m) rows.
+
+    It is computed by singular values; the package uses the QR decomposition.
     """
     m = rows.shape[1]
     _, s, V = np.linalg.svd(rows, full_matrices=True)
     out = np.zeros((m, m))
     out[: len(s)] = s[:, None] * V[: len(s)]
-    out[:, ~rows.any(axis=0)] = 0.0  # to the last bit, as QR leaves it
+    out[:, ~rows.any(axis=0)] = 0.0  # exactly zero, as with QR
     return out
 
 
-def spread(rows: Array, piece: int, P: int, n: int) -> Array:
+def spread(rows: Array, segment: int, P: int, n: int) -> Array:
     """(k, P n + c) of rows `[private, common]` of one segment among the columns of all unknowns."""
     wide = np.zeros((len(rows), P * n + rows.shape[1] - n))
-    wide[:, piece * n : (piece + 1) * n] = rows[:, :n]
+    wide[:, segment * n : (segment + 1) * n] = rows[:, :n]
     wide[:, P * n :] = rows[:, n:]
     return wide
 
@@ -71,10 +79,18 @@ def problem(
     c: int = 3,
     inner: int = 1,
     outer: int = 2,
-    lame: bool = False,
+    rank_deficient: bool = False,
 ) -> Dense:
-    """Random segments of one to three blocks in shuffled order, with priors. lame: no row depends
-    on the last private unknown.
+    """Random segments of one to three blocks in shuffled order, with priors.
+
+    Args:
+        seed: Seed of the random numbers.
+        P: Number of segments.
+        n: Number of private unknowns of a segment.
+        c: Number of common unknowns.
+        inner: Number of private rows of a segment.
+        outer: Number of common rows.
+        rank_deficient: Whether no row depends on the last private unknown.
     """
     rng = np.random.default_rng(seed)
     m = n + c + 1
@@ -86,7 +102,7 @@ def problem(
         rng.standard_normal((P, inner, m)) * units,
         rng.standard_normal((outer, c + 1)) * units[n:],
     )
-    if lame and n:
+    if rank_deficient and n:
         inside[:, :, n - 1] = 0.0
         for block in blocks:
             block[:, n - 1] = 0.0
@@ -96,9 +112,9 @@ def problem(
         private_rows=inside,
         common_rows=outside,
     )
-    every = [spread(b[:, :-1], i, P, n) for b, i in zip(blocks, owner, strict=True)]
-    every += [spread(own[:, :-1], i, P, n) for i, own in enumerate(inside)]
-    J = np.concatenate([*every, np.pad(outside[:, :-1], ((0, 0), (P * n, 0)))])
+    wide_rows = [spread(b[:, :-1], i, P, n) for b, i in zip(blocks, owner, strict=True)]
+    wide_rows += [spread(rows[:, :-1], i, P, n) for i, rows in enumerate(inside)]
+    J = np.concatenate([*wide_rows, np.pad(outside[:, :-1], ((0, 0), (P * n, 0)))])
     r = np.concatenate([*(b[:, -1] for b in blocks), inside[:, :, -1].ravel(), outside[:, -1]])
     return Dense(condensed, J, r, blocks, P, n, c)
 
@@ -107,11 +123,11 @@ SHAPES = [(4, 2, 3), (1, 3, 2), (5, 0, 3), (3, 4, 1), (6, 1, 5)]
 FREE = np.inf
 
 
-def close(value: Array, wanted: Array, rtol: float = 1e-7) -> None:
+def close(value: Array, expected: Array, rtol: float = 1e-7) -> None:
     """Equal up to round-off of the largest entry."""
-    assert value.shape == wanted.shape
+    assert value.shape == expected.shape
     np.testing.assert_allclose(
-        value, wanted, rtol=rtol, atol=rtol * max(float(np.abs(wanted).max(initial=0.0)), 1e-12)
+        value, expected, rtol=rtol, atol=rtol * max(float(np.abs(expected).max(initial=0.0)), 1e-12)
     )
 
 
@@ -120,16 +136,16 @@ def close(value: Array, wanted: Array, rtol: float = 1e-7) -> None:
 def test_a_step_solves_the_full_stacked_problem(
     shape: tuple[int, int, int], damping: float
 ) -> None:
-    """`min |J d + r|^2 + damping |scale d|^2`, with the damping as one further row per unknown."""
+    """The dense problem has one further row per unknown for the damping."""
     for seed in range(6):
         dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
         scale = np.random.default_rng(seed).uniform(0.5, 2.0, dense.n + dense.c)
         wide = np.concatenate([np.tile(scale[: dense.n], dense.P), scale[dense.n :]])
         rows = np.concatenate([dense.J, np.sqrt(damping) * np.diag(wide)])
-        wanted = lstsq(rows, -np.concatenate([dense.r, np.zeros(len(wide))]))[0]
+        expected = lstsq(rows, -np.concatenate([dense.r, np.zeros(len(wide))]))[0]
         step = dense.condensed.step(damping, scale, np.full(dense.c, -FREE), np.full(dense.c, FREE))
         unit = np.linalg.norm(rows, axis=0)
-        close(np.concatenate([step.private.ravel(), step.common]) * unit, wanted * unit)
+        close(np.concatenate([step.private.ravel(), step.common]) * unit, expected * unit)
         assert step.predicted_decrease == pytest.approx(
             0.5 * float(dense.r @ dense.r) - dense.halves(step), rel=1e-8
         )
@@ -139,7 +155,7 @@ def test_a_step_solves_the_full_stacked_problem(
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int]) -> None:
-    """Compare with another method of scipy on the full problem; common unknowns are bounded."""
+    """Compare with another method of SciPy on the full problem with bounded common unknowns."""
     active = 0
     for seed in range(10):
         dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
@@ -157,7 +173,7 @@ def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int
         unit = np.linalg.norm(dense.J, axis=0)
         none = np.full(dense.P * dense.n, FREE)
         wide = (np.concatenate([-none, lower]) * unit, np.concatenate([none, upper]) * unit)
-        wanted = lsq_linear(
+        expected = lsq_linear(
             dense.J / unit,
             -dense.r,
             wide,
@@ -166,16 +182,16 @@ def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int
             lsq_solver="exact",
             max_iter=500,
         )
-        assert dense.halves(step) <= wanted.cost * (1 + 1e-9)
+        assert dense.halves(step) <= expected.cost * (1 + 1e-9)
         np.testing.assert_allclose(
-            step.common * unit[-dense.c :], wanted.x[-dense.c :], rtol=1e-4, atol=1e-5
+            step.common * unit[-dense.c :], expected.x[-dense.c :], rtol=1e-4, atol=1e-5
         )
         active += int(((step.common == lower) | (step.common == upper)).sum())
-    assert active > 5, "bounds that never bind show nothing"
+    assert active > 5, "too few bounds are active for this test"
 
 
 def test_many_active_bounds_satisfy_the_optimality_conditions() -> None:
-    """Strongly correlated unknowns, most of which end at a bound."""
+    """Unknowns are strongly correlated, and most of them end at a bound."""
     for seed in (
         4,
         1188,
@@ -212,9 +228,9 @@ def test_a_common_unknown_with_equal_bounds_stays() -> None:
     lower, upper = np.array([-FREE, 0.0, -FREE]), np.array([FREE, 0.0, FREE])
     step = dense.condensed.step(0.0, np.ones(5), lower, upper)
     kept = np.delete(np.arange(dense.J.shape[1]), dense.P * dense.n + 1)
-    wanted = lstsq(dense.J[:, kept], -dense.r)[0]
+    expected = lstsq(dense.J[:, kept], -dense.r)[0]
     assert step.common[1] == 0.0
-    close(step.common[[0, 2]], wanted[-2:])
+    close(step.common[[0, 2]], expected[-2:])
     none = np.zeros(3)
     still = dense.condensed.step(0.0, np.ones(5), none, none)
     close(still.private.ravel(), lstsq(dense.starts, -dense.r)[0])
@@ -222,12 +238,14 @@ def test_a_common_unknown_with_equal_bounds_stays() -> None:
     assert still.common_length == 0.0
 
 
-@pytest.mark.parametrize("lame", [False, True])
+@pytest.mark.parametrize("rank_deficient", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_elimination_gives_the_schur_complement(shape: tuple[int, int, int], lame: bool) -> None:
-    """Response, information and reduced rows against the full normal matrix."""
+def test_elimination_gives_the_schur_complement(
+    shape: tuple[int, int, int], rank_deficient: bool
+) -> None:
+    """Compare response, information and reduced rows with the full normal matrix."""
     for seed in range(4):
-        dense = problem(seed, *shape, lame=lame)
+        dense = problem(seed, *shape, rank_deficient=rank_deficient)
         C, P, n, c = dense.condensed, dense.P, dense.n, dense.c
         inverse = np.linalg.pinv(
             dense.starts / (unit := np.maximum(np.linalg.norm(dense.starts, axis=0), 1e-30))
@@ -247,11 +265,11 @@ def test_elimination_gives_the_schur_complement(shape: tuple[int, int, int], lam
 
 
 def test_column_norms() -> None:
-    """Root mean square over segments for private unknowns, norm with priors for common ones."""
+    """They are root mean squares over segments for private unknowns."""
     dense = problem(1)
     norms = np.linalg.norm(dense.J, axis=0)
-    own = np.sqrt(np.mean(norms[: dense.P * dense.n].reshape(dense.P, dense.n) ** 2, axis=0))
-    close(dense.condensed.column_norms, np.concatenate([own, norms[dense.P * dense.n :]]))
+    private = np.sqrt(np.mean(norms[: dense.P * dense.n].reshape(dense.P, dense.n) ** 2, axis=0))
+    close(dense.condensed.column_norms, np.concatenate([private, norms[dense.P * dense.n :]]))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -277,11 +295,11 @@ def test_scores_and_information_of_blocks_sum_to_the_whole(
         known = np.concatenate([C.reduced_private_rows.reshape(-1, dense.c + 1), C.common_rows])
         gradient = C.block_scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
         fitted = dense.starts @ np.linalg.lstsq(dense.starts, -dense.r)[0] if n else 0.0
-        wanted = dense.shared.T @ (dense.r + fitted)
+        expected = dense.shared.T @ (dense.r + fitted)
         if n:
             basis = np.linalg.qr(dense.starts)[0]
-            wanted = (dense.shared - basis @ (basis.T @ dense.shared)).T @ dense.r
-        close(gradient, wanted, rtol=1e-6)
+            expected = (dense.shared - basis @ (basis.T @ dense.shared)).T @ dense.r
+        close(gradient, expected, rtol=1e-6)
         close(
             C.block_information.sum(axis=0) + known[:, :-1].T @ known[:, :-1],
             C.information(),
@@ -290,7 +308,7 @@ def test_scores_and_information_of_blocks_sum_to_the_whole(
 
 
 def test_the_gradient_lets_the_private_unknowns_follow() -> None:
-    """Compared with differences of the minimum over the private unknowns."""
+    """Compare with differences of the minimum over the private unknowns."""
     dense = problem(5, inner=3)
     C = dense.condensed
 
@@ -310,7 +328,7 @@ def test_the_gradient_lets_the_private_unknowns_follow() -> None:
 def test_undetermined_private_unknowns_do_not_break_the_step(damping: float) -> None:
     """No row depends on one private unknown, and one segment has fewer rows than unknowns."""
     for seed in range(5):
-        dense = problem(seed, P=3, n=3, c=2, inner=0, outer=3, lame=True)
+        dense = problem(seed, P=3, n=3, c=2, inner=0, outer=3, rank_deficient=True)
         scale = np.maximum(dense.condensed.column_norms, 0.0)
         step = dense.condensed.step(damping, scale, np.full(2, -FREE), np.full(2, FREE))
         assert np.isfinite(step.private).all()
@@ -322,7 +340,7 @@ def test_undetermined_private_unknowns_do_not_break_the_step(damping: float) -> 
 
 
 def test_a_problem_without_common_unknowns() -> None:
-    """Every segment is solved for itself."""
+    """Every segment is solved separately."""
     dense = problem(2, P=3, n=2, c=0, inner=2, outer=0)
     none = np.zeros(0)
     step = dense.condensed.step(0.0, np.ones(2), none, none)
@@ -345,7 +363,7 @@ def test_step_lengths_are_standard_deviations() -> None:
 
 
 def test_units_of_the_unknowns_do_not_matter() -> None:
-    """Columns ten orders of magnitude apart give the same step in their own units."""
+    """Columns ten orders of magnitude apart give equal steps in these units."""
     dense = problem(9, inner=3, outer=4)
     unit = np.array([1e6, 1e-4, 1e-5, 1.0, 1e5, 1.0])
     C = dense.condensed

@@ -25,7 +25,7 @@ VALUES = {"apart": [0.5, 0.85, 2.0], "meeting": [0.5, 0.5 + 5e-10, 0.525]}
 
 
 def model_of(values: list[float], power: float = 12.0, share: float = 0.6) -> EigenvalueModel:
-    """A model without slopes."""
+    """A model without derivatives by state and control."""
     m = len(values) * (len(values) + 1) // 2
     return EigenvalueModel(
         eigenvalues=np.array(values),
@@ -47,10 +47,10 @@ def test_coordinates_keep_scalar_products() -> None:
 
 @pytest.mark.parametrize("values", VALUES)
 def test_the_model_is_the_criterion_of_changed_information(values: str) -> None:
-    """`log phi` of an information whose logarithm changes by B, times its weight in the cost."""
+    """It is the weighted `log phi` of an information whose logarithm changes by B."""
     rng, model = np.random.default_rng(1), model_of(VALUES[values])
 
-    def wanted(d: Array) -> float:
+    def expected(d: Array) -> float:
         moved = np.diag(np.log(model.eigenvalues)) + symmetric_matrix(d, 3)
         return model.weight * float(
             np.log(smooth_e_optimality(np.asarray(expm(moved)), model.power).value)
@@ -60,7 +60,7 @@ def test_the_model_is_the_criterion_of_changed_information(values: str) -> None:
     assert model.value(zero) == 0.0
     for size in (1e-3, 0.3, 3.0):
         d = size * rng.normal(size=6)
-        assert model.value(d) == pytest.approx(wanted(d) - wanted(zero), rel=1e-6, abs=1e-9)
+        assert model.value(d) == pytest.approx(expected(d) - expected(zero), rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize("values", VALUES)
@@ -76,7 +76,7 @@ def test_the_gradient_agrees_with_differences_and_the_model_is_convex(values: st
 
 @pytest.mark.parametrize("values", VALUES)
 def test_the_minimising_gradient_solves_the_proximal_problem(values: str) -> None:
-    """Also with a singular spread: coordinates that no step can change keep their values."""
+    """With a singular spread, coordinates that no step can change keep their values."""
     rng, model = np.random.default_rng(3), model_of(VALUES[values][:2])
     for rank in (3, 1):
         root = rng.normal(size=(3, rank))
@@ -104,7 +104,7 @@ def test_divided_differences_give_the_derivative_of_the_matrix_logarithm() -> No
 def test_slopes_agree_with_the_logarithm_of_simulated_information(
     information: str, tmp_path: Path
 ) -> None:
-    """Along random controls, in the eigenvectors of the point, off the diagonal too."""
+    """Compare along random controls, in the eigenvectors of the point, also off the diagonal."""
     tables = {
         "plain": {},
         "nuisance": {"nuisance": {"initial": {"qpos:slide": 0.05}}},

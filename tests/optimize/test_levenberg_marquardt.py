@@ -1,5 +1,6 @@
-"""The bounded Levenberg-Marquardt search against SciPy's on small analytic problems, and its status
-where it fails.
+"""Bounded Levenberg-Marquardt on small analytic problems, compared with SciPy.
+
+The status names the reason where the search fails.
 """
 
 from __future__ import annotations
@@ -29,13 +30,18 @@ SHARP = SearchSettings(max_iterations=200, tolerance=1e-9)
 
 @dataclass(eq=False)
 class Analytic:
-    """Residuals of each segment as a function of (theta, its private unknowns); derivatives by
-    complex steps.
+    """Residuals of segments as functions of theta and of the private unknowns of the segment.
 
-    Every evaluated point is kept.
+    Derivatives are computed by complex steps.
 
-    spoil: changes the Jacobian of a segment, (k, n + c);  stop: number of the evaluation that sets
-    the stop token
+    Attributes:
+        segments: Residuals of every segment.
+        lower: (c,) lower bounds of theta.
+        upper: (c,) upper bounds of theta.
+        spoil: Changes the (k, n + c) Jacobian of a segment.
+        stop: Number of the evaluation that sets the stop token.
+        token: The stop token.
+        seen: All evaluated points.
     """
 
     segments: tuple[Rows, ...]
@@ -47,7 +53,9 @@ class Analytic:
     seen: list[UnknownValues] = field(default_factory=list)
 
     def residuals(self, at: UnknownValues) -> list[Array]:
-        return [rows(at.theta, own) for rows, own in zip(self.segments, at.private, strict=True)]
+        return [
+            rows(at.theta, private) for rows, private in zip(self.segments, at.private, strict=True)
+        ]
 
     def cost(self, at: UnknownValues) -> float:
         self.seen.append(at)
@@ -121,8 +129,9 @@ def solved(p: Analytic, start: UnknownValues, search: SearchSettings = SHARP) ->
 
 
 def decays(sigma: float = 0.01) -> tuple[Rows, ...]:
-    """Exponential decays with one rate and one offset, each segment with its amplitude as private
-    unknown.
+    """Exponential decays with a common rate and offset.
+
+    The amplitude of each segment is its private unknown.
     """
     rng = np.random.default_rng(0)
     t = np.linspace(0.0, 2.0, 25)
@@ -130,24 +139,24 @@ def decays(sigma: float = 0.01) -> tuple[Rows, ...]:
     for amplitude in (1.0, 0.4, -2.0):
         y = amplitude * np.exp(-1.7 * t) + 0.3 + sigma * rng.standard_normal(len(t))
         found.append(
-            lambda theta, own, y=y: (own[0] * np.exp(-theta[0] * t) + theta[1] - y) / sigma
+            lambda theta, private, y=y: (private[0] * np.exp(-theta[0] * t) + theta[1] - y) / sigma
         )
     return tuple(found)
 
 
-def rosenbrock(theta: Array, own: Array) -> Array:
-    """A bent valley with its minimum at (1, 1)."""
+def rosenbrock(theta: Array, private: Array) -> Array:
+    """The function of Rosenbrock, a bent valley with its minimum at (1, 1)."""
     return np.array([100.0 * (theta[1] - theta[0] ** 2), 10.0 * (1.0 - theta[0])])
 
 
-def powell(theta: Array, own: Array) -> Array:
+def powell(theta: Array, private: Array) -> Array:
     """Powell's badly scaled function: the minimum is near (1.1e-5, 9.1)."""
     return np.array(
         [1e4 * theta[0] * theta[1] - 1.0, np.exp(-theta[0]) + np.exp(-theta[1]) - 1.0001]
     )
 
 
-def peak(theta: Array, own: Array) -> Array:
+def peak(theta: Array, private: Array) -> Array:
     """A Gaussian peak on noise."""
     x = np.linspace(-3.0, 3.0, 60)
     y = 2.0 * np.exp(-((x - 0.4) ** 2) / (2 * 0.7**2)) + 0.05 * np.random.default_rng(
@@ -196,8 +205,8 @@ def test_the_minimum_agrees_with_scipy(name: str) -> None:
     """No evaluated point leaves the bounds, and the cost falls from iterate to iterate."""
     build, start = CASES[name]
     p = build()
-    told: list[IterationReport] = []
-    found = minimise(p, start, SHARP, callback=told.append)
+    reports: list[IterationReport] = []
+    found = minimise(p, start, SHARP, callback=reports.append)
     assert found is not None
     theta, starts, cost = reference(build(), start)
     assert found.success, found.status
@@ -208,9 +217,9 @@ def test_the_minimum_agrees_with_scipy(name: str) -> None:
     for at in p.seen:
         assert (at.theta >= p.lower).all()
         assert (at.theta <= p.upper).all()
-    costs = [progress.cost for progress in told]
+    costs = [progress.cost for progress in reports]
     assert costs == sorted(costs, reverse=True)
-    assert [progress.iteration for progress in told] == list(range(1, len(told) + 1))
+    assert [progress.iteration for progress in reports] == list(range(1, len(reports) + 1))
     assert found.cost == costs[-1]
     assert found.cost == pytest.approx(p.cost(found.unknowns), rel=1e-12)
 
@@ -237,9 +246,10 @@ def test_gauss_newton_finds_the_minimum_and_ignores_bounds() -> None:
     assert len(lengths) > 3
 
 
-def cliff(theta: Array, own: Array) -> Array:
-    """Diverges for theta below 0.2, close to the minimum; the first steps from the right overshoot
-    into that region.
+def cliff(theta: Array, private: Array) -> Array:
+    """Residuals that diverge for theta below 0.2, close to the minimum.
+
+    The first steps from the right overshoot into that region.
     """
     bad = np.real(theta[0]) < 0.2
     x = np.linspace(0.0, 1.0, 12)
@@ -266,7 +276,7 @@ def test_diverging_trials_shorten_the_step() -> None:
 def test_a_minimum_at_a_cliff_is_not_called_converged() -> None:
     """The cost falls up to the border of the region that cannot be simulated."""
 
-    def rows(theta: Array, own: Array) -> Array:
+    def rows(theta: Array, private: Array) -> Array:
         bad = np.real(theta[0]) < 1.0
         return np.where(bad, np.nan, np.array([10.0 * theta[0], 3.0 * theta[0] + 1.0]))
 
@@ -277,8 +287,9 @@ def test_a_minimum_at_a_cliff_is_not_called_converged() -> None:
 
 
 def test_a_diverging_neighbourhood_is_reported() -> None:
-    """Where the linearisation fails after a step, the best point is returned with the previous
-    linearisation.
+    """The linearisation fails after a step.
+
+    The best point is returned with the previous linearisation.
     """
 
     class Once(Analytic):
@@ -296,8 +307,9 @@ def test_a_diverging_neighbourhood_is_reported() -> None:
 @pytest.mark.parametrize("damped", [True, False])
 @pytest.mark.parametrize("fault", ["sign", "swapped", "noise"])
 def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
-    """No step helps although the linearisation predicts a decrease: not converged, however short
-    the damped steps are.
+    """No step lowers the cost although the linearisation predicts it.
+
+    The search has not converged, even where damped steps are short.
     """
     rng = np.random.default_rng(3)
     spoils = {
@@ -318,9 +330,9 @@ def test_numerical_noise_does_not_prevent_convergence() -> None:
     """With round-off far above machine precision the search still succeeds close to the minimum."""
     for seed in range(10):
 
-        def rough(theta: Array, own: Array, seed: int = seed) -> Array:
+        def rough(theta: Array, private: Array, seed: int = seed) -> Array:
             ripple = np.sin(1e9 * (seed + 1) * np.sum(np.real(theta)) + np.arange(60.0))
-            return peak(theta, own) * (1.0 + 1e-7 * ripple)
+            return peak(theta, private) * (1.0 + 1e-7 * ripple)
 
         found = solved(
             problem(rough, lower=[0.0, -3.0, 0.1]),
@@ -334,7 +346,7 @@ def test_numerical_noise_does_not_prevent_convergence() -> None:
 
 
 def test_a_search_from_the_minimum_ends_at_once() -> None:
-    """With and without residuals that vanish at the minimum."""
+    """Residuals vanish at the minimum, or they do not."""
     exact = solved(problem(rosenbrock, lower=[-5.0, -5.0]), alone(1.0, 1.0))
     assert exact.success
     assert exact.iterations == 1
@@ -346,12 +358,13 @@ def test_a_search_from_the_minimum_ends_at_once() -> None:
 
 
 def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
-    """The first steps on the floor of a narrow valley are short; the minimum is ten standard
-    deviations away.
+    """The first steps on the floor of a narrow valley are short.
+
+    The minimum is ten standard deviations away.
     """
     for thin in (1e-2, 1e-3, 1e-4, 1e-5):
 
-        def rows(theta: Array, own: Array, thin: float = thin) -> Array:
+        def rows(theta: Array, private: Array, thin: float = thin) -> Array:
             total, apart = theta[0] + theta[1], theta[0] - theta[1]
             return np.array([total - 2.0, thin * apart - 10.0])
 
@@ -420,7 +433,7 @@ def test_the_limit_of_iterations_is_kept_and_reported() -> None:
 
 
 def test_the_last_linearisation_is_at_the_solution() -> None:
-    """Without `relinearise_at_end` it is the previous one."""
+    """Without `relinearise_at_end`, it is the previous one."""
     start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
     p = problem(*decays(), lower=[0.0, -5.0])
     found = solved(p, start, SearchSettings())

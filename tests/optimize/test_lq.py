@@ -1,5 +1,6 @@
-"""Linear recursions, regulator and descent against plain loops, SciPy's RiccatiSolution solver and
-a dense KKT system.
+"""Linear recursions, regulator and descent against independent solutions.
+
+These are plain loops, the Riccati solver of SciPy and a dense KKT system.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from tests.support.lq import positive, random_system, random_weights
 
 
 def dense_solution(A, B, a, b, Q, R, terminal) -> tuple[np.ndarray, np.ndarray]:
-    """(z, v) of the LQ problem by one dense KKT solve over z_1 ... z_N, v_0 ... v_{N-1} and the
-    multipliers.
+    """Solution (z, v) of the LQ problem by one dense KKT system.
+
+    Its unknowns are z_1 ... z_N, v_0 ... v_{N-1} and the multipliers.
     """
     N, nx, nu = B.shape
     nz, nv = N * nx, N * nu
@@ -46,7 +48,7 @@ def dense_solution(A, B, a, b, Q, R, terminal) -> tuple[np.ndarray, np.ndarray]:
 
 
 def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
-    """The quadratic form, sample by sample."""
+    """The quadratic form, computed sample by sample."""
     total, before = float(z[-1] @ weights.Q[-1] @ z[-1]), np.zeros(v.shape[1])
     for k, now in enumerate(v):
         total += (

@@ -1,5 +1,6 @@
-"""Algorithm 1 on a pendulum written in NumPy, with exact derivatives: no MuJoCo, nothing but the
-algorithm is tested.
+"""Algorithm 1 on a pendulum written in NumPy, with exact derivatives.
+
+Only the algorithm is tested, without MuJoCo.
 """
 
 from __future__ import annotations
@@ -33,20 +34,25 @@ Q, R, TERMINAL = np.diag([1.0, 0.1]), np.array([[0.05]]), np.diag([20.0, 5.0])
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """x: (N+1, 2) angle and rate, u: (N, 1)."""
+    """A trajectory of the pendulum.
+
+    Attributes:
+        x: (N+1, 2) angle and rate.
+        u: (N, 1) torque.
+    """
 
     x: Array
     u: Array
 
 
 def step(x: Array, u: Array) -> Array:
-    """One sample of a damped pendulum, angle from hanging."""
+    """One sample of a damped pendulum; the angle is zero when it hangs down."""
     rate = x[1] + DT * (-np.sin(x[0]) - 0.1 * x[1] + u[0])
     return np.array([x[0] + DT * rate, rate])
 
 
 def jacobians(x: Array) -> tuple[Array, Array]:
-    """Derivative of `step`."""
+    """Derivatives of `step` by state and control."""
     bend = -DT * np.cos(x[0])
     drag = 1.0 - 0.1 * DT
     return np.array([[1.0 + DT * bend, DT * drag], [bend, drag]]), np.array([[DT * DT], [DT]])
@@ -54,10 +60,13 @@ def jacobians(x: Array) -> tuple[Array, Array]:
 
 @dataclass
 class Pendulum:
-    """Swing towards upright with quadratic cost. Keeps every value that was evaluated.
+    """Swing-up with a quadratic cost, as a problem that keeps every evaluated value.
 
-    shift: subtracted from the cost;  sign: of the gradient of `expand`;  wall: |u| beyond which a
-    trial diverges refinements: how often `refine` has something better
+    Attributes:
+        shift: Number that is subtracted from the cost.
+        sign: Sign of the gradient of `expand`.
+        wall: Size of the torque above which a trial diverges.
+        refinements: Number of times that `refine` returns a more accurate point.
     """
 
     shift: float = 0.0
@@ -67,19 +76,19 @@ class Pendulum:
     values: list[float] = field(default_factory=list)
 
     def rollout(self, u: Array) -> Curve:
-        """Open loop."""
+        """Trajectory without feedback."""
         x = [START]
         for k in range(N):
             x.append(step(x[-1], u[k]))
         return Curve(np.array(x), u)
 
     def value(self, point: Curve) -> float:
-        """J by plain loops."""
+        """The cost, computed by plain loops."""
         self.values.append(self.whole(point) - self.shift)
         return self.values[-1]
 
     def size(self, point: Curve) -> float:
-        """The cost before anything is subtracted."""
+        """The cost before `shift` is subtracted."""
         return self.whole(point)
 
     def whole(self, point: Curve) -> float:
@@ -111,11 +120,11 @@ class Pendulum:
         return Curve(np.array(x), np.array(u))
 
     def difference(self, new: Curve, old: Curve) -> TangentCurve:
-        """On a vector space."""
+        """Difference of states and torques."""
         return TangentCurve(z=new.x - old.x, v=new.u - old.u)
 
     def refine(self, point: Curve) -> Curve | None:
-        """Nothing to refine, unless asked for."""
+        """The point itself while refinements are left, otherwise None."""
         if self.refinements == 0:
             return None
         self.refinements -= 1
@@ -123,7 +132,7 @@ class Pendulum:
 
 
 def start(problem: Pendulum) -> Curve:
-    """A gentle push."""
+    """A small torque."""
     return problem.rollout(0.5 * np.sin(np.arange(N) * DT)[:, None])
 
 
@@ -132,7 +141,7 @@ REGULATOR = Regulator(Q=np.eye(2) * DT, R=np.eye(1) * DT, terminal=np.eye(2))
 
 
 def run(problem: Any, direction: Direction, **changes: Any) -> list[Iterate[Curve]]:
-    """All iterates."""
+    """All iterates of a run."""
     settings = {
         "regulate": REGULATOR,
         "armijo": Armijo(),
@@ -266,10 +275,10 @@ class Upwards:
         return TangentCurve(z=-zeta.z, v=-zeta.v)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Nothing is learnt."""
+        """Ignore the step."""
 
     def reset(self) -> bool:
-        """Nothing to forget."""
+        """Return False: there is no memory."""
         return False
 
 
@@ -282,8 +291,10 @@ def test_an_ascent_direction_is_not_called_converged() -> None:
 def searched(
     problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.0
 ) -> tuple[Any, float, float]:
-    """Result of the line search, J at the start and slope, along the metric direction times a
-    factor.
+    """Search along a multiple of the metric direction.
+
+    Returns:
+        Result of the line search, J at the first point, and slope.
     """
     point = start(problem)
     expansion = problem.expand(point)
@@ -312,7 +323,7 @@ def test_armijo_accepts_a_step_of_sufficient_decrease_however_long_the_direction
 
 def test_armijo_rejects_small_decrease_that_is_not_sufficient() -> None:
     class Flat(Pendulum):
-        """Every trial is lower than the start, by a thousandth of what the slope promises."""
+        """Every trial lowers the cost by a thousandth of the predicted decrease."""
 
         def value(self, point: Curve) -> float:
             gap = float(np.abs(point.u - origin.u).max())
@@ -425,7 +436,7 @@ def test_lbfgs_needs_fewer_iterations_than_metric_descent_for_the_same_digits() 
 
 
 def learned(memory: int, iterations: int = 9) -> tuple[LBFGS, Expansion, Array]:
-    """An L-BFGS after some iterations, the expansion it will see next, and K."""
+    """An L-BFGS after some iterations, the next expansion, and K."""
     problem, direction = Pendulum(), LBFGS(R * DT, memory)
     iterates = run(
         problem, direction, max_iterations=iterations, regulate=replace(REGULATOR, period=1000)

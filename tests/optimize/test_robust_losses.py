@@ -1,5 +1,6 @@
-"""Losses against scipy's: the same optimum of a line through points with outliers, and weights that
-follow from values.
+"""Losses against those of SciPy.
+
+A line through points with outliers has an equal optimum, and weights follow from values.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ T = np.linspace(0.0, 1.0, 80)
 
 
 def points(seed: int) -> Array:
-    """A line with unit noise, every eighth point far off to one side."""
+    """Points of a line with unit noise; every eighth point is far off to one side."""
     rng = np.random.default_rng(seed)
     y = 2.0 - 5.0 * T + rng.standard_normal(len(T))
     y[::8] += rng.uniform(8.0, 30.0, len(y[::8]))
@@ -27,12 +28,12 @@ def points(seed: int) -> Array:
 
 
 def residuals(x: Array, y: Array) -> Array:
-    """Residuals of a line."""
+    """Residuals of the points from a line."""
     return np.asarray(x[0] + x[1] * T - y)
 
 
 def reweighted(loss: RobustLoss, y: Array) -> Array:
-    """The line by iteratively reweighted least squares."""
+    """The line that iteratively reweighted least squares finds."""
     A, x = np.column_stack([np.ones_like(T), T]), np.zeros(2)
     for _ in range(2000):
         w = loss.weight(residuals(x, y))
@@ -58,8 +59,9 @@ def test_the_optimum_agrees_with_scipy(kind: Kind, scale: float) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_weight_follows_from_the_value(kind: Kind) -> None:
-    """Half of the slope of the value is the squared weight times the residual, below and above the
-    scale.
+    """Half of the derivative of the value is the squared weight times the residual.
+
+    This holds below and above the scale.
     """
     loss = RobustLoss(kind=kind, scale=2.0)
     for r in (-40.0, -2.5, -1.0, -1e-3, 0.3, 1.9, 2.1, 7.0, 1e3):
@@ -73,7 +75,7 @@ def test_the_weight_follows_from_the_value(kind: Kind) -> None:
 
 
 def test_outliers_count_less_than_small_residuals() -> None:
-    """All losses agree with squares near zero; far away they are in the order of scipy's table."""
+    """All losses equal the square near zero; far away, their order is that of SciPy."""
     small, large = np.full(5, 1e-4), np.full(5, 1e3)
     for kind in KINDS:
         assert RobustLoss(kind=kind).value(small) == pytest.approx(5e-8, rel=1e-6)
@@ -87,7 +89,7 @@ def test_outliers_count_less_than_small_residuals() -> None:
 
 @pytest.mark.parametrize("scale", [1.0, 3.0, 4.5])
 def test_the_mean_square_of_inliers(scale: float) -> None:
-    """Compared with a million normal numbers; a linear loss has no outliers."""
+    """Compare with a million normal numbers; a linear loss has no outliers."""
     r = np.random.default_rng(2).standard_normal(1_000_000)
     for kind in KINDS:
         loss = RobustLoss(kind=kind, scale=scale)
@@ -98,8 +100,9 @@ def test_the_mean_square_of_inliers(scale: float) -> None:
 
 
 def test_outliers_hardly_move_a_robust_line() -> None:
-    """Over many draws the ordinary fit is biased, and robust fits stay within a few standard
-    deviations.
+    """The ordinary fit is biased in the mean over many draws.
+
+    Robust fits stay within a few standard deviations.
     """
     found = {
         kind: np.array(
@@ -115,7 +118,7 @@ def test_outliers_hardly_move_a_robust_line() -> None:
 
 
 def reweighted_few(loss: RobustLoss, y: Array) -> Array:
-    """As `reweighted`, to a coarse tolerance."""
+    """The line of `reweighted`, to a coarse tolerance."""
     A, x = np.column_stack([np.ones_like(T), T]), np.zeros(2)
     for _ in range(40):
         w = loss.weight(residuals(x, y))

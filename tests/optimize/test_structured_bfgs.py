@@ -1,5 +1,6 @@
-"""Directions under hard limits: metrics against dense matrices, and a small problem with a barrier
-against SciPy's optimum.
+"""Directions under hard limits.
+
+Metrics are compared with dense matrices, and the optimum of a small problem with that of SciPy.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ N, NX, NU = 12, 3, 2
 
 
 def random_expansion(rng: np.random.Generator) -> tuple[Expansion, Weights]:
-    """An expansion with every weight."""
+    """A random expansion with all kinds of weights."""
     A, B = random_system(rng, N, NX, NU)
     expansion = Expansion(A=A, B=B, a=rng.normal(size=(N + 1, NX)), b=rng.normal(size=(N, NU)))
     return expansion, random_weights(rng, N, NX, NU, steps=True)
 
 
 def dense(metric: CurveMetric) -> Array:
-    """(N*nu, N*nu) matrix of a metric, applied to every unit step."""
+    """(N nu, N nu) matrix of a metric, from its product with every unit step."""
     units = np.eye(N * NU).reshape(-1, N, NU)
     return np.stack([metric.apply(e).reshape(-1) for e in units], axis=1)
 
@@ -76,7 +77,7 @@ def test_both_metrics_agree_on_an_identity_basis() -> None:
 
 
 def test_the_metric_of_a_basis_is_the_projected_metric() -> None:
-    """Also with some weights equal to zero, as long as every basis function has some weight."""
+    """Some weights may be zero, as long as every basis function has some weight."""
     rng = np.random.default_rng(3)
     expansion, weights = random_expansion(rng)
     weights.Q[4:9], weights.S[4:9], weights.W[::2] = 0.0, 0.0, 0.0
@@ -109,10 +110,13 @@ class ToyPoint:
 
 @dataclass(frozen=True, eq=False)
 class Toy:
-    """A linear plant, a convex quadratic cost with its minimum outside the limits, and a barrier on
-    first state and control.
+    """A linear plant with a convex quadratic cost, whose minimum lies outside the limits.
 
-    mu: of the barrier;  steps: also on the steps of the control
+    The barrier limits the first state and the control.
+
+    Attributes:
+        mu: Weight of the barrier.
+        steps: Whether the changes of the control are limited as well.
     """
 
     mu: float
@@ -120,7 +124,7 @@ class Toy:
 
     @cached_property
     def plant(self) -> tuple[Array, Array]:
-        """A oscillates, B pushes the second state; and one more state that follows."""
+        """Matrices A of an oscillator with a third state, and B of two controls."""
         A = np.array([[1.0, 0.2, 0.0], [-0.3, 0.95, 0.0], [0.1, 0.0, 0.9]])
         return np.tile(A, (N, 1, 1)), np.tile(
             np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.3]]), (N, 1, 1)
@@ -134,20 +138,20 @@ class Toy:
 
     @property
     def delta(self) -> float:
-        """As on the barrier_weights: sharper with mu."""
+        """Relative distance below which the barrier is relaxed; it becomes smaller with mu."""
         return 0.3 * self.mu
 
     def point(self, u: Array) -> ToyPoint:
-        """The curve of a control."""
+        """The trajectory of a control."""
         A, B = self.plant
         return ToyPoint(u, LinearRecursion(A).forward(self.start, np.einsum("kij,kj->ki", B, u)))
 
     def value(self, point: ToyPoint) -> float:
-        """Cost and barrier."""
+        """Sum of cost and barrier."""
         cost = 0.01 * np.sum((point.x[1:] - self.wanted) ** 2) + 1e-4 * np.sum(point.u**2)
         cost += 2e-3 * np.sum(
             point.x[1:, 2] ** 2 * point.u[:, 1] ** 2
-        )  # a little that is not quadratic
+        )  # a small term that is not quadratic
         if not self.mu:
             return float(cost)
         barriers = (
@@ -161,11 +165,11 @@ class Toy:
         return float(cost + self.mu * barriers)
 
     def size(self, point: ToyPoint) -> float:
-        """Of a change."""
+        """Scale of a change of the cost."""
         return max(1.0, abs(self.value(point)))
 
     def expand(self, point: ToyPoint) -> Expansion:
-        """Slopes by hand; the barrier with its curvature, the cost's own is to be learnt."""
+        """Derivatives of cost and barrier, and the curvature of the barrier only."""
         (A, B), x, u = self.plant, point.x, point.u
         a, b = np.zeros((N + 1, NX)), 2e-4 * u
         a[1:] = 0.02 * (x[1:] - self.wanted)
@@ -213,11 +217,11 @@ class Toy:
 
 
 CALM = Regulator(Q=np.eye(NX), R=np.eye(NU), terminal=np.eye(NX), feedback_threshold=np.inf)
-FED_BACK = Regulator(Q=np.eye(NX), R=np.eye(NU), terminal=np.eye(NX))
+WITH_FEEDBACK = Regulator(Q=np.eye(NX), R=np.eye(NU), terminal=np.eye(NX))
 
 
 @pytest.mark.parametrize("mu", [1e-1, 1e-3])
-@pytest.mark.parametrize("kind", ["free", "fed back", "with steps", "on a basis"])
+@pytest.mark.parametrize("kind", ["free", "with feedback", "with steps", "on a basis"])
 def test_the_optimum_of_the_toy_problem_agrees_with_scipy(kind: str, mu: float) -> None:
     toy, basis = Toy(mu, steps=kind == "with steps"), None
     if kind == "on a basis":
@@ -240,7 +244,7 @@ def test_the_optimum_of_the_toy_problem_agrees_with_scipy(kind: str, mu: float) 
         options={"gtol": 1e-9, "maxiter": 5000},
     )
     direction = StructuredBFGS(np.full(NU, 1e-3), basis)
-    regulate = FED_BACK if kind == "fed back" else CALM
+    regulate = WITH_FEEDBACK if kind == "with feedback" else CALM
     iterates = list(
         optimize(
             toy,
@@ -265,8 +269,9 @@ def test_the_optimum_of_the_toy_problem_agrees_with_scipy(kind: str, mu: float) 
 
 
 def test_stored_pairs_do_not_contain_the_barrier() -> None:
-    """They hold the change of the cost's gradient alone, so that they stay valid for a sharper
-    barrier.
+    """They contain only the change of the cost's gradient.
+
+    So they stay valid for a sharper barrier.
     """
     direction, blunt = StructuredBFGS(np.full(NU, 1e-3)), Toy(1e-1)
     for iterate in optimize(
@@ -309,8 +314,9 @@ def test_no_step_changes_a_limited_quantity_by_more_than_the_reach() -> None:
 
 
 def test_damping_keeps_the_step_back_inside_the_limits() -> None:
-    """From outside a bound, with a cost that pulls elsewhere, the damped step returns further than
-    the scaled one.
+    """The point is outside a bound, and the cost pulls in another direction.
+
+    The damped step returns further than the scaled one.
     """
     toy, outside = Toy(1e-4), np.zeros((N, NU))
     outside[3, 0] = toy.control.upper[0] + 0.2 * toy.control.scale[0]

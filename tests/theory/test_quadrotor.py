@@ -1,5 +1,6 @@
-"""A free-floating body with thrusters: psi against plain re-simulation of recompiled models along a
-tumbling flight.
+"""A free-floating body with thrusters on a tumbling flight.
+
+psi is compared with simulations of recompiled models.
 """
 
 from __future__ import annotations
@@ -48,9 +49,7 @@ def tumbling_task() -> DesignTask:
 def simulated_states(
     path: Path, change: dict[str, float], ctrl: Array, start: Array, substeps: int
 ) -> tuple[Loop, Array]:
-    """States (N+1, ns) of a model compiled anew from the MJCF with relative changes of its
-    parameters.
-    """
+    """(N+1, ns) states of a model that is compiled anew with relative changes of its parameters."""
     spec = mujoco.MjSpec.from_file(str(path))
     body = spec.body("quadrotor")
     body.mass *= 1.0 + change.get("mass", 0.0)

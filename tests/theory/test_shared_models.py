@@ -1,5 +1,6 @@
-"""Models from other projects (`shared_models`): every file loads, and a design has ten times the
-information of a chirp.
+"""Models from other projects (`shared_models`).
+
+Every file loads, and a design has ten times the information of a chirp.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ EXPERIMENT_NAMES = [
 
 
 def experiment(name: str) -> mjfim.Experiment:
-    """The experiment of this name, beside its model; skips where that is absent."""
+    """The experiment of this name, next to its model; the test is skipped where it is missing."""
     shared_model(EXPERIMENTS[name]["model"])
     return mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name)
 
