@@ -1,4 +1,4 @@
-"""Detection of angles that are probably logged in degrees although the experiment file does not say so."""
+"""Detection of angles that are probably in degrees although the experiment file states no unit."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from mjfim.recordings.plausibility import displacements
 # Degrees per radian.
 DEGREES = 180.0 / np.pi
 
-# Relative tolerance of a factor between degrees and radians, and of a joint's range.
+# Relative tolerance for the ratio of degrees to radians, and for a joint's range.
 TOLERANCE = 0.2
 
-# Correlation above which a position and a velocity count as measurements of one motion.
+# Correlation above which a position and a velocity are considered to belong to one motion.
 MIN_CORRELATION = 0.5
 
-# Time over which positions are differenced [s], so that their resolution and noise have little
-# effect.
+# Time between the positions whose difference is taken [s]; it is long enough that resolution and
+# noise have little effect.
 DIFFERENCE_TIME = 0.05
 
 # Angles beyond this multiple of a joint's range are implausible.
 MAX_RANGE_RATIO = 3.0
 
-# Angle [rad] and speed [rad/s] that together are implausible for a joint without a known range.
+# An angle [rad] and a speed [rad/s] that are implausible if a joint exceeds both.
 MAX_PLAUSIBLE_ANGLE = 50.0
 MAX_PLAUSIBLE_SPEED = 200.0
 
@@ -37,7 +37,7 @@ MAX_PLAUSIBLE_SPEED = 200.0
 def check_angles(
     where: str, model: Any, t: Array, columns: Mapping[str, Array], stated: Collection[str]
 ) -> None:
-    """Refuse a column of a hinge that looks like degrees.
+    """Refuse columns of hinge joints that are probably in degrees.
 
     Args:
         where: The file, for messages.
@@ -72,7 +72,15 @@ def _check_slope(
     velocity: tuple[str, Array],
     stated: Collection[str],
 ) -> None:
-    """Refuse a position whose slope is its velocity times the factor between degrees and radians, or the reverse."""
+    """Refuse a position and velocity of which one is probably in degrees, the other in radians.
+
+    Args:
+        where: The file, for messages.
+        t: (M,) times [s].
+        position: Name and (M,) values of the position.
+        velocity: Name and (M,) values of the velocity.
+        stated: Names of the columns whose unit the experiment file states.
+    """
     ratio = _slope_ratio(t, position[1], velocity[1])
 
     for name, factor, degrees, radians in (
@@ -87,7 +95,10 @@ def _check_slope(
 
 
 def _slope_ratio(t: Array, q: Array, v: Array) -> float:
-    """Least-squares ratio of the slope of q: (M,) to v: (M,); NaN where they do not show one motion."""
+    """Least-squares ratio of the slope of q: (M,) to v: (M,).
+
+    NaN if they are not correlated enough to belong to one motion.
+    """
     both = np.isfinite(q) & np.isfinite(v)
     t, q, v = t[both], q[both], v[both]
     if len(t) < 3:
@@ -103,26 +114,32 @@ def _slope_ratio(t: Array, q: Array, v: Array) -> float:
 
 
 def _check_range(where: str, name: str, q: Array, limits: Array) -> None:
-    """Refuse angles q: (M,) far beyond the joint's range, limits: (2,) [rad], if they are inside it as degrees."""
+    """Refuse angles that are far outside the joint's range, but inside it if they are in degrees.
+
+    Args:
+        where: The file, for messages.
+        name: Name of the column.
+        q: (M,) values.
+        limits: (2,) range of the joint [rad].
+    """
     low, high = (float(x) for x in limits)
     smallest, largest = float(np.nanmin(q)), float(np.nanmax(q))
 
     reach = max(abs(low), abs(high))
     is_beyond = max(abs(smallest), abs(largest)) > MAX_RANGE_RATIO * reach
 
-    slack = TOLERANCE * (high - low)
-    from_degrees = smallest / DEGREES, largest / DEGREES
-    is_inside = low - slack <= from_degrees[0] and from_degrees[1] <= high + slack
+    tolerance = TOLERANCE * (high - low)
+    is_inside = low - tolerance <= smallest / DEGREES and largest / DEGREES <= high + tolerance
 
     if is_beyond and is_inside:
         raise RecordingError(
-            f"{where}: column {name!r} ranges from {smallest:g} to {largest:g}, its joint from "
+            f"{where}: column {name!r} ranges from {smallest:g} to {largest:g}, but its joint from "
             f"{low:g} to {high:g} rad; {_advice(name, 'deg', 'rad')}"
         )
 
 
 def _check_speed(where: str, name: str, t: Array, q: Array) -> None:
-    """Refuse angles q: (M,) of many turns that change faster than any joint."""
+    """Refuse angles q: (M,) of many turns if they change faster than a joint can move."""
     largest = float(np.nanmax(np.abs(q)))
     if largest <= MAX_PLAUSIBLE_ANGLE:
         return
@@ -136,7 +153,7 @@ def _check_speed(where: str, name: str, t: Array, q: Array) -> None:
 
 
 def _largest_slope(t: Array, q: Array) -> float:
-    """Largest slope of q: (M,) [per s] between rows that have a value."""
+    """Largest absolute slope of q: (M,) between successive rows that have a value [1/s]."""
     present = np.isfinite(q)
     steps = np.diff(t[present])
     if not len(steps):
@@ -145,8 +162,8 @@ def _largest_slope(t: Array, q: Array) -> float:
 
 
 def _advice(name: str, degrees: str, radians: str) -> str:
-    """End of a message: how the experiment file states the unit of a column."""
+    """End of a message, which says how to state the unit of a column in the experiment file."""
     return (
-        f'{name!r} is probably in {degrees}: state unit = "{degrees}" for it in [recording.columns], '
-        f'or unit = "{radians}" if it is not'
+        f'{name!r} is probably in {degrees}: state unit = "{degrees}" for it in '
+        f'[recording.columns], or unit = "{radians}" if it is not'
     )

@@ -1,4 +1,4 @@
-"""The signals that a log of an experiment can hold, and how the experiment file says to read them."""
+"""The signals that a log of an experiment may hold, and how to read them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mjfim.recordings.spec import RecordingSpec
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Channels:
-    """Signals of an experiment by name; everything that reading and checking a log needs to know.
+    """Signals of an experiment by name, and everything else that is needed to read and check a log.
 
     Attributes:
         model: The compiled MuJoCo model (`mujoco.MjModel`) at its nominal parameters.

@@ -1,11 +1,11 @@
 """Conversion of a log's column to the model's unit.
 
-A column of the recording is, with the symbols of `ColumnSpec`:
+With the names of `ColumnSpec`, a column of the recording is
 
     value = (scale * unit * raw + offset) * product of the columns `multiply_by`          (1)
 
-where raw numbers are first freed of missing signs and counter wraps, and values of jumps by whole
-turns.
+Signs are restored and counter wraps are removed from the raw numbers before; jumps by whole turns
+are removed from the values.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mjfim.recordings.spec import ColumnSpec
 # One turn [rad].
 TURN = 2.0 * np.pi
 
-# Factors from the units that a log may have to the model's unit, by the model's unit.
+# Factors that convert the units of a log to the model's unit, by the model's unit.
 FACTORS = {
     "rad": {"rad": 1.0, "deg": TURN / 360.0, "rev": TURN},
     "rad/s": {"rad/s": 1.0, "deg/s": TURN / 360.0, "rev/s": TURN, "rpm": TURN / 60.0},
@@ -34,10 +34,10 @@ FACTORS = {
     "m/s": {"m/s": 1.0, "mm/s": 1e-3},
 }
 
-# Factor to the model's unit of every unit that a log may have.
+# Factor that converts each unit of a log to the model's unit.
 UNIT_FACTORS = {unit: factor for table in FACTORS.values() for unit, factor in table.items()}
 
-# Sensors that may measure an angle as well as a length: any unit is accepted.
+# Sensors that measure an angle or a length, depending on the actuator; any unit is accepted.
 SENSORS_OF_ANY_UNIT = (
     mujoco.mjtSensor.mjSENS_ACTUATORPOS,
     mujoco.mjtSensor.mjSENS_ACTUATORVEL,
@@ -52,8 +52,8 @@ def units_of(model: Any) -> dict[str, str]:
         model: The compiled MuJoCo model.
 
     Returns:
-        By column name the unit; `any` where each of rad, rad/s, m and m/s is possible, `none` where
-        there is none.
+        Unit by column name; `any` if all units of an angle, a length and their rates are possible,
+        `none` if the quantity has no unit.
     """
     units = {component.name: component.unit or "none" for component in state_components(model)}
 
@@ -80,7 +80,7 @@ def check_unit(where: str, spec: ColumnSpec, unit: str) -> None:
         unit: Unit of the model, with the values of `units_of`.
 
     Raises:
-        ExperimentError: The unit does not fit, or something other than an angle is unwrapped.
+        ExperimentError: The unit does not fit, or a quantity that is not an angle is unwrapped.
     """
     valid = list(UNIT_FACTORS) if unit == "any" else list(FACTORS.get(unit, {}))
     if spec.unit is not None and spec.unit not in valid:
@@ -90,7 +90,7 @@ def check_unit(where: str, spec: ColumnSpec, unit: str) -> None:
 
     if spec.unwrap and unit not in ("rad", "any"):
         raise ExperimentError(
-            f"{where}.unwrap: only angles jump by whole turns; use period for a counter"
+            f"{where}.unwrap: only an angle jumps by whole turns; use period for a counter"
         )
 
 
@@ -113,7 +113,7 @@ def convert(table: Table, spec: ColumnSpec) -> Array:
     if spec.period is not None:
         raw = _unwrapped(raw, spec.period)
 
-    # Without a conversion the values keep all their bits, and infinite ones stay infinite.
+    # Without a conversion the values stay bit by bit unchanged, and infinite values stay infinite.
     factor = spec.scale * (1.0 if spec.unit is None else UNIT_FACTORS[spec.unit])
     value = raw if factor == 1.0 and spec.offset == 0.0 else factor * raw + spec.offset
 
@@ -125,7 +125,10 @@ def convert(table: Table, spec: ColumnSpec) -> Array:
 
 
 def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
-    """(M,) signed integers from their two's complement (M,); numbers that are negative already stay."""
+    """(M,) signed integers of bits from their two's complement raw: (M,).
+
+    Numbers that are already negative stay unchanged.
+    """
     half = 2.0 ** (bits - 1)
 
     outside = (raw < -half) | (raw >= 2.0 * half)
@@ -134,7 +137,7 @@ def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
         row = int(np.argmax(invalid))
         raise RecordingError(
             f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is "
-            f"no integer of {bits} bits"
+            f"not an integer of {bits} bits"
         )
 
     return np.asarray(np.where(raw >= half, raw - 2.0 * half, raw))

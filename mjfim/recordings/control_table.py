@@ -1,4 +1,4 @@
-"""Controls of an experiment from a table of a file."""
+"""Reader of a control from a CSV table."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError, unknown
 from mjfim.recordings.formats.read import read_table
 
-# Prefixes of the columns that a design.csv has beside the time and the controls.
+# Prefixes of the columns that a design.csv has besides the time and the controls.
 DESIGN_PREFIXES = ("qpos:", "qvel:", "act:", "gain:")
 
-# A time stamp may be rounded by this share of the sample period.
+# Tolerance of rounded time stamps, as a fraction of the sample period.
 STAMP_TOLERANCE = 1e-6
 
 # Tolerance of the first and last time of a table [s].
@@ -32,7 +32,7 @@ def read_control(
         t: (N,) sample times [s].
         dt: Sample period [s].
         names: nu names of the actuators.
-        repeat: Whether a table that ends before the last sample starts again.
+        repeat: Whether a table that ends before the last sample is repeated.
 
     Returns:
         (N, nu) control at the sample times [control unit].
@@ -64,7 +64,7 @@ def read_control(
 def _columns_of_control(
     path: Path, columns: Mapping[str, Array], names: tuple[str, ...]
 ) -> tuple[Array, Array]:
-    """Times: (M,) and controls: (M, nu) of a table whose columns are those of a control or of a design."""
+    """Times: (M,) and controls: (M, nu) of a table with a control, or of a design.csv."""
     if "t" not in columns:
         raise RecordingError(f"{path}: column 't' is missing; found: {', '.join(columns)}")
 
@@ -81,7 +81,8 @@ def _columns_of_control(
         if column not in known and not column.startswith(DESIGN_PREFIXES):
             raise RecordingError(f"{path}: {unknown('column', column, ['t', *names])}")
 
-    stamps, values = columns["t"], np.column_stack([columns[key] for key in keys])
+    stamps = columns["t"]
+    values = np.column_stack([columns[key] for key in keys])
 
     # The last row of a design is the final state, which has no control.
     if f"ctrl:{names[0]}" in columns:

@@ -1,4 +1,4 @@
-"""The design.csv that a controller plays on a robot."""
+"""Reader of a design.csv, the table that a controller applies to a robot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mjfim.records.playback import Playback
 # Smallest number of rows of a playback.
 MIN_ROWS = 3
 
-# Largest deviation of a time stamp from the grid of timesteps, as a share of a timestep, per row.
+# Largest deviation of the time stamps from the grid, per row, as a fraction of a timestep.
 STAMP_TOLERANCE = 1e-6
 
 
@@ -26,7 +26,7 @@ def read_playback(path: Path, channels: Channels) -> Playback:
 
     Args:
         path: The file.
-        channels: The signals of the experiment for which it was written.
+        channels: The signals of the experiment to which the design belongs.
 
     Returns:
         States, controls and gains of every row.
@@ -42,7 +42,7 @@ def read_playback(path: Path, channels: Channels) -> Playback:
     for name in ("t", *states, *controls, *gains):
         if name not in table:
             raise RecordingError(
-                f"{path}: column {name!r} is missing; it is no design.csv of this model"
+                f"{path}: column {name!r} is missing; the file is not a design.csv of this model"
             )
 
     # The last row is the final state, which has neither control nor gain.
@@ -55,7 +55,7 @@ def read_playback(path: Path, channels: Channels) -> Playback:
 
 
 def _grid(path: Path, t: Array, timestep: float) -> Array:
-    """(M+1,) times of a table, free of rounding: multiples of a whole number of timesteps [s]."""
+    """(M+1,) times of the rows without rounding [s]; the period is a whole number of timesteps."""
     if len(t) < MIN_ROWS:
         raise RecordingError(
             f"{path}: too few rows ({len(t)}); a playback needs at least {MIN_ROWS}"
@@ -68,8 +68,8 @@ def _grid(path: Path, t: Array, timestep: float) -> Array:
     # The comparison is negated so that NaN is refused, too.
     if steps < 1 or not np.abs(t - grid).max() <= STAMP_TOLERANCE * timestep * len(t):
         raise RecordingError(
-            f"{path}: column 't' does not go from 0 in equal periods of whole timesteps "
-            f"({timestep:g} s)"
+            f"{path}: column 't' must begin at 0 and increase by equal periods, each a whole "
+            f"number of timesteps ({timestep:g} s)"
         )
     return np.asarray(grid)
 
@@ -81,6 +81,6 @@ def _stacked(path: Path, table: Mapping[str, Array], names: Sequence[str], rows:
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0]
         raise RecordingError(
-            f"{path}: column {names[column]!r} has no number in data row {row + 1}"
+            f"{path}: column {names[column]!r} holds no finite number in data row {row + 1}"
         )
     return values

@@ -1,4 +1,7 @@
-"""Remarks about the quality of measured data before any fit: noise, spikes, and columns that contradict each other."""
+"""Remarks about the quality of measured data before any fit.
+
+They concern noise, spikes, and columns that contradict each other.
+"""
 
 from __future__ import annotations
 
@@ -15,34 +18,34 @@ from mjfim.records.recording import Recording
 # Only the first rows of a long recording are inspected.
 MAX_ROWS = 200_000
 
-# Width of the running median that separates a smooth motion from noise and spikes [rows].
+# Width of the running median filter that separates smooth motion from noise and spikes [rows].
 MEDIAN_ROWS = 7
 
-# Shortest column that is inspected [rows].
+# Length of the shortest column that is inspected [rows].
 MIN_ROWS = 4 * MEDIAN_ROWS
 
-# A measured column is rough if the running median removes more than this share of its variance.
+# A measured column is rough if the running median removes more than this fraction of its variance.
 MAX_ROUGH_SHARE = 0.1
 
 # A deviation counts only if it exceeds this number of stated standard deviations of the noise.
 SIGNIFICANT_SIGMAS = 3.0
 
-# A control jumps if the running median removes more than this share of its variance; controls may
-# jump by intent.
+# A control is rough if the running median removes more than this fraction of its variance. The
+# limit is higher than for measured columns, because a control may jump intentionally.
 MAX_ROUGH_CONTROL_SHARE = 0.5
 
-# A control that jumps by intent is still correlated with the row before; below this correlation it
-# looks like noise.
+# A control that jumps intentionally is still correlated with the previous row. Below this
+# correlation it is considered noise.
 MIN_CONTROL_CORRELATION = 0.5
 
-# Share of the rows in which a control may be outside its range.
+# Largest fraction of the rows in which a control may be outside its range.
 MAX_SHARE_OUTSIDE_RANGE = 1e-3
 
-# Tolerance of that range, as a share of its width.
+# Tolerance of the range of a control, as a fraction of its width.
 RANGE_TOLERANCE = 1e-6
 
 # A position and the integral of its velocity contradict each other if their displacements differ by
-# more than this share of the displacements' standard deviation.
+# more than this fraction of the displacements' standard deviation.
 MAX_DISAGREEMENT = 0.1
 
 # Time over which displacements are compared [s].
@@ -50,14 +53,14 @@ COMPARISON_TIME = 0.2
 
 
 def plausibility_remarks(channels: Channels, recording: Recording) -> tuple[str, ...]:
-    """Describe everything that makes the data of a recording implausible.
+    """Describe properties of a recording that make its data implausible.
 
     Args:
         channels: Names, ranges and noise of the recording's columns.
         recording: The measured data.
 
     Returns:
-        One sentence per remark; none where the data are plausible.
+        One sentence per remark; empty if the data are plausible.
     """
     return (
         *_control_remarks(channels, recording.ctrl[:MAX_ROWS]),
@@ -67,7 +70,7 @@ def plausibility_remarks(channels: Channels, recording: Recording) -> tuple[str,
 
 
 def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
-    """Remarks about controls outside their range, and controls that look like noise. ctrl: (M-1, nu)."""
+    """Remarks about controls ctrl: (M-1, nu) that are outside their range or look like noise."""
     model = channels.model
 
     for i, name in enumerate(channels.controls):
@@ -75,7 +78,7 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
         if not _moves(u):
             continue
 
-        # The ranges are in the order of the controls only where every actuator has one control.
+        # The ranges are in the order of the controls only if every actuator has one control.
         if model.nactuator == model.nu and model.actuator_ctrllimited[i]:
             yield from _range_remarks(name, u, model.actuator_ctrlrange[i])
 
@@ -84,8 +87,8 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
             yield (
                 f"control {name!r} jumps from row to row ({100 * rough:.0f} % of its variance lies "
                 f"within {MEDIAN_ROWS} rows, correlation with the previous row {correlation:.2f}): "
-                "if it was measured rather than commanded, its noise acts as a force that never "
-                "existed, and the estimates are biased"
+                "if it was measured instead of commanded, the simulation treats its noise as a "
+                "force, and the estimates are biased"
             )
 
 
@@ -105,7 +108,7 @@ def _range_remarks(name: str, u: Array, limits: Array) -> Iterator[str]:
 
 
 def _roughness_remarks(channels: Channels, recording: Recording) -> Iterator[str]:
-    """Remarks about outputs that jump by more than the stated noise and by much of their motion."""
+    """Remarks about outputs whose jumps are large compared with both their noise and motion."""
     sigma = _sigma_by_name(channels)
 
     for i, name in enumerate(recording.outputs):
@@ -146,7 +149,7 @@ def _contradiction_remarks(channels: Channels, recording: Recording) -> Iterator
         if disagreement > max(MAX_DISAGREEMENT, SIGNIFICANT_SIGMAS * expected):
             yield (
                 f"{position} and the integral of {velocity} differ by {100 * disagreement:.0f} % "
-                "of the motion: one of them is wrong or delayed"
+                "of the motion; one of them is wrong or delayed"
             )
 
 
@@ -163,8 +166,8 @@ def _disagreement(
         sigma_v: Standard deviation of the velocities' noise.
 
     Returns:
-        Standard deviation of the difference and the one expected from the noise, both relative to
-        the standard deviation of the displacement; 0 and 0 if the joint does not move.
+        Standard deviation of the difference, and its value that the noise explains, both divided
+        by the standard deviation of the displacement; 0 and 0 if the joint does not move.
     """
     dq, dv, lag = displacements(t, q, v, COMPARISON_TIME, len(t) // 4)
     size = float(np.std(dq))
@@ -179,18 +182,18 @@ def _disagreement(
 def displacements(
     t: Array, q: Array, v: Array, duration: float, max_lag: int
 ) -> tuple[Array, Array, int]:
-    """Compare a position with the integral of a velocity over stretches of a fixed number of rows.
+    """Compute displacements over a fixed number of rows from a position and from a velocity.
 
     Args:
         t: (M,) times [s].
         q: (M,) positions without NaN.
         v: (M,) velocities without NaN.
-        duration: Approximate length of a stretch [s].
-        max_lag: Largest length of a stretch [rows].
+        duration: Approximate time of a displacement [s].
+        max_lag: Largest number of rows of a displacement.
 
     Returns:
         (M-lag,) differences of the position, (M-lag,) integrals of the velocity by the trapezoidal
-        rule, and lag, the length of a stretch [rows].
+        rule, and lag, the number of rows of a displacement.
     """
     steps = np.diff(t)
     lag = int(np.clip(round(duration / float(np.median(steps))), 1, max_lag))
@@ -211,11 +214,11 @@ def _moves(x: Array) -> bool:
 
 
 def _rough_share(x: Array) -> float:
-    """Share of the variance of x: (M,) that a running median removes."""
+    """Fraction of the variance of x: (M,) that a running median removes."""
     return float(np.var(x - medfilt(x, MEDIAN_ROWS)) / np.var(x))
 
 
 def _lag_one_correlation(x: Array) -> float:
-    """Correlation of x: (M,) with its previous row."""
+    """Correlation of successive rows of x: (M,)."""
     d = x - x.mean()
     return float(d[1:] @ d[:-1] / (d @ d))

@@ -1,7 +1,7 @@
-"""Recordings from logs: the experiment's `[recording]` table applied to the columns of a file.
+"""Reader of recordings: it applies the experiment's `[recording]` table to the columns of a log.
 
-The times are those of the log, and nothing is interpolated; only controls are held over rows in
-which they are empty.
+The times are those of the log, and nothing is interpolated. Only a control is held over rows in
+which it is empty.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mjfim.recordings.validity import (
 )
 from mjfim.records.recording import Recording
 
-# Tolerance of the begin and the end of the window [s].
+# Tolerance of the beginning and the end of the window [s].
 WINDOW_TOLERANCE = 1e-9
 
 
@@ -98,7 +98,7 @@ def read_log(path: Path, channels: Channels) -> Log:
     stated = {name for name, source in sources.items() if source.unit is not None}
     check_angles(str(path), channels.model, t, columns, stated)
 
-    # The last row has no control: it would be held beyond the recording.
+    # The control of the last row is left out, because it would act after the end of the recording.
     ctrl = np.column_stack([columns[name][:-1] for name in channels.control_columns])
     y = np.column_stack([columns[name] for name in measured])
     column_names = {name: source.column for name, source in sources.items()}
@@ -129,10 +129,10 @@ def check_spec(channels: Channels) -> None:
 
 
 def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
-    """Rule of every column of the recording: first of all controls, then of the measured columns.
+    """Rules of all columns of the recording, first the controls, then the measured columns.
 
-    A control without a stated rule is read under its default name; measured columns are read under
-    their default names only where the experiment file states none of them.
+    A control without a stated rule is read under its default name. Measured columns are read under
+    their default names only if the experiment file states none of them.
     """
     stated = channels.spec.sources
     default = _columns_by_default_name(table, channels)
@@ -141,7 +141,7 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
         name: stated.get(name) or ColumnSpec(column=default.get(name, name))
         for name in channels.control_columns
     }
-    # Looking up a missing column raises the error that explains it.
+    # The look-up of a missing column raises the error that explains it.
     for source in controls.values():
         table.column(source.column)
 
@@ -162,7 +162,10 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
 
 
 def _check_names(table: Table, channels: Channels) -> None:
-    """Refuse a column whose name has mjfim's form but does not exist in this model, such as a misspelled joint."""
+    """Refuse a column whose name looks like mjfim's but does not exist in this model.
+
+    A misspelled joint is an example.
+    """
     known = (*channels.control_columns, *channels.measurable)
     for name in table.names:
         if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
@@ -171,7 +174,11 @@ def _check_names(table: Table, channels: Channels) -> None:
 
 
 def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]:
-    """Columns of the table by mjfim's name: joint states of a bag, matrices of a design.npz, and every column itself."""
+    """Names of the table's columns, by the names that mjfim gives them.
+
+    The joint states of a bag and the matrices of a design.npz have other names there; all other
+    columns keep their names.
+    """
     found = {}
     for name in table.names:
         for quantity, coordinate in (("position:", "qpos:"), ("velocity:", "qvel:")):
@@ -184,7 +191,7 @@ def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]
             continue
         if len(labels) != len(parts):
             raise RecordingError(
-                f"{table.source}: array {matrix!r} has {len(labels)} columns, the model "
+                f"{table.source}: array {matrix!r} has {len(labels)} columns; the model needs "
                 f"{len(parts)}: {', '.join(parts)}"
             )
         found.update(zip(parts, labels, strict=True))
@@ -194,7 +201,10 @@ def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]
 
 
 def _matrices(channels: Channels) -> dict[str, list[str]]:
-    """Default names of the columns of qpos, qvel and ctrl, without the matrices that stated rules replace."""
+    """Default names of the columns of the matrices qpos, qvel and ctrl.
+
+    A matrix is left out if stated rules replace it.
+    """
     stated = channels.spec.sources
     state = [component.name for component in state_components(channels.model)]
     nq = channels.model.nq
@@ -209,7 +219,7 @@ def _matrices(channels: Channels) -> dict[str, list[str]]:
 
 
 def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
-    """(M,) times of all rows [s], and the rows from the beginning of the window to the first time after its end."""
+    """(M,) times of all rows [s], and the rows inside the window."""
     t = table.column(spec.time) * SECONDS[spec.time_unit]
     if spec.window is None or not len(t):
         return t, slice(0, len(t))
@@ -217,8 +227,8 @@ def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
     since = t - t[0]
     begin = _first_true(since >= spec.window[0] - WINDOW_TOLERANCE)
 
-    # Only rows after the beginning count: a clock that restarts later must not end the window
-    # earlier.
+    # The window ends at the first time after its end. Only rows after its beginning are searched,
+    # because the clock may have restarted before.
     end = begin + _first_true(since[begin:] > spec.window[1] + WINDOW_TOLERANCE)
 
     if end == begin:
@@ -237,7 +247,10 @@ def _first_true(condition: np.ndarray) -> int:
 def _columns(
     table: Table, sources: Mapping[str, ColumnSpec], t: Array, rows: slice, spec: RecordingSpec
 ) -> dict[str, Array]:
-    """Converted columns inside the window; controls are held where they are empty, also from before the window."""
+    """Converted columns inside the window, by the name of the recording's column.
+
+    Empty rows of a control get its last value, which may be from before the window.
+    """
     columns = {}
 
     for name, source in sources.items():
@@ -250,7 +263,7 @@ def _columns(
             where = f"{table.source}: column {source.column!r} (the control {name!r})"
             check_held(where, t[rows][:-1], values[rows][:-1], age[rows][:-1], spec.gap)
 
-        # The conversion itself may overflow.
+        # Finite raw numbers may become infinite by the conversion.
         columns[name] = values[rows]
         check_finite(f"{table.source}: column {name!r}", columns[name], rows.start)
 

@@ -12,7 +12,7 @@ Range = tuple[Annotated[float, Field(strict=True)], Annotated[float, Field(stric
 
 
 class Section(BaseModel):
-    """A table of the experiment file: immutable, no unknown keys.
+    """A table of the experiment file; it is immutable and refuses unknown keys.
 
     Attributes:
         renamed_keys: Keys of earlier versions, each with the name that it has now.
@@ -38,26 +38,28 @@ class ColumnSpec(Section):
         ]
         | None
     ) = Field(default=None, description="Unit of the column in the log. Default: the model's unit.")
-    scale: Finite = Field(default=1.0, description="Factor of the raw numbers.")
+    scale: Finite = Field(
+        default=1.0, description="Factor by which the raw numbers are multiplied."
+    )
     offset: Finite = Field(
         default=0.0, description="Constant that is added after scaling [unit of the model]."
     )
     signed: Literal[8, 16, 32] | None = Field(
         default=None,
         description=(
-            "Number of bits of a signed integer that the log holds as an unsigned one. Default: "
-            "the log's numbers already have a sign."
+            "Number of bits of signed integers that the log holds as unsigned ones. Default: the "
+            "numbers in the log already have a sign."
         ),
     )
     period: Positive | None = Field(
         default=None,
         description=(
-            "Raw number after which a counter begins again at 0; its jumps are removed. Default: "
-            "no counter."
+            "Raw number at which a counter starts again from 0; these jumps are removed. Default: "
+            "the column is not a counter."
         ),
     )
     unwrap: bool = Field(
-        default=False, description="Jumps of an angle by a whole turn are removed."
+        default=False, description="true: jumps of an angle by a whole turn are removed."
     )
     multiply_by: tuple[str, ...] = Field(
         default=(),
@@ -66,7 +68,10 @@ class ColumnSpec(Section):
 
 
 class RecordingSpec(Section):
-    """Rules by which the log of a robot becomes a recording; by default it has the columns of mjfim's CSV files."""
+    """Rules by which the log of a robot becomes a recording.
+
+    By default, the log has the columns of the CSV files that mjfim writes.
+    """
 
     time: str = Field(default="t", description="Column of the time stamps.")
     time_unit: Literal["s", "ms", "us", "ns"] = Field(
@@ -75,28 +80,32 @@ class RecordingSpec(Section):
     records: str | None = Field(
         default=None,
         description=(
-            "Place of the list of records inside a JSON file, keys joined by dots, such as "
+            "Path of the list of records inside a JSON file, as keys joined by dots, such as "
             "`data.entries`. Default: the only list of records that the file holds."
         ),
     )
     topics: tuple[str, ...] = Field(
         default=(),
-        description="Topics of the joint states of a ROS bag. Default: the only such topic in the bag.",
+        description=(
+            "Topics of the joint states of a ROS bag. Default: the only such topic in the bag."
+        ),
     )
     window: Range | None = Field(
         default=None,
-        description="First and last time that are used, after the first row [s]. Default: all rows.",
+        description=(
+            "First and last time that are used, counted from the first row [s]. Default: all rows."
+        ),
     )
     gap: Positive = Field(
         default=0.1,
-        description="Longest gap in the time stamps or in a column that is accepted [s].",
+        description="Longest accepted gap in the time stamps or in a column [s].",
     )
     columns: dict[str, str | ColumnSpec] = Field(
         default={},
         description=(
             "Sources of the columns of the recording, by `ctrl:<actuator>`, `qpos:<joint>`, "
-            "`qvel:<joint>` or sensor: the name of a column of the log, or a table. Default: "
-            "columns with these very names."
+            "`qvel:<joint>` or sensor: the name of a column of the log, or a table. Default: the "
+            "columns of the log have these names."
         ),
     )
 
@@ -109,7 +118,7 @@ class RecordingSpec(Section):
 
     @property
     def sources(self) -> dict[str, ColumnSpec]:
-        """Rule of every stated column; the name of a column is a rule without conversion."""
+        """Rule of every stated column; a mere name becomes a rule without conversion."""
         return {
             name: ColumnSpec(column=source) if isinstance(source, str) else source
             for name, source in self.columns.items()

@@ -1,4 +1,4 @@
-"""Summary of a log in plain numbers: its clock and the range of its columns."""
+"""Summary of a log: its clock, and the range and resolution of its columns."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-# Values closer than this share of the column's largest value differ only by rounding.
+# Differences below this fraction of the column's largest value are rounding errors.
 ROUNDING = 1e-12
 
 

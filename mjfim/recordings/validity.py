@@ -1,4 +1,7 @@
-"""Checks that refuse an unusable log: a clock that stops, jumps or has another unit; gaps; columns without content."""
+"""Checks that refuse an unusable log.
+
+They concern its clock, gaps in the rows, and columns without content.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +13,22 @@ from mjfim.errors import RecordingError
 # Smallest number of rows of a usable log.
 MIN_ROWS = 3
 
-# Shortest and longest median step of a robot's log [s]; outside, the unit of time is probably
-# wrong.
+# Shortest and longest plausible median step of a robot's log [s]. Outside this range, the unit of
+# time is probably wrong.
 MIN_MEDIAN_STEP = 1e-6
 MAX_MEDIAN_STEP = 1.0
 
-# Typical step of a robot's log [s], by which the unit of time is guessed.
+# Typical step of a robot's log [s], from which the unit of time is guessed.
 TYPICAL_STEP = 5e-3
 
-# A pause is bridged up to this number of median steps, even where `gap` is shorter.
+# A gap of up to this number of median steps is bridged, even if it is longer than `gap`.
 MIN_GAP_STEPS = 5.0
 
-# Smallest number of values with which a measured column of equal values counts as a dead channel.
+# A measured column with at least this number of values, all equal, is a dead channel.
 DEAD_CHANNEL_ROWS = 10
 
-# A clock that falls back below this share of the elapsed time has restarted; above, rows are out of
-# order.
+# A clock that jumps back to less than this fraction of the elapsed time has restarted. After a
+# smaller jump back, the rows are out of order.
 RESTART_SHARE = 0.1
 
 # Seconds per unit of time.
@@ -33,7 +36,7 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None:
-    """Refuse times that are not a clock of a robot's log.
+    """Refuse times that cannot be the clock of a robot's log.
 
     Args:
         where: File and column, for messages.
@@ -43,8 +46,8 @@ def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None
         gap: Longest gap that is bridged [s].
 
     Raises:
-        RecordingError: There are too few rows, a time is missing or not after the time before, the
-            unit is probably wrong, or there is too long a gap.
+        RecordingError: There are too few rows, a time is missing, the times do not increase, their
+            unit is probably wrong, or a gap is too long.
     """
     if len(t) < MIN_ROWS:
         raise RecordingError(
@@ -73,7 +76,7 @@ def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None
         raise RecordingError(
             f"{where}: a gap of {steps[row]:g} s after data row {first + row + 1} "
             f"({t[row] - t[0]:g} s after the first one); gaps longer than {limit:g} s are not "
-            "bridged: exclude it by recording.window, or raise recording.gap"
+            "bridged: exclude this gap by recording.window, or raise recording.gap"
         )
 
 
@@ -85,13 +88,20 @@ def longest_bridged_gap(t: Array, gap: float) -> float:
         gap: Longest gap that the experiment file allows [s].
 
     Returns:
-        That gap, or a few median steps where these are longer [s].
+        The larger of this gap and a few median steps [s].
     """
     return max(gap, MIN_GAP_STEPS * float(np.median(np.diff(t))))
 
 
 def _describe_reversal(where: str, t: Array, steps: Array, first: int) -> str:
-    """Message about the first time that is not after the time before. t: (M,), steps: (M-1,) [s]."""
+    """Message about the first time that is not later than the previous time.
+
+    Args:
+        where: File and column, for messages.
+        t: (M,) times [s].
+        steps: (M-1,) differences of the times [s].
+        first: Row of the file in which `t` begins, counted from 0.
+    """
     row = int(np.argmax(steps <= 0.0))
     before, after = t[row], t[row + 1]
     place = (
@@ -102,9 +112,9 @@ def _describe_reversal(where: str, t: Array, steps: Array, first: int) -> str:
     if steps[row] == 0.0:
         count = int(np.sum(steps == 0.0))
         others = f", one of {count}" if count > 1 else ""
-        return f"{place} (a duplicate{others}); every row needs its own time"
+        return f"{place} (a duplicate{others}); every row needs a different time"
 
-    # A clock that restarts goes back to the beginning, and continues from there.
+    # A clock that restarts jumps back to the beginning and continues from there.
     is_last = row + 2 == len(t)
     if after - t[0] < RESTART_SHARE * (before - t[0]) and not is_last:
         return (
@@ -116,11 +126,16 @@ def _describe_reversal(where: str, t: Array, steps: Array, first: int) -> str:
 
 
 def _likely_unit(median: float, unit: str) -> str:
-    """Unit of time in which a median step [s], read in another unit, is that of a typical log."""
+    """Unit of time with which the median step is closest to that of a typical log.
+
+    Args:
+        median: Median step, read with the stated unit [s].
+        unit: The stated unit.
+    """
     raw = median / SECONDS[unit]
 
     def distance(other: str) -> float:
-        """Logarithmic distance of the step, read in another unit, from a typical one."""
+        """Logarithmic distance from a typical step if the raw step has another unit."""
         return abs(float(np.log(raw * SECONDS[other] / TYPICAL_STEP)))
 
     return min(SECONDS, key=distance)
@@ -141,12 +156,12 @@ def check_finite(where: str, values: Array, first: int) -> None:
     if infinite.any():
         row = first + int(np.argmax(infinite)) + 1
         raise RecordingError(
-            f"{where} is infinite in data row {row}; leave a field empty where there is no number"
+            f"{where} is infinite in data row {row}; leave the field empty if there is no number"
         )
 
 
 def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
-    """Refuse a measured column that is empty or dead, or has gaps that its own rate does not explain.
+    """Refuse a measured column that is empty or constant, or has gaps that are too long.
 
     Args:
         where: File and column, for messages.
@@ -155,21 +170,21 @@ def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
         gap: Longest gap that is bridged [s].
 
     Raises:
-        RecordingError: The column is empty, constant, or has too long a gap.
+        RecordingError: The column is empty or constant, or a gap is too long.
     """
     present = np.flatnonzero(np.isfinite(values))
-    cure = "leave it out of the file or of [recording.columns]"
+    advice = "remove it from the file or from [recording.columns]"
 
     if not len(present):
-        raise RecordingError(f"{where} holds no number; {cure}")
+        raise RecordingError(f"{where} holds no number; {advice}")
 
     if len(present) >= DEAD_CHANNEL_ROWS and np.ptp(values[present]) == 0.0:
         raise RecordingError(
-            f"{where} is {values[present[0]]:g} in all of its {len(present)} rows, a dead channel; "
-            f"{cure}"
+            f"{where} is {values[present[0]]:g} in all of its {len(present)} rows, which suggests "
+            f"a dead channel; {advice}"
         )
 
-    # A slow column is empty in most rows: its gaps are measured against its own steps.
+    # A column with a low rate is empty in most rows, so its gaps are compared with its median step.
     limit = longest_bridged_gap(t[present], gap) if len(present) > 1 else gap
     edges = np.concatenate([t[:1], t[present], t[-1:]])
     longest = int(np.argmax(np.diff(edges)))
@@ -178,12 +193,12 @@ def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
         begin, end = edges[longest] - t[0], edges[longest + 1] - t[0]
         raise RecordingError(
             f"{where} is empty from {begin:g} to {end:g} s; gaps longer than {limit:g} s are not "
-            "bridged: exclude that time by recording.window, or raise recording.gap"
+            "bridged: exclude this time by recording.window, or raise recording.gap"
         )
 
 
 def hold_last_value(t: Array, values: Array) -> tuple[Array, Array]:
-    """Fill the empty rows of a control with the last value before them.
+    """Fill empty rows of a control with the last value before them.
 
     Args:
         t: (M,) times [s].
@@ -199,7 +214,7 @@ def hold_last_value(t: Array, values: Array) -> tuple[Array, Array]:
 
 
 def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> None:
-    """Refuse a control that is missing at the start or was held for too long.
+    """Refuse a control that is missing in the first row, or that is held for too long.
 
     Args:
         where: File and column, for messages.
@@ -218,7 +233,7 @@ def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> N
             reason = f"it begins {t[row] - t[0]:g} s later"
         raise RecordingError(
             f"{where} has no value in the first row; {reason}; every control is needed from the "
-            "start"
+            "first row on"
         )
 
     limit = longest_bridged_gap(t, gap)
@@ -226,6 +241,6 @@ def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> N
         end = int(np.argmax(age))
         raise RecordingError(
             f"{where} is empty for {age[end]:g} s until {t[end] - t[0]:g} s; a control is not held "
-            f"longer than {limit:g} s: exclude that time by recording.window, or raise "
+            f"longer than {limit:g} s: exclude this time by recording.window, or raise "
             "recording.gap"
         )

@@ -125,7 +125,7 @@ def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
 
 @formats
 def test_damaged_files(ending: str, columns: Columns, tmp_path: Path) -> None:
-    """Overwritten bytes never cause another error than RecordingError, whose message is one line."""
+    """Overwritten bytes cause no other error than RecordingError, whose message is one line."""
     path = tmp_path / f"log{ending}"
     WRITERS[ending](path, columns)
     whole, rng, said = path.read_bytes(), np.random.default_rng(3), list[str]()
@@ -167,7 +167,7 @@ def test_unknown_endings(tmp_path: Path) -> None:
     (tmp_path / "log.xlsx").write_text("x", encoding="utf-8")
     with pytest.raises(
         RecordingError,
-        match=r"log\.xlsx: not a known kind.*\.csv, \.csv\.gz, \.parquet, \.npz, \.json",
+        match=r"log\.xlsx: unknown format.*\.csv, \.csv\.gz, \.parquet, \.npz, \.json",
     ):
         read_columns(tmp_path / "log.xlsx", ALL)
     with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
@@ -204,7 +204,7 @@ def test_text_is_a_fault_only_if_it_is_used(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t,q,q\n0,1,2\n", "there is more than one column 'q'"),
+        ("t,q,q\n0,1,2\n", "more than one column is named 'q'"),
         ("t,q\n0,1\n1\n", "not a readable CSV table: .*Expected 2 columns, got 1"),
         ("t,q\xff\n0,1\n", "not a readable CSV table"),
     ],
@@ -346,7 +346,7 @@ def test_transposed_matrices_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "log.npz", t=np.arange(5000.0), qpos=np.zeros((2, 5000)))
     with pytest.raises(
         RecordingError,
-        match=r"'qpos' of shape \(2, 5000\) has too many columns; each row must be one time",
+        match=r"'qpos' of shape \(2, 5000\) has too many columns; each row must hold",
     ):
         read_columns(tmp_path / "log.npz", ALL)
     np.savez(tmp_path / "log.npz", t=np.zeros((5, 1)))

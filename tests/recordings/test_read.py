@@ -62,11 +62,18 @@ def task_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> Des
     mass = {"mass": {"target": "body/arm:mass"}}
     start = {"control": {"kind": "sine"}}
     noise = NOISE if model == ARM else {"state": 0.01}
-    e = Experiment(
-        model="arm.xml", rate=100.0, horizon=1.0, initial=start, parameters=mass, noise=noise, recording=recording,
-        directory=folder, source="study.toml",
-    )  # fmt: skip
-    return DesignTask.resolve(e)
+    experiment = Experiment(
+        model="arm.xml",
+        rate=100.0,
+        horizon=1.0,
+        initial=start,
+        parameters=mass,
+        noise=noise,
+        recording=recording,
+        directory=folder,
+        source="study.toml",
+    )
+    return DesignTask.resolve(experiment)
 
 
 @pytest.fixture
@@ -97,7 +104,7 @@ def wave(amplitude: float = 1.0, frequency: float = 2.0) -> Array:
 
 
 def test_default_column_names(read: Read) -> None:
-    """Without a [recording] table columns have mjfim's names; other columns are ignored, also text."""
+    """Without a [recording] table, columns have mjfim's names, and other columns are ignored."""
     logged = read({"qpos:pin": wave(), "encoder": wave(0.9), "note": np.array(["x"] * M)})
     recording = logged.recording
     assert recording.outputs == ("qpos:pin", "encoder")
@@ -206,7 +213,7 @@ def test_signed(read: Read) -> None:
         raw[9] = wrong
         with pytest.raises(
             RecordingError,
-            match=rf"column 'raw' holds {wrong:g} in data row 10, which is no integer",
+            match=rf"column 'raw' holds {wrong:g} in data row 10, which is not an integer",
         ):
             read({"raw": raw}, columns={"motor": {"column": "raw", "signed": 16}})
 
@@ -376,7 +383,8 @@ def test_controls_are_held(read: Read) -> None:
     u[10:40] = np.nan
     with pytest.raises(
         RecordingError,
-        match=r"'ctrl:push'.* is empty for 0\.15 s until 0\.195 s; a control is not held longer than 0\.1 s",
+        match=r"'ctrl:push'.* is empty for 0\.15 s until 0\.195 s; "
+        r"a control is not held longer than 0\.1 s",
     ):
         read({"qpos:pin": wave(), "ctrl:push": u})
     assert read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2).recording.ctrl[39, 0] == 9.0
@@ -397,10 +405,10 @@ def test_dead_channels(read: Read) -> None:
     """A measured column that never moves is refused, a constant control is not."""
     with pytest.raises(
         RecordingError,
-        match=r"column 'enc' is 1\.5 in all of its 400 rows, a dead channel; leave it out",
+        match=r"column 'enc' is 1\.5 in all of its 400 rows, which suggests a dead channel; remove it",
     ):
         read({"enc": np.full(M, 1.5), "q": wave()}, columns={"encoder": "enc", "qpos:pin": "q"})
-    with pytest.raises(RecordingError, match=r"column 'encoder' holds no number; leave it out"):
+    with pytest.raises(RecordingError, match=r"column 'encoder' holds no number; remove it"):
         read({"encoder": np.full(M, np.nan), "qpos:pin": wave()})
     few = np.where(np.arange(M) % 50 == 0, 1.5, np.nan)
     assert (
@@ -552,7 +560,7 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     )
     np.savez(tmp_path / "d.npz", t=T, qpos=qpos[:, :2], ctrl=ctrl)
     with pytest.raises(
-        RecordingError, match=r"'qpos' has 2 columns, the model 3: qpos:rail, qpos:pin, qpos:stop"
+        RecordingError, match=r"'qpos' has 2 columns; the model needs 3: qpos:rail, qpos:pin, qpos:stop"
     ):
         read_recording(tmp_path / "d.npz", task.system.channels)
     stated = task_of(tmp_path, {"columns": {"qpos:pin": "qpos[1]"}})

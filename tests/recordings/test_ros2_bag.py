@@ -120,9 +120,9 @@ def test_messages_without_a_stamp_have_the_time_of_reception(tmp_path: Path) -> 
         ),
         (
             [State(EPOCH, ["a", "b"], [0.0])],
-            r"message 1: the numbers of names and of values differ \(2 names\)",
+            r"message 1: a field does not have one value for each of the 2 joints",
         ),
-        ([State(EPOCH, ["a", "a"], [0.0, 1.0])], "message 1: a joint is named twice: a, a"),
+        ([State(EPOCH, ["a", "a"], [0.0, 1.0])], "message 1: a joint is listed twice: a, a"),
         ([], "topic /j has no message"),
     ],
 )
@@ -145,7 +145,7 @@ def test_no_joint_states(tmp_path: Path) -> None:
 def test_stamps_have_their_unit(tmp_path: Path) -> None:
     path = write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": swing()})
     with pytest.raises(
-        RecordingError, match=r"recording\.time_unit: the stamps of a bag are in seconds"
+        RecordingError, match=r"recording\.time_unit: the time of a bag is in seconds"
     ):
         read_columns(path, RecordingSpec(time_unit="ns"))
 

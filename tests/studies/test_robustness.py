@@ -290,19 +290,19 @@ def change(path: Path, **fields: Any) -> None:
         (
             "ctrl:servo",
             lambda v: np.full_like(v, np.nan),
-            "column 'ctrl:servo' has no number in data row 1",
+            "column 'ctrl:servo' holds no finite number in data row 1",
         ),
         (
             "qpos:hinge",
             lambda v: np.where(np.arange(len(v)) == 2, np.nan, v),
-            "'qpos:hinge' has no number in data row 3",
+            "'qpos:hinge' holds no finite number in data row 3",
         ),
         (
             "t",
             lambda v: v * 1.01,
-            "column 't' does not go from 0 in equal periods of whole timesteps",
+            "column 't' must begin at 0 and increase by equal periods",
         ),
-        ("t", lambda v: v + 0.02, "column 't' does not go from 0"),
+        ("t", lambda v: v + 0.02, "column 't' must begin at 0"),
     ],
 )
 def test_a_damaged_table_is_refused(column: str, wrong: Any, words: str, tmp_path: Path) -> None:

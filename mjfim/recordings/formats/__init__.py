@@ -1,4 +1,4 @@
-"""Columns of numbers from files of every supported format.
+"""Readers of columns of numbers from files of all supported formats.
 
 No content of a file is executed or unpickled.
 """

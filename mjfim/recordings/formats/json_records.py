@@ -1,4 +1,4 @@
-"""JSON logs as columns: a list of records somewhere in the file, or one list of numbers per column."""
+"""Reader of JSON logs, which hold a list of records or one list of numbers per column."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ NUMBERS = (bool, int, float)
 
 
 def read_json(path: Path, spec: RecordingSpec) -> Table:
-    """Read the records of a JSON file; where there are none, its lists of numbers are the columns.
+    """Read the records of a JSON file; without records, its lists of numbers are the columns.
 
-    A field inside an object is named `a.b`, an item of a list `a[0]`. null is an empty field.
-    Numbers beside the list of records hold for all rows.
+    A field inside an object is named `a.b`, and an item of a list `a[0]`. A null is an empty field.
+    Numbers outside the list of records are constants, which hold for all rows.
 
     Args:
         path: The file.
-        spec: The `[recording]` table; `records` says where the list of records is.
+        spec: The `[recording]` table; its `records` may name the list of records.
 
     Returns:
         All columns.
 
     Raises:
-        RecordingError: The file is damaged, or the place of the records is not clear.
+        RecordingError: The file is damaged, or it is not clear which list holds the records.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -46,7 +46,7 @@ def read_json(path: Path, spec: RecordingSpec) -> Table:
 
 
 def _table(path: Path, content: Any, spec: RecordingSpec) -> Table:
-    """Columns of the records and of the constants beside them."""
+    """Columns of the records, and of the constants outside the list of records."""
     keys = _keys_of_records(path, content, spec)
     if keys is None:
         return _table_of_lists(path, content, spec.time)
@@ -69,7 +69,7 @@ def _table(path: Path, content: Any, spec: RecordingSpec) -> Table:
 
 
 def _keys_of_records(path: Path, content: Any, spec: RecordingSpec) -> tuple[str, ...] | None:
-    """Keys that lead to the list of records; None where the file has lists of numbers instead."""
+    """Keys that lead to the list of records; None if the file has lists of numbers instead."""
     if spec.records is not None:
         return _stated_keys(path, content, spec.records)
 
@@ -115,7 +115,7 @@ def _is_records(value: Any) -> bool:
 
 
 def _lists_of_records(value: Any, keys: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Keys of every list of records inside a value, which is itself reached by `keys`."""
+    """Keys of every list of records inside a value; `keys` lead to the value."""
     if _is_records(value):
         yield keys
     elif isinstance(value, Mapping):
@@ -136,7 +136,7 @@ def _without_records(content: Any, keys: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _leaves(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and value of everything in nested objects that is not an object itself."""
+    """Dotted names and values of nested objects; every value that is not an object is yielded."""
     for key, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _leaves(inner, f"{prefix}{key}.")
@@ -147,8 +147,10 @@ def _leaves(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
 def _columns_of_records(
     records: Sequence[Mapping[str, Any]],
 ) -> tuple[dict[str, Array], dict[str, str]]:
-    """Columns and faults of records, which need not all have the same fields."""
-    columns, faults, lengths = dict[str, Array](), dict[str, str](), dict[str, int]()
+    """Columns and faults by name; fields may be missing in some of the records."""
+    columns: dict[str, Array] = {}
+    faults: dict[str, str] = {}
+    lengths: dict[str, int] = {}
 
     for row, record in enumerate(records):
         for field, value in _leaves(record):
@@ -171,7 +173,10 @@ def _columns_of_records(
 
 
 def _ragged(field: str, items: list[Any], row: int, lengths: dict[str, int]) -> dict[str, str]:
-    """Faults of a list field whose length differs from that in the first record; `lengths` keeps that length."""
+    """Faults of a list field whose length differs from its length in the first record.
+
+    lengths: length of each list field in the first record; a new field is added.
+    """
     first = lengths.setdefault(field, len(items))
     if first == len(items):
         return {}
@@ -189,7 +194,8 @@ def _table_of_lists(path: Path, content: Mapping[str, Any], time: str) -> Table:
         raise RecordingError(f"{path}: column {time!r} is missing; found: {found}")
 
     rows = len(lists[time])
-    columns, faults = dict[str, Array](), dict[str, str]()
+    columns: dict[str, Array] = {}
+    faults: dict[str, str] = {}
     for name, value in values.items():
         if name in lists and len(value) != rows:
             faults[name] = length_fault(len(value), time, rows)

@@ -1,4 +1,4 @@
-"""NPZ archives as columns: one array per column, or matrices with one column per matrix column."""
+"""Reader of NPZ archives, whose vectors and columns of matrices are the columns of the log."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mjfim.recordings.formats.table import (
 )
 from mjfim.recordings.spec import RecordingSpec
 
-# Largest number of columns of one matrix; more are a matrix whose time runs along the rows.
+# Largest number of columns of one matrix. If a matrix has more, its rows are probably not times.
 MAX_COLUMNS = 4096
 
 # NumPy's readers of array headers, by version of the NPY format.
@@ -34,14 +34,21 @@ HEADER_READERS = {
 
 # Errors that zipfile and NumPy raise for a damaged archive.
 DAMAGED = (
-    ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
+    ValueError,
+    OSError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def read_npz(path: Path, spec: RecordingSpec) -> Table:
     """Read the one- and two-dimensional arrays of an archive; nothing is unpickled.
 
-    A number holds for all rows. A control may lack the last row.
+    A single number holds for all rows. A control may have one row less than the time.
 
     Args:
         path: The archive.
@@ -51,11 +58,12 @@ def read_npz(path: Path, spec: RecordingSpec) -> Table:
         The columns `name` of vectors and `name[i]` of matrices.
 
     Raises:
-        RecordingError: The archive is damaged, too large, holds pickled objects or lacks the time.
+        RecordingError: The archive is damaged or too large, holds pickled objects, or has no time.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            # All sizes are checked before memory is taken: first the archive's, then each array's.
+            # All sizes are checked before memory is allocated: that of the archive, then those of
+            # the arrays.
             unpacked = sum(info.file_size for info in archive.infolist())
             check_unpacked_size(path, path.stat().st_size, unpacked)
 
@@ -69,7 +77,7 @@ def read_npz(path: Path, spec: RecordingSpec) -> Table:
 
 
 def _header(path: Path, archive: zipfile.ZipFile, member: str) -> tuple[tuple[int, ...], np.dtype]:
-    """Read shape and type of one array, and refuse what must not be loaded."""
+    """Read shape and type of one array; refuse pickled objects and arrays that are too large."""
     with archive.open(member) as stream:
         shape, _, dtype = HEADER_READERS[np.lib.format.read_magic(stream)](stream)
 
@@ -82,8 +90,8 @@ def _header(path: Path, archive: zipfile.ZipFile, member: str) -> tuple[tuple[in
 
     if len(shape) == 2 and shape[1] > MAX_COLUMNS:
         raise RecordingError(
-            f"{path}: array {name!r} of shape {shape} has too many columns; each row must be one "
-            "time"
+            f"{path}: array {name!r} of shape {shape} has too many columns; each row must hold the "
+            "values of one time"
         )
 
     # NumPy allocates the whole array before it reads the content.
@@ -99,7 +107,7 @@ def _table(
     headers: Mapping[str, tuple[tuple[int, ...], np.dtype]],
     spec: RecordingSpec,
 ) -> Table:
-    """Read the arrays that are needed; headers: shape and type by name of the array."""
+    """Read the arrays that are needed; headers: shape and type of each array by its name."""
     labels = {name: _labels(name, shape) for name, (shape, _) in headers.items() if len(shape) <= 2}
     time = headers[spec.time][0] if spec.time in headers else None
     if time is None or len(time) != 1:
@@ -111,11 +119,13 @@ def _table(
     needed = set(columns_to_read(itertools.chain.from_iterable(labels.values()), spec))
     controls = {s.column for key, s in spec.sources.items() if key.startswith("ctrl:")}
 
-    columns, faults, unread = dict[str, Array](), dict[str, str](), list[str]()
+    columns: dict[str, Array] = {}
+    faults: dict[str, str] = {}
+    unread: list[str] = []
     for name, parts in labels.items():
         shape, dtype = headers[name]
 
-        # A control is held from each row to the next one, so that the last row may have none.
+        # A control is held from each row to the next one, so the last row may have no control.
         is_control = name.startswith("ctrl") or not controls.isdisjoint(parts)
         fits = not shape or shape[0] == rows or (is_control and shape[0] == rows - 1)
 

@@ -1,4 +1,7 @@
-"""Log files of every format as columns of numbers; CSV and Parquet here, the other formats in their own modules."""
+"""Reader of log files of all formats.
+
+CSV and Parquet files are read here; each of the other formats has a module.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ from mjfim.recordings.spec import RecordingSpec
 # Errors that pyarrow and gzip raise for a damaged file.
 DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)
 
-# Bytes that are unpacked at once where the reader states no size.
+# Number of bytes that are unpacked at once if the reader requests no number.
 CHUNK = 1 << 20
 
 
@@ -56,7 +59,7 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
             raise RecordingError(
-                f"{path}: a folder without metadata.yaml is no ROS 2 bag; name a file"
+                f"{path}: a folder without metadata.yaml is not a ROS 2 bag; name a file"
             )
         return read_bag(path, spec)
 
@@ -64,8 +67,8 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     reader = next((read for ending, read in READERS.items() if name.endswith(ending)), None)
     if reader is None:
         raise RecordingError(
-            f"{path}: not a known kind of log; valid endings: {', '.join(READERS)}; or the folder "
-            "of a bag"
+            f"{path}: unknown format; a log is a file that ends in {', '.join(READERS)}, or the "
+            "folder of a ROS 2 bag"
         )
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty")
@@ -87,7 +90,7 @@ def read_table(path: Path) -> dict[str, Array]:
     """
     table = _read_csv(path, RecordingSpec())
 
-    # Looking up a faulty column raises the error that explains its fault.
+    # The look-up of a faulty column raises the error that explains its fault.
     for name in table.faults:
         table.column(name)
 
@@ -102,7 +105,7 @@ def _read_csv(path: Path, spec: RecordingSpec) -> Table:
 
         duplicate = next((name for name in names if names.count(name) > 1), None)
         if duplicate is not None:
-            raise RecordingError(f"{path}: there is more than one column {duplicate!r}")
+            raise RecordingError(f"{path}: more than one column is named {duplicate!r}")
 
         needed = columns_to_read(names, spec)
         table = _parse_csv(path, needed)
@@ -115,19 +118,22 @@ def _read_csv(path: Path, spec: RecordingSpec) -> Table:
 
 
 def _parse_csv(path: Path, names: list[str]) -> Any:
-    """Parse columns as numbers (an arrow table); where one holds text, all have the type of their content."""
+    """Parse columns as an arrow table of numbers.
+
+    If a column holds text, the type of every column is inferred from its content.
+    """
     try:
         return _parse_csv_as(path, names, {name: pyarrow.float64() for name in names})
     except pyarrow.ArrowInvalid as error:
         if "conversion error" not in str(error):
             raise
 
-    # Slower, but it shows which columns hold text.
+    # This is slower, but it shows which columns hold text.
     return _parse_csv_as(path, names, {})
 
 
 def _parse_csv_as(path: Path, names: list[str], types: dict[str, Any]) -> Any:
-    """Parse columns of stated types; a column without a stated type has the type of its content."""
+    """Parse columns; the type of a column without a stated type is inferred from its content."""
     options = pyarrow.csv.ConvertOptions(include_columns=names, column_types=types)
     with _opened(path) as source:
         return pyarrow.csv.read_csv(source, convert_options=options)
@@ -145,7 +151,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 class _SizeCheckedStream(io.RawIOBase):
-    """Stream of a gzip file's content that refuses to unpack a decompression bomb."""
+    """Stream of the content of a gzip file, which refuses to unpack a decompression bomb."""
 
     def __init__(self, path: Path, packed: io.BufferedReader, stream: gzip.GzipFile) -> None:
         self._path = path
@@ -154,7 +160,7 @@ class _SizeCheckedStream(io.RawIOBase):
         self._unpacked_size = 0
 
     def readable(self) -> bool:
-        """Return True: this stream can be read."""
+        """Return True, because this stream can be read."""
         return True
 
     def read(self, size: int = -1) -> bytes:
@@ -184,11 +190,14 @@ def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
 
 def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
     """Convert the columns of an arrow table to float64."""
-    columns, faults = dict[str, Array](), dict[str, str]()
+    columns: dict[str, Array] = {}
+    faults: dict[str, str] = {}
 
-    # Each column is dropped once it is converted, so that memory never holds two copies of all.
+    # Each column is dropped after its conversion, so that memory never holds two copies of the
+    # whole table.
     while table.num_columns:
-        name, column = table.column_names[0], table.column(0)
+        name = table.column_names[0]
+        column = table.column(0)
         table = table.remove_column(0)
 
         numbers = _as_numbers(column)
@@ -201,7 +210,7 @@ def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
 
 
 def _as_numbers(column: Any) -> Array | None:
-    """(M,) numbers of an arrow column; None for text, even where every field reads like a number."""
+    """(M,) numbers of an arrow column; None for text, even if every field looks like a number."""
     kind = column.type
     if pyarrow.types.is_string(kind) or pyarrow.types.is_large_string(kind):
         return None

@@ -1,9 +1,9 @@
-"""ROS 2 bags as columns: joint states by topic.
+"""Reader of the joint states in ROS 2 bags.
 
 The library `rosbags` is imported only when a bag is read.
 
-Messages are read by the definition that ROS publishes, not by the one inside the bag: the library
-generates code from definitions, and a file of unknown origin must not control that code.
+Messages are read with the definition that ROS publishes, not with the one inside the bag: the
+library generates code from definitions, and a file of unknown origin must not control this code.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mjfim.errors import RecordingError, unknown
 from mjfim.recordings.formats.table import Table, one_line
 from mjfim.recordings.spec import RecordingSpec
 
-# The only type of message that is read.
+# Type of the messages that are read; all other messages are ignored.
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 # Fields of a joint state that become columns.
@@ -34,7 +34,7 @@ NANOSECONDS = 1_000_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class _Layout:
-    """Shape that several messages of one topic share.
+    """Joints and quantities of a message; messages of one layout are collected in one block.
 
     Attributes:
         topic: Name of the topic.
@@ -56,7 +56,7 @@ class _Layout:
 
 @dataclass(kw_only=True)
 class _Block:
-    """Messages of one layout, appended while the bag is read.
+    """Messages of one layout, which are appended while the bag is read.
 
     Attributes:
         stamps: M time stamps [ns].
@@ -71,23 +71,23 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
     """Read the joint states of a ROS 2 bag.
 
     The columns are `t` [s after the first stamp] and `position:<joint>`, `velocity:<joint>`,
-    `effort:<joint>`. Where the recording has several topics, they are `<topic>:position:<joint>`,
-    and the rows of all topics are merged by time.
+    `effort:<joint>`. If several topics are read, their names begin with the topic, as in
+    `<topic>:position:<joint>`, and the rows of all topics are merged by time.
 
     Args:
         path: The folder of the bag, or its file.
         spec: The `[recording]` table; `topics` selects topics.
 
     Returns:
-        All columns, NaN where a topic has no message at a time.
+        All columns; NaN if a topic has no message at a time.
 
     Raises:
-        RecordingError: The bag is damaged, has no joint states, or it is not clear which topic to
-            read; or the library is not installed.
+        RecordingError: The bag is damaged, has no joint states, it is not clear which topic to
+            read, or the library is not installed.
     """
     if spec.time_unit != "s":
         raise RecordingError(
-            f"{path}: recording.time_unit: the stamps of a bag are in seconds; leave it out"
+            f"{path}: recording.time_unit: the time of a bag is in seconds; leave this key out"
         )
 
     rosbag2 = _library(path, "rosbags.rosbag2")
@@ -123,7 +123,7 @@ def _library(path: Path, name: str) -> Any:
 
 
 def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]) -> list[Any]:
-    """Connections of the stated topics, or of the only topic of joint states."""
+    """Connections of the stated topics, or of the only topic with joint states."""
     connections = list(connections)
     states = [c for c in connections if c.msgtype == JOINT_STATE]
     available = sorted({c.topic for c in states})
@@ -150,8 +150,8 @@ def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict
     """Read all messages and collect them by layout."""
     blocks: dict[_Layout, _Block] = {}
 
-    # Several publishers of one topic may interleave: the stamps of each set of joints increase
-    # separately.
+    # Messages of several publishers of one topic may interleave, so the stamps must increase only
+    # among messages with equal joints.
     last: dict[tuple[str, frozenset[str]], int] = {}
 
     for number, (connection, received, raw) in enumerate(reader.messages(connections=connections)):
@@ -168,7 +168,8 @@ def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict
         block = blocks.get(layout)
         if block is None:
             if len(set(layout.joints)) < len(layout.joints):
-                raise RecordingError(f"{where}: a joint is named twice: {', '.join(layout.joints)}")
+                listed = ", ".join(layout.joints)
+                raise RecordingError(f"{where}: a joint is listed twice: {listed}")
             block = blocks[layout] = _Block()
 
         block.stamps.append(stamp)
@@ -180,13 +181,13 @@ def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict
 
 
 def _layout(where: str, topic: str, message: Any) -> _Layout:
-    """Layout of a message, whose fields that are not empty need one number per joint."""
+    """Layout of a message; a field that is not empty must have one number per joint."""
     joints = tuple(message.name)
     quantities = tuple(name for name in QUANTITIES if len(getattr(message, name)))
 
     if any(len(getattr(message, name)) != len(joints) for name in quantities):
         raise RecordingError(
-            f"{where}: the numbers of names and of values differ ({len(joints)} names)"
+            f"{where}: a field does not have one value for each of the {len(joints)} joints"
         )
     return _Layout(topic=topic, joints=joints, quantities=quantities)
 
@@ -211,7 +212,7 @@ def _merged(path: Path, blocks: dict[_Layout, _Block], with_topic: bool) -> Tabl
     all_stamps = [np.frombuffer(block.stamps, dtype=np.int64) for block in blocks.values()]
     stamps = np.unique(np.concatenate(all_stamps))
 
-    # Subtract whole nanoseconds first: since 1970 there are too many for a float64.
+    # Subtract integers first: a float64 cannot hold nanoseconds since 1970 exactly.
     t = (stamps - stamps[0]).astype(np.float64) / NANOSECONDS
     columns: dict[str, Array] = {"t": t}
 

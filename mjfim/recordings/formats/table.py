@@ -1,4 +1,4 @@
-"""A log file as columns of numbers by name, before the columns have a meaning."""
+"""Columns of numbers of a log file by name, and limits of its size."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mjfim.recordings.spec import RecordingSpec
 # Largest size of a file's unpacked content, and of the columns read from it [bytes].
 MAX_UNPACKED_SIZE = 4 * 2**30
 
-# Unpacked size below which the packing ratio of a file is not questioned [bytes].
+# Unpacked size below which the packing ratio of a file is not checked [bytes].
 UNSUSPICIOUS_SIZE = 64 * 2**20
 
 # Largest plausible ratio of unpacked to packed size of a log.
@@ -33,8 +33,8 @@ class Table:
     Attributes:
         source: The file.
         columns: (M,) float64 numbers by column name, NaN where a field is empty.
-        faults: Reason why a column cannot be used, by column name, as the end of a sentence (`is
-            not numeric`).
+        faults: Reasons why columns cannot be used, by column name, each the end of a sentence that
+            begins with the column, such as `is not numeric`.
         unread: Names of the columns that were not read because they were not requested.
     """
 
@@ -78,8 +78,8 @@ def columns_to_read(names: Iterable[str], spec: RecordingSpec) -> list[str]:
         spec: The `[recording]` table.
 
     Returns:
-        All names where the table states no measured column, else the stated columns, the time and
-        everything that may be a control under its default name.
+        All names if the table states no measured column. Otherwise the stated columns, the time,
+        and all columns that may be a control under its default name.
     """
     sources = spec.sources
     if all(key.startswith("ctrl:") for key in sources):
@@ -112,7 +112,7 @@ def check_unpacked_size(path: Path, packed: int, unpacked: int) -> None:
     if unpacked > UNSUSPICIOUS_SIZE and unpacked > MAX_PACKING_RATIO * packed:
         raise RecordingError(
             f"{path}: unpacks to more than {MAX_PACKING_RATIO:g} times its size, which is unusual "
-            "for a log; if it is one, unpack it first"
+            "for a log; if it is a log, unpack it first"
         )
 
 
@@ -153,12 +153,12 @@ def one_line(error: Exception) -> str:
     """Quote another library's error message in one short line.
 
     Args:
-        error: An error whose message may quote the damaged file.
+        error: An error, whose message may quote content of a damaged file.
 
     Returns:
         The message without line breaks and control characters, at most `MAX_QUOTATION` characters.
     """
-    # A damaged file may hold anything, including control sequences of a terminal.
+    # A damaged file may hold control sequences of a terminal, which must not be printed.
     printable = "".join(c if c.isprintable() or c.isspace() else "?" for c in str(error))
 
     line = " ".join(printable.split()) or type(error).__name__
