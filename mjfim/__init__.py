@@ -1,8 +1,8 @@
-"""mjfim: system identification on MuJoCo that designs the experiment.
+"""mjfim: optimal experiment design and system identification with MuJoCo.
 
-`check` says what can be identified, `design` finds the excitation that reveals most about uncertain
-parameters, `simulate` plays it, `identify` estimates the parameters from recordings, `monte_carlo`
-compares the estimates with the Cramér-Rao bound.
+`check` says which parameters can be identified, `design` finds the excitation that gives the most
+information about them, `simulate` makes a synthetic recording, `identify` estimates the parameters
+from recordings, and `monte_carlo` compares the estimates with the Cramér-Rao bound.
 """
 
 from mjfim.budget import Budget, StopToken
@@ -70,18 +70,18 @@ RENAMED = {
     "shortest": "shortest_experiment",
 }
 
-# Names of earlier versions that several names replace.
+# Names of earlier versions that are replaced by several names.
 REPLACED = {
     "Setup": "mjfim.experiment.System and mjfim.excitation.DesignTask",
 }
 
 
 def __getattr__(name: str) -> object:
-    """Name the new name of a function or record that was renamed.
+    """Raise an error that states the new name of a renamed function or record.
 
     Raises:
-        ImportError: The name was renamed; the message names the new one. An AttributeError would be
-            replaced by Python in `from mjfim import name`, together with its message.
+        ImportError: The name was renamed; the message states the new one. An AttributeError is not
+            used, because `from mjfim import name` would replace it and its message.
         AttributeError: The name does not exist and did not exist before.
     """
     if name in RENAMED:

@@ -1,4 +1,4 @@
-"""Array types and helpers that every package shares."""
+"""The array type and small functions on arrays that all packages use."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Smallest diagonal entry of a matrix that is scaled to unit diagonal; protects a division by zero.
+# Lower bound of the diagonal entries by which a matrix is scaled; it avoids a division by zero.
 SMALLEST_DIAGONAL = 1e-300
 
 
@@ -25,7 +25,7 @@ def freeze(record: object, *names: str) -> None:
 
 
 def evenly_spread_indices(count: int, limit: int) -> NDArray[np.intp]:
-    """Indices of at most `limit` of `count` rows, evenly spread from the first to the last one.
+    """Indices of at most `limit` out of `count` rows, evenly spread from the first to the last row.
 
     Args:
         count: Number of rows.
@@ -55,12 +55,15 @@ def scaled_to_unit_diagonal(matrix: Array) -> tuple[Array, Array]:
 
 
 def scaled_pseudo_inverse(matrix: Array, tolerance: float) -> Array:
-    """Pseudo-inverse of a symmetric positive semidefinite matrix, independent of the units of the unknowns.
+    """Pseudo-inverse of a symmetric positive semidefinite matrix.
+
+    The matrix is scaled to unit diagonal first, so that its rank does not depend on the units of
+    the unknowns.
 
     Args:
         matrix: (n, n) symmetric positive semidefinite matrix.
-        tolerance: Eigenvalues of the matrix scaled to unit diagonal below this share of the largest
-            one count as zero.
+        tolerance: Eigenvalues of the scaled matrix below this fraction of the largest one count as
+            zero.
 
     Returns:
         (n, n) pseudo-inverse.

@@ -1,4 +1,4 @@
-"""Files that are written completely or not at all: under a temporary name in the same folder, then renamed."""
+"""Atomic writing of files: under a temporary name in the same folder, then renamed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-# Permissions of a new file before the process's umask removes some of them.
+# Permissions of a new file, from which the umask of the process removes some.
 DEFAULT_PERMISSIONS = 0o666
 
 
@@ -31,7 +31,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.close(handle)
 
-    # mkstemp makes files that only their owner may read; give the usual permissions instead.
+    # mkstemp creates files that only their owner may read; results get the usual permissions.
     os.chmod(name, DEFAULT_PERMISSIONS & ~_umask())
 
     temporary = Path(name)

@@ -1,8 +1,8 @@
-"""Budget of time, engine steps and iterations for long work, and a token that asks it to stop.
+"""Budget of time, engine steps and iterations, and a token that asks a computation to stop.
 
-Long work asks `budget.exhausted` in its loops and returns the best result so far; nothing is raised
-to stop it. Ctrl-C becomes a token at the edge, in the verbs and the command line, by
-`stop_on_interrupt`.
+Long computations check `budget.exhausted` in their loops and return their best result so far; no
+exception is raised to stop them. `stop_on_interrupt`, which the verbs and the command line use,
+turns Ctrl-C into a request of a token.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 
 
 class StopReason(Enum):
-    """Reason for which work ended early. The value is the sentence that a user reads."""
+    """Reason why a computation ended early; the value is a sentence for the user."""
 
     REQUESTED = "interrupted by the user"
     SECONDS = "the time is used up"
@@ -31,13 +31,13 @@ class StopReason(Enum):
 
 
 class StopToken:
-    """A request to stop, set once and seen by all work that shares the token.
+    """A request to stop, which all computations that share the token check.
 
-    A token may be set from another thread, from a signal handler or from a callback.
+    The request may come from another thread, from a signal handler or from a callback.
 
     Args:
-        also: Function that returns True where work has to stop as well, for example at the request
-            of a parent process.
+        also: Function that returns True if there is a request from elsewhere, such as from a
+            parent process.
     """
 
     def __init__(self, also: Callable[[], bool] | None = None) -> None:
@@ -45,7 +45,7 @@ class StopToken:
         self._also = also
 
     def request(self) -> None:
-        """Ask all work that shares this token to return the best result so far."""
+        """Ask all computations that share this token to return their best result so far."""
         self._event.set()
 
     @property
@@ -55,13 +55,13 @@ class StopToken:
 
 
 class Budget:
-    """Time, engine steps and iterations that work may use; asked in its loops.
+    """Time, engine steps and iterations that a computation may use; it checks them in its loops.
 
     Args:
         seconds: Time from the creation of the budget [s]; infinite without a limit.
         steps: Engine steps; None without a limit.
         iterations: Iterations; None without a limit.
-        stop: Token that ends the work early.
+        stop: Token that ends the computation early.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Budget:
         self.iterations = 0
 
     def spend(self, *, steps: float = 0.0, iterations: int = 0) -> None:
-        """Count what was used since the last call."""
+        """Count the engine steps and iterations since the last call."""
         self.steps += steps
         self.iterations += iterations
 
@@ -92,7 +92,7 @@ class Budget:
 
     @property
     def iterations_left(self) -> float:
-        """Iterations that are left, never negative; infinite without a limit."""
+        """Remaining iterations, never negative; infinite without a limit."""
         return max(self.max_iterations - self.iterations, 0)
 
     @property
@@ -102,7 +102,7 @@ class Budget:
 
     @property
     def used(self) -> float:
-        """Share of the tightest limit that is used, at least 0; 1 or more when the budget is exhausted."""
+        """Used fraction of the limit that is closest to its end; 1 or more if it is exhausted."""
         shares = [self.steps / self.max_steps, self.iterations / self.max_iterations]
         total = self.deadline - self.begun
         if np.isfinite(total):
@@ -112,7 +112,7 @@ class Budget:
 
     @property
     def exhausted(self) -> StopReason | None:
-        """Reason to stop the work, or None while it may continue."""
+        """Reason to stop the computation; None while it may continue."""
         if self.stop.requested:
             return StopReason.REQUESTED
         if time.monotonic() >= self.deadline:
@@ -125,10 +125,10 @@ class Budget:
         return None
 
     def share(self, fraction: float = 1.0, *, iterations: int | None = None) -> Budget:
-        """A budget for a part of the work, with the same token.
+        """Make a budget for a part of the computation; both budgets share one token.
 
         Args:
-            fraction: Share of the remaining time and of the remaining engine steps.
+            fraction: Fraction of the remaining time and of the remaining engine steps.
             iterations: Iterations of the part; None without a limit.
 
         Returns:
@@ -143,20 +143,20 @@ class Budget:
         )
 
     def with_stop(self, stop: StopToken) -> Budget:
-        """Make a copy that asks another token.
+        """Make a copy with another token.
 
         Args:
             stop: The other token.
 
         Returns:
-            A budget with the same limits, of which as much is used.
+            A budget with equal limits and equal use so far.
         """
         other = copy.copy(self)
         other.stop = stop
         return other
 
     def __getstate__(self) -> dict[str, Any]:
-        """State for another process, which has another stop token and whose monotonic clock may differ."""
+        """State for another process, in which the stop token and the monotonic clock differ."""
         state = dict(self.__dict__)
         state["stop"] = None
         state["moment"] = time.time(), time.monotonic()
@@ -177,16 +177,17 @@ _active: ContextVar[StopToken | None] = ContextVar("mjfim_stop_token", default=N
 
 @contextmanager
 def stop_on_interrupt(stop: StopToken | None = None) -> Iterator[StopToken]:
-    """Turn the first Ctrl-C inside the context into a request to stop; a second one interrupts as usual.
+    """Turn the first Ctrl-C inside the context into a request to stop.
 
-    Nested contexts share the token of the outermost one. Outside the main thread, where Python
-    delivers no signals, the token is only yielded.
+    A second Ctrl-C raises KeyboardInterrupt as usual. Nested contexts share the token of the
+    outermost one. Outside the main thread, to which Python delivers no signals, the token is only
+    yielded.
 
     Args:
         stop: Token to set; default: that of the surrounding context, or a new one.
 
     Yields:
-        The token that the work has to check.
+        The token that the computation has to check.
     """
     outer = _active.get()
     token = stop or outer or StopToken()
@@ -195,11 +196,11 @@ def stop_on_interrupt(stop: StopToken | None = None) -> Iterator[StopToken]:
     )
     previous = signal.getsignal(signal.SIGINT) if handled else None
 
-    # A process that ignores Ctrl-C, such as a worker, keeps ignoring it.
+    # A process that ignores Ctrl-C, such as a worker, continues to ignore it.
     handled = handled and callable(previous)
 
     def request(number: int, frame: FrameType | None) -> None:
-        """Set the token; ask the surrounding context as well, and interrupt where the token is set already."""
+        """Set this token and the one of the surrounding context; a second call interrupts."""
         if token.requested:
             signal.default_int_handler(number, frame)
         token.request()

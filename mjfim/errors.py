@@ -1,4 +1,4 @@
-"""Errors that misuse causes. Each message names the place, the fault and what would be right."""
+"""Errors that misuse causes; each message names the place, the fault and what would be right."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-# Arguments of the public functions that were renamed, each with its new name and what to pass now.
+# Renamed arguments of public functions, each with its new name and a description of its value.
 RENAMED_ARGUMENTS = {
     "monitor": ("callback", "which is called with one event"),
     "tell": ("callback", "which is called with one event"),
@@ -22,15 +22,15 @@ RENAMED_ARGUMENTS = {
 
 
 class MjfimError(Exception):
-    """Base class of every error that mjfim raises for misuse; the command line turns it into exit code 2."""
+    """Base class of all errors that mjfim raises for misuse; the command line exits with code 2."""
 
 
 class ExperimentError(MjfimError):
-    """The experiment file, or its Python equivalent, asks for something impossible or unknown."""
+    """The experiment has an unknown key or name, or a value that is not valid."""
 
 
 class ModelError(MjfimError):
-    """MuJoCo does not load or compile the model, or the model lacks what the experiment names."""
+    """MuJoCo cannot load or compile the model, or mjfim cannot use it."""
 
 
 class RecordingError(MjfimError):
@@ -38,22 +38,22 @@ class RecordingError(MjfimError):
 
 
 class UnidentifiableError(MjfimError):
-    """The initial trajectory carries no information about some direction of the parameters."""
+    """A trajectory gives no information about a combination of parameters."""
 
 
 class SimulationDivergedError(MjfimError):
-    """MuJoCo reported a numerical warning, or a state is not finite, along a rollout that must not fail."""
+    """A rollout failed: MuJoCo reported a numerical warning, or a state is not finite."""
 
 
 class NoResultError(MjfimError):
-    """The work was asked to stop before there was a result."""
+    """The computation was asked to stop before it had a result."""
 
 
 def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
-    """Sentence for a name that does not exist.
+    """Describe the use of a name that does not exist.
 
     Args:
-        kind: Kind of thing that was named, e.g. "actuator".
+        kind: Kind of object that was named, such as "actuator".
         name: The unknown name.
         valid: All names that exist.
 
@@ -69,18 +69,19 @@ def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
 
 
 def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Decorate a public function so that an argument under its old name is an error that names the new one.
+    """Decorate a public function so that an old name of an argument is explained.
 
     Args:
         function: The function.
 
     Returns:
-        The function with the check.
+        The function; it raises a TypeError that names the new argument for an old one.
     """
     known = inspect.signature(function).parameters
 
     @functools.wraps(function)
     def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        """Raise TypeError for an old name of an argument; otherwise call the function."""
         for old, (new, meaning) in RENAMED_ARGUMENTS.items():
             if old in kwargs and old not in known and new in known:
                 raise TypeError(
@@ -93,7 +94,7 @@ def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable
 
 
 class RenamedFields:
-    """Base of records whose fields were renamed: an old name is an error that names the new one.
+    """Base class of records with renamed fields; the error for an old name states the new one.
 
     Attributes:
         renamed_fields: Names of fields in earlier versions, each with its new name.
@@ -101,11 +102,11 @@ class RenamedFields:
 
     renamed_fields: ClassVar[Mapping[str, str]] = {}
 
-    # A type checker must not take this for a promise that every attribute exists.
+    # Type checkers do not see this method, because they would accept every attribute name.
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Raise AttributeError; called only where there is no attribute of this name."""
+            """Raise AttributeError; Python calls this only for an attribute that does not exist."""
             record = type(self).__name__
             if name in type(self).renamed_fields:
                 new = type(self).renamed_fields[name]

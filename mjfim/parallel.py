@@ -1,4 +1,4 @@
-"""Worker processes that see a request to stop and then return the best result that they have."""
+"""Pool of worker processes that can be asked to stop and to return their best result so far."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from mjfim.budget import Budget, StopToken
 
 T = TypeVar("T")
 
-# Time that running tasks have to return their best result after a request to stop [s]; they ask
-# between two iterates.
+# Time for which the parent process waits for running tasks after a request to stop [s]. The tasks
+# check the request after each iterate.
 GRACE = 20.0
 
-# Time between two looks at the stop token while the parent process waits for a task [s].
+# Period at which the parent process checks its stop token while it waits for a task [s].
 POLL_INTERVAL = 0.2
 
 
@@ -32,14 +32,14 @@ def cores() -> int:
 
 
 class Pool(ProcessPoolExecutor):
-    """Fresh worker processes, at most one per core, that share a request to stop.
+    """Worker processes, at most one per core, that share one request to stop.
 
-    Only the parent process reacts to Ctrl-C; the workers continue until `stop` is called. Other
-    executors of `concurrent.futures` can be used in place of a pool; their processes do not see the
-    request, so that their tasks run to the end.
+    Only the parent process reacts to Ctrl-C; the workers continue until `stop` is called. Another
+    executor of `concurrent.futures` can be used instead of a pool. Its processes do not receive the
+    request to stop, so their tasks run to the end.
 
     Args:
-        count: Number of processes; default and maximum: one per core.
+        count: Number of processes; the default and the maximum are one per core.
     """
 
     def __init__(self, count: int | None = None) -> None:
@@ -49,33 +49,38 @@ class Pool(ProcessPoolExecutor):
         super().__init__(processes, context, _initialize_worker, (self._stop,))
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Submit a task, as for any executor.
+        """Submit a task; the arguments are those of `concurrent.futures.Executor.submit`.
 
-        Processes that are started here ignore Ctrl-C from the beginning.
+        A process that is started for the task ignores Ctrl-C from the beginning.
         """
         with _interrupts_blocked():
             return super().submit(fn, *args, **kwargs)
 
     def stop(self) -> None:
-        """Ask all tasks, also later ones, to return the best result that they have."""
+        """Ask all running and later tasks to return their best result so far."""
         self._stop.set()
 
     def resume(self) -> None:
-        """Withdraw the request to stop; allowed when no task is running."""
+        """Withdraw the request to stop. No task may be running."""
         self._stop.clear()
 
 
-# The token of the pool that this process works for. It is replaced when a pool starts the process.
+# Stop token of the pool to which this process belongs. In a worker process, `_initialize_worker`
+# replaces it.
 _pool_token = StopToken()
 
 
 def pool_stop_token() -> StopToken:
-    """Return the token of the pool that this process works for; elsewhere a token that nobody sets."""
+    """Return the stop token of the pool to which this process belongs.
+
+    Returns:
+        The token; in a process that does not belong to a pool, a token that is never set.
+    """
     return _pool_token
 
 
 def workers_of(executor: Executor | None) -> int:
-    """Return how many tasks an executor runs at the same time; 1 without an executor."""
+    """Return the number of tasks that an executor runs in parallel; 1 without an executor."""
     # `concurrent.futures` has no public name for this number; an executor without it counts as one.
     return 1 if executor is None else int(getattr(executor, "_max_workers", 1))
 
@@ -83,13 +88,13 @@ def workers_of(executor: Executor | None) -> int:
 def results_in_order(
     executor: Executor, futures: Sequence[Future[T]], budget: Budget
 ) -> Iterator[T]:
-    """Yield the results of tasks in the order of their submission, as far as the budget allows.
+    """Yield the results of tasks in the order of their submission, within a budget.
 
     Args:
-        executor: Runs the tasks.
+        executor: Executor that runs the tasks.
         futures: Submitted tasks.
-        budget: When its time is used up, tasks that have not begun are cancelled, except the first
-            one. After a request to stop, all tasks return the best result that they have.
+        budget: When it is exhausted, tasks that have not begun are cancelled, except the first
+            one. After a request to stop, all running tasks return their best result so far.
 
     Yields:
         The result of every task that was not cancelled.
@@ -100,8 +105,8 @@ def results_in_order(
     waiting = list(futures)
     try:
         while waiting and not budget.stop.requested:
-            # A task that has not begun by the end of the time is not worth beginning, unless it is
-            # the only hope.
+            # When the budget is exhausted, a task that has not begun is cancelled. The first task
+            # is kept, because without it there might be no result at all.
             is_first = len(waiting) == len(futures)
             if not is_first and budget.exhausted is not None and waiting[0].cancel():
                 waiting.pop(0)
@@ -111,26 +116,26 @@ def results_in_order(
             if done:
                 yield waiting.pop(0).result()
 
-        # Asked to stop: return whatever the other tasks have found.
-        stopped, waiting = waiting, []
+        # After a request to stop, the remaining tasks return their best results so far.
+        stopped = waiting
+        waiting = []
         if stopped:
             yield from collect_finished(executor, stopped)
     finally:
-        # The consumer ended early or a task failed: nothing may continue to run.
+        # If the caller ended the iteration or a task failed, the other tasks are stopped.
         if waiting:
             collect_finished(executor, waiting)
 
 
 def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T]:
-    """Stop all tasks and collect what they have found.
+    """Stop all tasks and collect their results so far.
 
     Args:
-        executor: Runs the tasks; a `Pool` passes the request to stop on to them.
+        executor: Executor that runs the tasks; a `Pool` asks them to stop.
         futures: Submitted tasks; those that have not begun are cancelled.
 
     Returns:
-        Results of the tasks that ended within the grace period without an error, in the given
-        order.
+        Results of the tasks that ended without an error within `GRACE` seconds, in the given order.
     """
     waiting = list(futures)
     for future in waiting:
@@ -140,7 +145,7 @@ def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T
         executor.stop()
     done, running = wait(waiting, timeout=GRACE)
 
-    # The pool can be used again once nothing runs that might miss the request.
+    # The request is withdrawn, so that the pool can be used again, unless a task is still running.
     if isinstance(executor, Pool) and not running:
         executor.resume()
 
@@ -150,7 +155,10 @@ def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C in this thread; child processes inherit that, where the system has signal masks."""
+    """Block Ctrl-C in this thread, and thereby in processes that it starts.
+
+    Without signal masks, as on Windows, this has no effect.
+    """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -163,7 +171,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _initialize_worker(stop: Event) -> None:
-    """Ignore Ctrl-C in a new worker process and connect its token with the pool's event."""
+    """Prepare a new worker process: it ignores Ctrl-C, and its token follows the pool's event."""
     global _pool_token
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _pool_token = StopToken(also=stop.is_set)

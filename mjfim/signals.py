@@ -1,7 +1,8 @@
-"""Bases and signals for controls: splines, Fourier series, chirps, multisines and random steps, as functions of time.
+"""Basis functions and signals for controls.
 
-A parametric excitation maps parameters in [0, 1] to a curve for every actuator, for searches over
-all excitations of a kind.
+They are splines, Fourier series, chirps, multisines and random steps. A parametric excitation maps
+parameters in [0, 1] to a curve of every actuator, which allows a search over all excitations of a
+kind.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mjfim.arrays import Array
 # Degree of the splines.
 SPLINE_DEGREE = 3
 
-# Curves whose singular value is below this share of the largest one count as linearly dependent.
+# Curves are linearly dependent if a singular value is below this fraction of the largest one.
 DEPENDENCE_TOLERANCE = 1e-5
 
 # Largest number of harmonics of a parametric multisine.
@@ -30,11 +31,11 @@ MAX_LEVELS = 24
 # Smallest amplitude of an actuator, relative to the actuator with the largest amplitude.
 MIN_RELATIVE_AMPLITUDE = 0.05
 
-# Amplitudes of a parametric multisine fall at most with this power of the frequency.
+# Largest power of the frequency with which the amplitudes of a parametric multisine fall.
 MAX_ROLL_OFF = 2.0
 
-# Smallest share of the time of a level that the transition to it takes; protects a division by
-# zero.
+# Duration of the shortest transition between two levels, as a fraction of the duration of a level;
+# it avoids a division by zero.
 SHORTEST_TRANSITION = 1e-9
 
 
@@ -54,7 +55,7 @@ def spline_basis(
         bandwidth: Highest frequency that the splines have to represent [Hz].
         starts_at_rest: Whether value and slope are zero at the beginning.
         ends_at_rest: Whether value and slope are zero at the end.
-        periodic: Whether the end continues at the beginning with two derivatives.
+        periodic: Whether value and two derivatives at the end equal those at the beginning.
 
     Returns:
         (N, M) values of the M splines.
@@ -68,8 +69,8 @@ def spline_basis(
         values[:, :SPLINE_DEGREE] += values[:, intervals:]
         return np.asarray(values[:, :intervals])
 
-    # Knots are repeated at both ends, so that the first two splines alone have a value or a slope
-    # there.
+    # Knots are repeated at both ends. Only the first two splines then have a value or a slope at
+    # the beginning, and only the last two at the end.
     knots = np.clip(knots, 0.0, horizon)
     values = BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
     first = 2 if starts_at_rest else 0
@@ -87,9 +88,9 @@ def fourier_basis(
 ) -> Array:
     """Sines and cosines of the multiples of a base frequency, each with amplitude 1.
 
-    Where a curve has to begin or end at rest, the polynomial of lowest degree with its value and
-    first two derivatives there is subtracted: a finite Fourier series with a quintic polynomial, as
-    in point-to-point excitation of robots.
+    If a curve has to begin or end at rest, a polynomial with its value and first two derivatives
+    there is subtracted, of the lowest possible degree. With rest at both ends this is a finite
+    Fourier series with a quintic polynomial, as in point-to-point excitation of robots.
 
     Args:
         t: (N,) times [s].
@@ -124,14 +125,27 @@ def fourier_basis(
 
 
 def _wave_derivatives(t: Array, omega: Array, order: int) -> Array:
-    """(N, 2 H) derivatives of an order of sin(omega t) and cos(omega t) at times t: (N,), omega: (H,) [rad/s]."""
+    """(N, 2 H) derivatives of sin(omega t) and cos(omega t) with respect to time.
+
+    Args:
+        t: (N,) times [s].
+        omega: (H,) angular frequencies [rad/s].
+        order: Order of the derivative.
+    """
     angle = np.outer(t, omega) + 0.5 * np.pi * order
     waves = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
     return np.asarray(waves * np.tile(omega**order, 2))
 
 
 def _power_derivatives(t: Array, horizon: float, powers: np.ndarray, order: int) -> Array:
-    """(N, K) derivatives of an order of (t / horizon)^k at times t: (N,), for every k of powers: (K,)."""
+    """(N, K) derivatives of (t / horizon)^k with respect to time.
+
+    Args:
+        t: (N,) times [s].
+        horizon: Duration of the curves [s].
+        powers: (K,) exponents k.
+        order: Order of the derivative.
+    """
     factors = [
         np.prod(np.arange(k - order + 1, k + 1)) if k >= order else 0.0 for k in powers.tolist()
     ]
@@ -140,16 +154,16 @@ def _power_derivatives(t: Array, horizon: float, powers: np.ndarray, order: int)
 
 
 def independent_curves(curves: Array) -> Array:
-    """Linearly independent curves with equal span.
+    """Linearly independent curves that span the space of given curves.
 
-    Curves may be nearly dependent: splines with more knots than there are samples, or waves that
+    Curves may be nearly dependent, such as splines with more knots than samples, or waves that
     resemble polynomials.
 
     Args:
         curves: (N, M) curves.
 
     Returns:
-        The curves themselves where they are independent, else (N, K < M) orthogonal ones with root
+        The given curves if they are independent. Otherwise (N, K < M) orthogonal curves with root
         mean square 1 / sqrt(2).
     """
     U, sizes, _ = np.linalg.svd(curves, full_matrices=False)
@@ -162,7 +176,7 @@ def independent_curves(curves: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExcitationSettings:
-    """Settings that all parametric excitations of an experiment share.
+    """Settings of all parametric excitations of an experiment.
 
     Attributes:
         t: (N,) sample times [s].
@@ -181,10 +195,10 @@ class ExcitationSettings:
     may_jump: bool
 
     def frequency(self, z: Array) -> Array:
-        """Frequencies [Hz] of parameters in [0, 1], on a logarithmic scale.
+        """Map parameters in [0, 1] to frequencies on a logarithmic scale.
 
         Args:
-            z: (...) parameters.
+            z: (...) parameters in [0, 1].
 
         Returns:
             (...) frequencies [Hz].
@@ -254,7 +268,7 @@ class Chirp:
 
 
 def schroeder_phases(power: Array) -> Array:
-    """Phases with which harmonics add up to a signal of low peak (Schroeder 1970).
+    """Phases with which the sum of harmonics has a low peak (Schroeder 1970).
 
     Args:
         power: (K,) power of every harmonic.
@@ -268,10 +282,10 @@ def schroeder_phases(power: Array) -> Array:
 
 @dataclass(frozen=True)
 class Multisine:
-    """Harmonics with Schroeder phases.
+    """A sum of harmonics with Schroeder phases for every actuator.
 
-    Its parameters are the base frequency, the number of harmonics and their roll-off; then
-    amplitude and delay of every actuator.
+    Its parameters are the base frequency, the number of harmonics and their roll-off, followed by
+    the amplitude and the delay of every actuator.
 
     Attributes:
         settings: Settings of all excitations.
@@ -302,7 +316,7 @@ class Multisine:
         return np.asarray(relative_amplitudes(amplitude) * curve / np.abs(curve).max(axis=0))
 
     def _base_frequency(self, z: float) -> float:
-        """Base frequency [Hz], low enough for at least two harmonics where the range of frequencies allows them."""
+        """Base frequency [Hz], low enough for two harmonics if the frequency range allows it."""
         lowest = self.settings.min_frequency
         highest = self.settings.max_frequency
         if highest <= 2.0 * lowest:
@@ -313,10 +327,10 @@ class Multisine:
 
 @dataclass(frozen=True)
 class RandomSteps:
-    """Random levels, each of which is held for a while.
+    """Random levels of every actuator, each of which is held for some time.
 
-    Its parameters are how long a level is held and which share of that time is a smooth transition
-    to the next one (none where jumps are allowed); then the levels of every actuator.
+    Its parameters are the duration of a level and the fraction of it that is a smooth transition
+    (unused if jumps are allowed), followed by the levels of every actuator.
 
     Attributes:
         settings: Settings of all excitations.
@@ -338,7 +352,7 @@ class RandomSteps:
         levels = 2.0 * z[2:].reshape(MAX_LEVELS, settings.nu) - 1.0
         levels = np.concatenate([np.zeros((1, settings.nu)), levels])
 
-        # Share of the way from the previous level to the present one.
+        # Progress of the transition from the previous level to the present one, 0 to 1.
         duration = max(float(z[1]), SHORTEST_TRANSITION)
         progress = (settings.t / held - index) / duration
         smooth = 0.5 - 0.5 * np.cos(np.pi * np.clip(progress, 0.0, 1.0))

@@ -34,7 +34,7 @@ from mjfim.records.events import Callback
 
 @contextmanager
 def several(task: DesignTask) -> Iterator[Executor | None]:
-    """Processes for the starts of a design under hard limits; None where one start has all threads to itself."""
+    """Processes for the starts of a design under hard limits; None if one start has all threads to itself."""
     d = task.experiment.descent
     count = d.starts + len(d.previous) + len(d.fourier) + len(d.repeats)
     if count == 1 or not task.is_limited:

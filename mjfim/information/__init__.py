@@ -1,13 +1,13 @@
 """The Fisher information of a trajectory, its criteria, and the parameters that it cannot identify.
 
 Modules:
-    fisher: Information of the measured samples, the part that a criterion sees, and standard
-    deviations. adjoint: Derivatives of a criterion along a trajectory, by one adjoint sweep.
+    fisher: Information of the measured samples, its reduction for a criterion, standard deviations.
+    adjoint: Derivatives of a criterion along a trajectory, by one adjoint sweep.
     criteria: Optimality criteria of an information matrix and their derivatives.
     marginal: Schur complement of nuisance parameters.
-    null_space: Combinations of parameters without any effect, and the groups that they form.
+    null_space: Combinations of parameters without effect, and the groups that they form.
     identifiability: Null spaces along the trajectory of an experiment and along random ones.
-    smoothness: Detection of derivatives that do not exist.
+    smoothness: Detection of points at which derivatives do not exist.
 """
 
 from mjfim.information.criteria import Criterion

@@ -1,9 +1,12 @@
-"""Derivatives of a criterion of the Fisher information along a trajectory, by one adjoint sweep for all sensitivities.
+"""Derivatives of a criterion of the Fisher information along a trajectory, by one adjoint sweep.
 
-The variation of phi is `sum_k tr V_k' dG_k` with `V_k = 2 Sigma^-1 G_k M` and `M = dphi/dI = sum_r
-m_r w_r w_r'`. psi is eliminated by the adjoint `Lambda_k = A_k' Lambda_{k+1} + C_k' V_k = sum_r
-l^r_k w_r'`. The derivative of `l' DF[psi w, w] + v' Dh[psi w, w]` by (x, u) is left: it takes r
-directions, not p.
+The variation of phi is `sum_k tr V_k' dG_k` with
+
+    V_k = 2 Sigma^-1 G_k M,    M = dphi/dI = sum_r m_r w_r w_r'.
+
+The adjoint `Lambda_k = A_k' Lambda_{k+1} + C_k' V_k = sum_r l^r_k w_r'` eliminates psi. The
+derivative of `l' DF[psi w, w] + v' Dh[psi w, w]` with respect to (x, u) remains, which needs only
+the r directions w instead of all p parameters.
 """
 
 from __future__ import annotations
@@ -23,12 +26,12 @@ from mjfim.records.trajectory import Sensitivity
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _AdjointRay:
-    """One of the r terms v^r w_r' of V, with its costate.
+    """One of the r terms v^r w_r' of V, and its costate.
 
     Attributes:
         measured: (N+1, ny) weights v of the measured outputs.
-        outputs: (N+1, ny) these weights on the outputs before they are delayed.
-        costate: (N+1, nx) l of the adjoint recursion.
+        outputs: (N+1, ny) equivalent weights of the outputs before the delay.
+        costate: (N+1, nx) costate l of the adjoint recursion.
     """
 
     measured: Array
@@ -62,7 +65,7 @@ def output_weights(
 def criterion_gradient(
     weights: Array, criterion: Criterion, bilinear: Bilinear
 ) -> tuple[Array, Array]:
-    """Gradient of the criterion with psi eliminated by the adjoint.
+    """Gradient of the criterion; psi is eliminated by the adjoint.
 
     Args:
         weights: (r, N+1, ny) weights of the outputs, by `output_weights`.
@@ -80,10 +83,11 @@ def criterion_gradient(
 def eigenvalue_model(
     weights: Array, criterion: Criterion, bilinear: Bilinear, cost: float
 ) -> EigenvalueModel:
-    """Model of log J about a point of the smooth E-criterion, from the derivatives that its gradient takes.
+    """Model of log J about a point of the smooth E-criterion.
 
-    With `V = 2 Sigma^-1 G w_i` the change of `w_i' I w_j` is half of the sum of two terms: the ray
-    of w_i along w_j, and the ray of w_j along w_i.
+    It needs the derivatives that the gradient needs, too. With `V = 2 Sigma^-1 G w_i`, the change
+    of `w_i' I w_j` is half of the sum of two terms: the ray of w_i along w_j, and the ray of w_j
+    along w_i.
 
     Args:
         weights: (r, N+1, ny) weights of the outputs, by `output_weights`.
@@ -120,7 +124,7 @@ def eigenvalue_model(
 def partial_derivatives(
     weights: Array, criterion: Criterion, full: Bilinear
 ) -> tuple[Array, Array, Array]:
-    """Derivatives of the criterion with psi kept as a state.
+    """Derivatives of the criterion if psi is a part of the state.
 
     Args:
         weights: (r, N+1, ny) weights of the outputs, by `output_weights`.
@@ -144,8 +148,10 @@ def partial_derivatives(
 
 
 def _adjoint_rays(weights: Array, bilinear: Bilinear) -> list[_AdjointRay]:
-    """The rays of (r, N+1, ny) weights of the outputs."""
-    recursion, delay = LinearRecursion(bilinear.A), bilinear.output_delay
+    """Rays for the (r, N+1, ny) weights of the outputs."""
+    recursion = LinearRecursion(bilinear.A)
+    delay = bilinear.output_delay
+
     rays = []
     for v in weights:
         outputs = v if delay is None else delay.apply_transposed(v)
@@ -155,7 +161,14 @@ def _adjoint_rays(weights: Array, bilinear: Bilinear) -> list[_AdjointRay]:
 
 
 def _term(ray: _AdjointRay, direction: int, criterion: Criterion, bilinear: Bilinear) -> Array:
-    """(N+1, nx+nu) derivative of `sum_k v_k' dG_k w` by (x_k, u_k) for a ray v and the direction w of this index."""
+    """(N+1, nx+nu) derivative of `sum_k v_k' dG_k w` with respect to (x_k, u_k).
+
+    Args:
+        ray: The ray, with the weights v.
+        direction: Index of the direction w.
+        criterion: The criterion with its r directions.
+        bilinear: Derivatives of the plant along these directions.
+    """
     term = np.zeros((len(ray.measured), bilinear.A.shape[1] + bilinear.B.shape[2]))
     term[:-1] = np.einsum("kzx,kx->kz", bilinear.F_mixed[direction], ray.costate[1:])
 
@@ -168,7 +181,10 @@ def _term(ray: _AdjointRay, direction: int, criterion: Criterion, bilinear: Bili
 
 
 def _with_held_control(term: Array, bilinear: Bilinear) -> Array:
-    """(N+1, nx+nu) derivatives; the last control is held for the outputs of the last sample, and gets their part."""
+    """(N+1, nx+nu) derivatives in which the last control gets the derivative of the last outputs.
+
+    The last control is held for the outputs of the last sample.
+    """
     nx = bilinear.A.shape[1]
     term[-2, nx:] += term[-1, nx:]
     return term
@@ -181,7 +197,10 @@ def _by_state_and_control(total: Array, bilinear: Bilinear) -> tuple[Array, Arra
 
 
 def _delay_term(bilinear: Bilinear, v: Array) -> Array:
-    """(N+1, nx+nu) derivative of `sum_k v_k' dy_k/d(delay)` by (x_k, u_k), for weights v: (N+1, ny) of the measured outputs."""
+    """(N+1, nx+nu) derivative of `sum_k v_k' dy_k/d(delay)` with respect to (x_k, u_k).
+
+    v: (N+1, ny) weights of the measured outputs.
+    """
     if bilinear.output_delay is None:
         raise ValueError("the outputs have no delay")
 

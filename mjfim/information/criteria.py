@@ -1,4 +1,7 @@
-"""Optimality criteria of an information matrix and their derivatives `M = dphi/dI = sum_r m_r w_r w_r'`."""
+"""Optimality criteria phi of an information matrix I and their derivatives.
+
+A derivative has the form `M = dphi/dI = sum_r m_r w_r w_r'`.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-# Smallest eigenvalue over the largest one, at and below which an information matrix counts as
-# singular.
+# An information matrix is singular if the ratio of its smallest to its largest eigenvalue is at
+# most this number.
 SINGULAR_RATIO = 1e-14
 
-# Weight of an eigenvector in a derivative, relative to the largest one, below which it is left out.
+# Eigenvectors whose weight is below this fraction of the largest weight are left out of a
+# derivative.
 NEGLIGIBLE_WEIGHT = 1e-9
 
 
@@ -22,7 +26,7 @@ class Criterion:
     """Value of a criterion phi and its derivative `M = sum_r weights_r directions_r directions_r'`.
 
     Attributes:
-        value: phi; infinite where the information is singular.
+        value: phi; infinite if the information is singular.
         weights: (r,) weights m of the derivative.
         directions: (r, p) directions w of the derivative.
         eigenvalues: (p,) eigenvalues of the information, ascending.
@@ -38,15 +42,48 @@ class Criterion:
 
 
 def _spectrum(information: Array) -> tuple[Array, Array, bool]:
-    """Ascending eigenvalues (p,), eigenvectors (p, p) as columns, and whether the matrix is regular."""
+    """Ascending eigenvalues (p,), eigenvectors as columns (p, p), and True for a regular matrix."""
     values, vectors = np.linalg.eigh(information)
     return values, vectors, bool(values[0] > SINGULAR_RATIO * values[-1])
 
 
 def _singular(values: Array, vectors: Array) -> Criterion:
-    """The infinite criterion of a singular matrix, with the direction of its smallest eigenvalue and no weight."""
+    """Infinite criterion of a singular matrix.
+
+    Its direction belongs to the smallest eigenvalue, and the weight of the direction is zero.
+    """
     return Criterion(
         value=np.inf, weights=np.zeros(1), directions=vectors[:, :1].T, eigenvalues=values
+    )
+
+
+def _spectral_criterion(
+    value: float,
+    weights: Array,
+    values: Array,
+    vectors: Array,
+    *,
+    power: float = np.inf,
+    negligible_weight: float = NEGLIGIBLE_WEIGHT,
+) -> Criterion:
+    """Criterion that depends on the eigenvalues alone; eigenvectors of small weight are left out.
+
+    Args:
+        value: phi.
+        weights: (p,) derivatives of phi with respect to the eigenvalues; the first has the largest
+            absolute value.
+        values: (p,) ascending eigenvalues.
+        vectors: (p, p) eigenvectors as columns.
+        power: Exponent q of the smooth E-criterion.
+        negligible_weight: Smallest weight that is kept, relative to the first one.
+    """
+    kept = np.abs(weights) > negligible_weight * np.abs(weights[0])
+    return Criterion(
+        value=value,
+        weights=weights[kept],
+        directions=vectors.T[kept],
+        eigenvalues=values,
+        power=power,
     )
 
 
@@ -55,6 +92,9 @@ def e_optimality(information: Array) -> Criterion:
 
     Args:
         information: (p, p) information.
+
+    Returns:
+        The criterion.
     """
     values, vectors, regular = _spectrum(information)
     if not regular:
@@ -71,32 +111,35 @@ def e_optimality(information: Array) -> Criterion:
 def smooth_e_optimality(
     information: Array, power: float, negligible_weight: float = NEGLIGIBLE_WEIGHT
 ) -> Criterion:
-    """Kiefer's criterion `(sum_i lambda_i^-q)^(1/q)`: differentiable where eigenvalues meet, 1/lambda_min as q grows.
+    """Kiefer's criterion `(sum_i lambda_i^-q)^(1/q)`, which is smooth also at equal eigenvalues.
 
-    It is at most `p^(1/q)` times 1/lambda_min.
+    It is at most `p^(1/q)` times 1/lambda_min, and approaches 1/lambda_min for large q.
 
     Args:
         information: (p, p) information.
         power: Exponent q.
-        negligible_weight: Weight of an eigenvector, relative to the largest one, below which it is
-            left out of the derivative.
+        negligible_weight: Eigenvectors whose weight is below this fraction of the largest weight
+            are left out of the derivative.
+
+    Returns:
+        The criterion.
     """
     values, vectors, regular = _spectrum(information)
     if not regular:
         return _singular(values, vectors)
 
-    # Powers of the ratio, not of the eigenvalues, which would overflow.
+    # Powers of the ratio are used, because powers of the eigenvalues would overflow.
     ratio = values[0] / values
     total = float(np.sum(ratio**power))
     weights = total ** (1.0 / power - 1.0) * ratio ** (power + 1.0) / values[0] ** 2
-    kept = weights > negligible_weight * weights[0]
 
-    return Criterion(
-        value=total ** (1.0 / power) / values[0],
-        weights=-weights[kept],
-        directions=vectors.T[kept],
-        eigenvalues=values,
+    return _spectral_criterion(
+        total ** (1.0 / power) / values[0],
+        -weights,
+        values,
+        vectors,
         power=power,
+        negligible_weight=negligible_weight,
     )
 
 
@@ -105,19 +148,15 @@ def a_optimality(information: Array) -> Criterion:
 
     Args:
         information: (p, p) information.
+
+    Returns:
+        The criterion.
     """
     values, vectors, regular = _spectrum(information)
     if not regular:
         return _singular(values, vectors)
 
-    weights = values**-2.0
-    kept = weights > NEGLIGIBLE_WEIGHT * weights[0]
-    return Criterion(
-        value=float(np.sum(1.0 / values)),
-        weights=-weights[kept],
-        directions=vectors.T[kept],
-        eigenvalues=values,
-    )
+    return _spectral_criterion(float(np.sum(1.0 / values)), -(values**-2.0), values, vectors)
 
 
 def d_optimality(information: Array) -> Criterion:
@@ -125,6 +164,9 @@ def d_optimality(information: Array) -> Criterion:
 
     Args:
         information: (p, p) information.
+
+    Returns:
+        The criterion.
     """
     values, vectors, regular = _spectrum(information)
     if not regular:
@@ -139,11 +181,14 @@ def d_optimality(information: Array) -> Criterion:
 
 
 def c_optimality(information: Array, contrast: Array) -> Criterion:
-    """The summed variance of stated combinations, `trace C' I^-1 C`.
+    """Sum of the variances of stated combinations, `trace C' I^-1 C`.
 
     Args:
         information: (p, p) information.
         contrast: C, (p, c) combinations of the parameters.
+
+    Returns:
+        The criterion.
     """
     values, vectors, regular = _spectrum(information)
     if not regular:
@@ -158,7 +203,7 @@ def c_optimality(information: Array, contrast: Array) -> Criterion:
     )
 
 
-# Criteria of an information matrix alone, by the name that an experiment states.
+# Criteria that depend on the information matrix alone, by their name in an experiment.
 CRITERIA: dict[str, Callable[[Array], Criterion]] = {
     "E": e_optimality,
     "A": a_optimality,

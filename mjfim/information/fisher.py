@@ -1,12 +1,13 @@
-"""Fisher information of the measured samples, and the part of it that a criterion sees.
+"""Fisher information of the measured samples, and its reduction to the part that a criterion uses.
 
-    I   = I_prior + sum_k G_k' Sigma^-1 G_k            (measured samples)
+    I   = I_prior + sum_k G_k' Sigma^-1 G_k            over the measured samples k
     I~  = S I S / f_m                                  S = diag(scale), f_m the measurement rate
-    R   = T' (I~_tt - I~_tn I~_nn^+ I~_nt) T           t wanted, n nuisance parameters, T the
-    identifiable combinations phi = Q_p / lambda_min(R)                          E-optimality
+    R   = T' (I~_tt - I~_tn I~_nn^+ I~_nt) T           t wanted parameters, n nuisance parameters,
+                                                       T the identifiable combinations
+    phi = Q_p / lambda_min(R)                          for E-optimality
 
-With `P = T' [1, -I~_tn I~_nn^+]`, `dR = P dI~ P'`, so a derivative `sum_r m_r w_r w_r'` by R is one
-by I~ with directions P'w.
+With `P = T' [1, -I~_tn I~_nn^+]`, `dR = P dI~ P'`. A derivative `sum_r m_r w_r w_r'` with respect
+to R is therefore a derivative with respect to I~ with the directions P'w.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ from mjfim.plant.mixed_derivatives import Bilinear
 from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Sensitivity
 
-# Squared part of a unit vector outside the identifiable combinations that still counts as
-# round-off.
+# A unit vector lies within the identifiable combinations if the squared length of its part outside
+# is below this number.
 ROUND_OFF_SHARE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FisherInformation:
-    """Turns sensitivities into Fisher information, its criterion and the gradient of that.
+    """Computes the Fisher information of sensitivities, its criterion and the gradient.
 
     Attributes:
         noise: Noise of the outputs.
@@ -52,17 +53,17 @@ class FisherInformation:
         prior: (p, p) prior information [1 / (theta_i theta_j unit)].
         criterion: "E", "A", "D" or "c".
         weight: Q_p, factor of the criterion.
-        interest: Indices of the t wanted parameters, None for all; the Schur complement removes the
-            others.
+        interest: Indices of the t wanted parameters, None for all; the others are removed by the
+            Schur complement.
         basis: (t, s) orthonormal identifiable combinations of the scaled wanted parameters, None
             for all.
         contrast: (t, c) combinations of the scaled wanted parameters whose variances criterion "c"
             sums.
         power: Exponent q of the smooth E-criterion, infinite for 1/lambda_min.
-        negligible_weight: Weight of an eigenvector in the smooth criterion, relative to the largest
-            one, below which it is left out of the gradient.
-        stated_prior: (p,) information of the stated priors, from which a combination can be known
-            that no measurement shows; None for the diagonal of `prior`.
+        negligible_weight: Eigenvectors whose weight in the smooth criterion is below this fraction
+            of the largest weight are left out of the gradient.
+        stated_prior: (p,) information of the stated priors, which may determine a combination that
+            no measurement determines; None for the diagonal of `prior`.
     """
 
     noise: Noise
@@ -83,7 +84,7 @@ class FisherInformation:
         """(t,) indices of the wanted parameters."""
         return np.arange(len(self.scale)) if self.interest is None else self.interest
 
-    # The information and the part that the criterion sees
+    # The information and the part that the criterion uses
 
     def matrix(self, sensitivity: Sensitivity) -> Array:
         """Information of a trajectory.
@@ -111,7 +112,7 @@ class FisherInformation:
         return np.asarray(information * np.outer(self.scale, self.scale) / self.measure_rate)
 
     def reduced(self, information: Array) -> tuple[Array, Array]:
-        """The part of an information matrix that the criterion sees.
+        """Reduce an information matrix to the part that the criterion uses.
 
         Args:
             information: (..., p, p) information [1 / (theta_i theta_j unit)].
@@ -139,7 +140,10 @@ class FisherInformation:
     # The criterion and its derivatives
 
     def evaluate(self, information: Array) -> Criterion:
-        """Criterion of an information matrix (p, p), times Q_p; its directions w are in the units of the parameters."""
+        """Evaluate the criterion of an information matrix (p, p), including the weight Q_p.
+
+        The directions w of its derivative are in the units of the parameters.
+        """
         R, P = self.reduced(information)
         if not len(R):
             p = len(information)
@@ -173,7 +177,7 @@ class FisherInformation:
     def gradient(
         self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear
     ) -> tuple[Array, Array]:
-        """Gradient of the criterion, psi eliminated by the adjoint.
+        """Gradient of the criterion; psi is eliminated by the adjoint.
 
         Args:
             criterion: The criterion with its r directions.
@@ -196,6 +200,9 @@ class FisherInformation:
             sensitivity: Sensitivities of the outputs to the parameters.
             bilinear: Derivatives of the plant along these directions.
             cost: J.
+
+        Returns:
+            The model of the r smallest eigenvalues.
         """
         weights = self._output_weights(criterion, sensitivity)
         return eigenvalue_model(weights, criterion, bilinear, cost)
@@ -203,7 +210,7 @@ class FisherInformation:
     def partial_derivatives(
         self, criterion: Criterion, sensitivity: Sensitivity, full: Bilinear
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of the criterion with psi kept as a state.
+        """Derivatives of the criterion if psi is a part of the state.
 
         Args:
             criterion: The criterion with its r directions.
@@ -269,7 +276,11 @@ class FisherInformation:
         return np.asarray(np.sqrt(variances))
 
     def _identifiable_covariance(self, information: Array) -> tuple[Array, Array]:
-        """(t, t) covariance within the identifiable combinations, zero across them, and their basis in scaled units."""
+        """(t, t) covariance within the identifiable combinations, and their basis in scaled units.
+
+        The covariance is zero along directions outside the combinations, and NaN if the reduced
+        information is singular.
+        """
         t = self.wanted
         basis = np.eye(len(t)) if self.basis is None else self._basis_with_prior(self.basis)
         unknown = np.full((len(t), len(t)), np.nan)
@@ -290,13 +301,13 @@ class FisherInformation:
     # Identifiable combinations
 
     def is_estimable(self, combinations: Array) -> np.ndarray:
-        """Find which combinations of parameters the measurements or the priors determine.
+        """Find the combinations of parameters that the measurements or the priors determine.
 
         Args:
             combinations: (t, c) combinations of the scaled wanted parameters.
 
         Returns:
-            (c,) True where a combination is identifiable or known from priors.
+            (c,) True if a combination is identifiable or known from priors.
         """
         if self.basis is None:
             return np.ones(combinations.shape[1], dtype=bool)
@@ -306,7 +317,7 @@ class FisherInformation:
         return np.asarray(1.0 - inside < ROUND_OFF_SHARE)
 
     def without_round_off(self, information: Array) -> Array:
-        """(p, p) information from which the round-off along directions that cannot be identified is taken out."""
+        """(p, p) information without the round-off along directions that are not identifiable."""
         if self.basis is None:
             return information
 

@@ -35,10 +35,11 @@ PROBES = 3
 # Relative error of rows that are taken from an information matrix.
 ROW_ROUND_OFF = 1e-7
 
-# An effect below this share of the strongest one in earlier experiments is round-off.
+# An effect below this fraction of the strongest one in earlier experiments is round-off.
 NEGLIGIBLE_EFFECT = 1e-6
 
-# Number of samples of a trajectory whose single steps are tested first, before all of them.
+# Number of samples of a trajectory whose single steps are tested first; if they leave a doubt, all
+# samples are tested.
 FEW_SAMPLES = 60
 
 # Difference steps of the parameters for single engine steps, relative to the size of each
@@ -48,15 +49,14 @@ SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Identifiability:
-    """Directions of the wanted parameters that nothing measured can show.
+    """Directions of the wanted parameters without effect on the measured outputs.
 
     Attributes:
         names: Names of the t wanted parameters.
         along_trajectory: Null space along the given trajectory.
-        along_all: Null space that random trajectories share with it.
-        groups_along_trajectory: The null space along the given trajectory in the names of the
-            parameters.
-        groups_along_all: The shared null space in the names of the parameters.
+        along_all: Common null space of the given and of random trajectories.
+        groups_along_trajectory: Groups of parameters that the given trajectory cannot separate.
+        groups_along_all: Groups of parameters that none of the trajectories can separate.
     """
 
     names: tuple[str, ...]
@@ -67,19 +67,22 @@ class Identifiability:
 
     @property
     def basis(self) -> Array | None:
-        """(t, s) combinations that some experiment can show; None where every parameter can be shown."""
+        """(t, s) combinations that an experiment can identify; None if it can identify all."""
         return self.along_all.basis if self.along_all.count else None
 
     def combinations(
         self, information: FisherInformation, values: Array, before: Array, after: Array
     ) -> tuple[CombinationAccuracy, ...]:
-        """Identifiable combinations with their standard deviations under two information matrices.
+        """Identifiable combinations with their standard deviations for two information matrices.
 
         Args:
-            information: Turns an information matrix into standard deviations of combinations.
+            information: Computes standard deviations of combinations from an information matrix.
             values: (t,) values of the wanted parameters.
             before: (p, p) information of the first experiment.
-            after: (p, p) information of the second one.
+            after: (p, p) information of the second experiment.
+
+        Returns:
+            Accuracies of the combinations; empty if every parameter is identifiable.
         """
         rows = combination_matrix(self.groups_along_all, self.names)
         words = [
@@ -101,7 +104,7 @@ class Identifiability:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class IdentifiabilityTest:
-    """Test for parameters that the measurements of a plant cannot show.
+    """Test for combinations of parameters that the outputs of a plant do not depend on.
 
     Attributes:
         plant: The plant.
@@ -109,7 +112,8 @@ class IdentifiabilityTest:
         noise: Noise of the measured outputs.
         theta: (p,) parameter values.
         earlier: (p, p) information of earlier experiments, without the priors of the parameters.
-        probes: Simulates a number of random controls; trajectories that diverge are left out.
+        probes: Function that simulates a number of random controls; it leaves out trajectories that
+            diverge.
     """
 
     plant: Plant
@@ -129,16 +133,21 @@ class IdentifiabilityTest:
         return self.noise.whitened_rows(sensitivity.G)
 
     def along(self, trajectory: Trajectory, sensitivity: Sensitivity) -> Identifiability:
-        """Test identifiability along a trajectory; along random ones only where that leaves a doubt.
+        """Test identifiability along a trajectory.
+
+        Random trajectories are tested only if this trajectory leaves a doubt.
 
         Args:
             trajectory: The trajectory.
             sensitivity: Its sensitivities to the parameters.
+
+        Returns:
+            The null spaces.
         """
         J = self.rows(sensitivity)
         single_steps = _single_step_null_space(self, [trajectory])
 
-        # One difference step is enough where every singular value stands far above its round-off.
+        # One difference step is enough if all singular values are far larger than round-off.
         quick = _null_space(self, [J], None, single_steps)
         if quick.smallest > CLEAR_SINGULAR_VALUE and not quick.count:
             return _with_groups(self, quick, quick)
@@ -147,12 +156,17 @@ class IdentifiabilityTest:
         return _identifiability(self, trajectory, J, error, single_steps)
 
     def of_rows(self, trajectory: Trajectory, J: Array, error: Array) -> Identifiability:
-        """Test identifiability from rows of G; along random trajectories only where that leaves a doubt.
+        """Test identifiability from rows of G.
+
+        Random trajectories are tested only if these rows leave a doubt.
 
         Args:
             trajectory: One of the trajectories to which the rows belong.
             J: (n, p) whitened rows of G.
             error: (n, p) their change with a longer difference step.
+
+        Returns:
+            The null spaces.
         """
         return _identifiability(
             self, trajectory, J, error, _single_step_null_space(self, [trajectory])
@@ -160,7 +174,7 @@ class IdentifiabilityTest:
 
 
 def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
-    """Raise where a parameter cannot be identified from data with these rows of G.
+    """Raise an error if a parameter cannot be identified from data with these rows of G.
 
     Args:
         parameters: The p unknown parameters.
@@ -178,7 +192,7 @@ def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
     units = [parameter.unit for parameter in parameters.parameters]
     groups = parameter_groups(null, parameters.names, parameters.magnitude, units)
     listed = "; ".join(str(group) for group in groups)
-    raise UnidentifiableError(f"this trajectory does not show every parameter: {listed}")
+    raise UnidentifiableError(f"not every parameter is identifiable from this trajectory: {listed}")
 
 
 def _identifiability(
@@ -188,7 +202,7 @@ def _identifiability(
     error: Array,
     single_steps: Array | None,
 ) -> Identifiability:
-    """Null space of given rows, and the part of it that random trajectories leave.
+    """Null space of given rows, and the part of it that remains with random trajectories.
 
     Args:
         test: The plant and its parameters.
@@ -205,8 +219,7 @@ def _identifiability(
     known = _single_step_null_space(test, [trajectory, *tried])
     stack, errors = [J], [error]
 
-    # Whole motions are differentiated only where single steps do not explain the null space
-    # already.
+    # Whole motions are differentiated only if single steps do not explain the null space.
     if known is None or along_trajectory.count > known.shape[1]:
         for probe in tried:
             fine = test.plant.derivatives.sensitivity(test.theta, probe)
@@ -223,10 +236,13 @@ def _identifiability(
 def _single_step_null_space(
     test: IdentifiabilityTest, trajectories: Sequence[Trajectory]
 ) -> Array | None:
-    """Directions without effect on single steps and their outputs, (t, k); None without a parameter inside the model.
+    """Directions (t, k) without effect on single steps and their outputs.
 
-    Such a direction moves nothing, whatever is measured. Single steps show it exactly, even where
+    Such a direction changes no motion and no output. Single steps show this accurately, even if
     motions are chaotic.
+
+    Returns:
+        The directions; None if no wanted parameter changes the model, or if all steps diverge.
     """
     parameters = test.parameters
     inside = parameters.interest[parameters.changes_model[parameters.interest]]
@@ -236,8 +252,8 @@ def _single_step_null_space(
     no_prior = np.zeros_like(test.prior)
     longest = max(trajectory.samples for trajectory in trajectories)
 
-    # A few samples first: where they leave a direction open, a contact between them may still show
-    # it.
+    # A few samples are tested first. If a direction has no effect on them, all samples are tested,
+    # because a contact between the few may depend on it.
     for most in (FEW_SAMPLES, longest):
         found = _step_effects(test, trajectories, most)
         if found is None:
@@ -256,12 +272,12 @@ def _single_step_null_space(
 def _step_effects(
     test: IdentifiabilityTest, trajectories: Sequence[Trajectory], most: int
 ) -> tuple[Array, Array] | None:
-    """Effects of the parameters on single steps, and their error; None where all trajectories diverge.
+    """Effects of the parameters on single steps, and their error; None if all trajectories diverge.
 
     Args:
         test: The plant and its parameters.
-        trajectories: Trajectories whose samples are looked at.
-        most: Largest number of samples of each.
+        trajectories: Trajectories whose samples are tested.
+        most: Largest number of samples of each trajectory.
 
     Returns:
         (n, p) effects and (n, p) their change with a longer difference step.
@@ -286,7 +302,7 @@ def _step_effects(
 def _with_groups(
     test: IdentifiabilityTest, along_trajectory: NullSpace, along_all: NullSpace
 ) -> Identifiability:
-    """Two null spaces in the names of the wanted parameters."""
+    """Combine two null spaces with their groups of parameters."""
     parameters = test.parameters
     interest = parameters.interest
     names = tuple(parameters.names[j] for j in interest)
@@ -308,7 +324,14 @@ def _null_space(
     errors: Sequence[Array] | None,
     known: Array | None,
 ) -> NullSpace:
-    """Null space of stacked rows together with those of earlier experiments. known: (t, k) directions found otherwise."""
+    """Null space of the stacked rows and of the rows of earlier experiments.
+
+    Args:
+        test: The plant and its parameters.
+        stack: (n, p) whitened rows of G of each trajectory.
+        errors: Errors of these rows, or None.
+        known: (t, k) directions that are known to have no effect, or None.
+    """
     parameters = test.parameters
     before = _rows_of_information(test.earlier)
     error = None
@@ -327,14 +350,14 @@ def _null_space(
 
 
 def _rows_of_information(information: Array) -> Array:
-    """(n, p) rows whose squares add up to an information matrix (p, p)."""
+    """(n, p) rows J with J'J equal to an information matrix (p, p)."""
     values, vectors = np.linalg.eigh(information)
     kept = values > 1e-14 * max(float(values[-1]), 0.0)
     return np.asarray(np.sqrt(values[kept])[:, None] * vectors.T[kept])
 
 
 def _hidden_from_earlier(test: IdentifiabilityTest, directions: Array) -> Array:
-    """Combinations of (t, k) directions that earlier experiments do not show either."""
+    """Combinations of (t, k) directions without effect on earlier experiments."""
     if not test.earlier.any() or not directions.shape[1]:
         return directions
 
@@ -356,7 +379,10 @@ def _hidden_from_earlier(test: IdentifiabilityTest, directions: Array) -> Array:
 def _rows_and_error(
     test: IdentifiabilityTest, trajectory: Trajectory, fine: Sensitivity
 ) -> tuple[Array, Array]:
-    """Rows of G and their change with a longer step, which is all of them where the longer step diverges."""
+    """Whitened rows of G (n, p), and their change with a longer difference step (n, p).
+
+    The change is zero if the simulation with the longer step diverges.
+    """
     J = test.rows(fine)
     step = COARSER_STEP_FACTOR * SENSITIVITY_STEP
     coarse = test.plant.derivatives.sensitivity(test.theta, trajectory, step)

@@ -1,4 +1,4 @@
-"""Marginal information, by the Schur complement of the nuisance parameters, and standard deviations."""
+"""Marginal information by the Schur complement of nuisance parameters, and standard deviations."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import numpy as np
 from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.information.criteria import SINGULAR_RATIO
 
-# Singular values below this share of the largest one count as zero in a pseudo-inverse.
+# Singular values below this fraction of the largest one count as zero in a pseudo-inverse.
 PSEUDO_INVERSE_CUTOFF = 1e-13
 
 
 def marginal(information: Array, prior: Array, kept: np.ndarray) -> Array:
-    """Information about some parameters when the others are estimated as well.
+    """Information about several parameters if the others are estimated, too.
 
     Args:
         information: (p, p) information of the data [1 / (theta_i theta_j unit)].
-        prior: (p, p) prior information, of which the block of the other parameters is taken.
+        prior: (p, p) prior information, of which only the block of the other parameters is used.
         kept: (k,) indices of the parameters that are kept.
 
     Returns:
@@ -38,8 +38,9 @@ def shared(information: Array, prior: Array, private: np.ndarray) -> Array:
 
     Args:
         information: (p, p) information of one experiment [1 / (theta_i theta_j unit)].
-        prior: (p, p) prior information, of which the block of the private parameters is taken.
-        private: (p,) True for parameters that each experiment has by itself; they are marginalised.
+        prior: (p, p) prior information, of which only the block of the private parameters is used.
+        private: (p,) True for parameters with another value in each experiment; they are
+            marginalised.
 
     Returns:
         (p, p) information, zero in the rows and columns of the private parameters.
@@ -60,7 +61,7 @@ def standard_deviations(information: Array) -> Array:
         information: (p, p) information [1 / (theta_i theta_j unit)].
 
     Returns:
-        (p,) standard deviations [theta-unit], all infinite where the information is singular.
+        (p,) standard deviations [theta-unit], all infinite if the information is singular.
     """
     scaled, scale = scaled_to_unit_diagonal(information)
     values, vectors = np.linalg.eigh(scaled)

@@ -1,9 +1,9 @@
-"""The null space of sensitivities: combinations of parameters that no measurement shows, as opposed to round-off.
+"""The null space of sensitivities: combinations of parameters without effect on the measurements.
 
 A direction n with `G n = 0` at every sample is in the null space. The columns of the stacked,
-whitened G are brought to unit length, so that a weak parameter is not mistaken for one without
-effect. Singular values below the error of G, which is its change with a four times longer
-difference step, count as zero.
+whitened G are scaled to unit length, so that a parameter with a weak effect is not mistaken for
+one without effect. Singular values below the error of G count as zero; this error is the change of
+G with a difference step that is four times longer.
 """
 
 from __future__ import annotations
@@ -16,46 +16,46 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.records.combinations import Combination, ParameterGroup
 
-# The second difference step, whose change of G is the error of G, over the first one.
+# Ratio of the second difference step to the first one; the change of G between them is its error.
 COARSER_STEP_FACTOR = 4.0
 
-# A normalised singular value above it is certainly no round-off, so that one difference step is
-# enough.
+# A normalised singular value above this number is certainly not round-off, so that one difference
+# step is enough.
 CLEAR_SINGULAR_VALUE = 1e-4
 
-# Normalised singular values that count as zero: below the first in any case, above the second in no
-# case.
+# Bounds of the threshold below which a normalised singular value counts as zero: values below the
+# first number always do, values above the second number never do.
 ZERO_SINGULAR_VALUES = (1e-9, 1e-5)
 
-# A singular value below this multiple of the error of G counts as zero.
+# The threshold for a singular value is this multiple of the error of G, within the bounds above.
 ERROR_FACTOR = 3.0
 
-# Standard deviations by which the data move when a parameter changes by its size, up to which it
-# has no effect.
+# A parameter has no effect if a change by its size changes the data by at most this number of
+# standard deviations.
 LEAST_EFFECT = 1e-6
 
-# A column is compared with its error only where it is below this share of the strongest column.
+# A column is compared with its error only if it is below this fraction of the strongest column.
 LEAST_RELATIVE_EFFECT = 1e-7
 
-# A column that is so weak counts as zero below this multiple of its error.
+# Such a weak column counts as zero if it is below this multiple of its error.
 COLUMN_ERROR_FACTOR = 5.0
 
-# Coefficients of a combination, relative to the largest one in units of the sizes, below which they
-# are round-off.
+# Coefficients of a combination below this fraction of the largest one are round-off; they are
+# compared after multiplication with the sizes of the parameters.
 LEAST_COEFFICIENT = 1e-4
 
-# Directions are linearly dependent below this singular value, relative to the largest one.
+# Directions are linearly dependent if a singular value is below this fraction of the largest one.
 DEPENDENT = 1e-6
 
-# Norm that replaces zero where a column is divided by its norm.
+# Lower bound of a norm by which a column is divided; it avoids a division by zero.
 SMALLEST_NORM = 1e-300
 
-# Parameters are lumped into others where the remainder of their row exceeds these shares of the
-# longest row, tried in turn: rows that stand out come first, or the coefficients would explode.
+# A parameter is lumped into others if the remainder of its row exceeds a fraction of the longest
+# row. These fractions are tried in turn, because a small remainder leads to large coefficients.
 LUMPING_SHARES = (0.05, 1e-3, 1e-6)
 
-# Order in which parameters are lumped into others, by unit, as is usual for chains of bodies; other
-# units come last.
+# Order in which parameters are lumped into others, by unit, as is usual for chains of bodies.
+# Parameters with other units come last.
 LUMPING_ORDER = {"kg": 0, "kg m": 1, "kg m²": 2}
 
 
@@ -65,11 +65,11 @@ class NullSpace:
 
     Attributes:
         directions: (t, k) directions [theta-unit].
-        silent: Indices of the wanted parameters that have no effect by themselves.
+        silent: Indices of the wanted parameters that have no effect alone.
         basis: (t, t-k) orthonormal combinations with an effect, in scaled units.
-        smallest: Least singular value of the rest, columns normalised, times the least share of a
-            column that the nuisance parameters leave: 1 where all are orthogonal, 0 where one is
-                indistinguishable from zero.
+        smallest: Distance from a larger null space, 0 to 1: the smallest singular value of the
+            normalised columns with an effect, times the smallest fraction of such a column that
+            nuisance parameters do not explain.
     """
 
     directions: Array
@@ -85,7 +85,7 @@ class NullSpace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Columns:
-    """Columns of G for the t wanted parameters, nuisance parameters projected out.
+    """Columns of G of the t wanted parameters, without the part that nuisance parameters explain.
 
     Attributes:
         J: (n, t) effect of each parameter changed by its size [standard deviations].
@@ -112,7 +112,7 @@ def find_null_space(
 
     Args:
         J: (n, p) rows [1 / theta-unit].
-        error: (n, p) their change with a longer difference step, None where it is not known.
+        error: (n, p) their change with a longer difference step; None if it is not known.
         size: (p,) magnitudes of the parameters [theta-unit].
         scale: (p,) units of the basis [theta-unit].
         interest: (t,) indices of the wanted parameters.
@@ -129,14 +129,15 @@ def find_null_space(
     left_by_nuisance = length / np.maximum(columns.length_before, SMALLEST_NORM)
     least_share = float(left_by_nuisance[~dead].min(initial=1.0))
 
-    # Dead columns and known directions are in the null space; the rest is searched orthogonally to
-    # them.
+    # Columns without effect and known directions are in the null space. Further directions are
+    # searched orthogonally to them.
     t = len(interest)
     found = np.eye(t)[:, dead]
     if known is not None and known.shape[1]:
         found = _independent(np.concatenate([found, known / size[interest][:, None]], axis=1))
         Q = np.linalg.qr(found)[0]
-        J, error = J - (J @ Q) @ Q.T, error - (error @ Q) @ Q.T
+        J = J - (J @ Q) @ Q.T
+        error = error - (error @ Q) @ Q.T
 
     live = ~dead & (np.linalg.norm(J, axis=0) > ZERO_SINGULAR_VALUES[0] * length)
     hidden, smallest = _hidden_directions(J, error, live)
@@ -154,9 +155,9 @@ def find_null_space(
 def _wanted_columns(
     J: Array, error: Array | None, size: Array, interest: np.ndarray, prior: Array
 ) -> _Columns:
-    """Columns of the wanted parameters, the effects of nuisance parameters projected out.
+    """Columns of the wanted parameters, from which the effects of nuisance parameters are removed.
 
-    Arguments as above.
+    The arguments are those of `find_null_space`.
     """
     J = J * size
     error = np.zeros_like(J) if error is None else error * size
@@ -170,13 +171,14 @@ def _wanted_columns(
         error = np.concatenate([error, np.zeros_like(prior_rows)])
 
         Q = _range(J[:, nuisance])
-        J, error = J - Q @ (Q.T @ J), error - Q @ (Q.T @ error)
+        J = J - Q @ (Q.T @ J)
+        error = error - Q @ (Q.T @ error)
 
     return _Columns(J=J[:, interest], error=error[:, interest], length_before=length_before)
 
 
 def _dead_columns(columns: _Columns) -> np.ndarray:
-    """(t,) True where a parameter has no effect by itself, or none that nuisance parameters do not have."""
+    """(t,) True if a parameter has no effect, or only one that nuisance parameters explain."""
     length = np.linalg.norm(columns.J, axis=0)
     doubt = np.linalg.norm(columns.error, axis=0)
     strongest = columns.length_before.max(initial=0.0)
@@ -197,7 +199,7 @@ def _hidden_directions(J: Array, error: Array, live: np.ndarray) -> tuple[Array,
         live: (t,) True for the columns to combine.
 
     Returns:
-        (t, k) unit directions, and the least normalised singular value of the rest.
+        (t, k) unit directions, and the smallest normalised singular value of the others.
     """
     columns = np.flatnonzero(live)
     if not len(columns):
@@ -226,7 +228,7 @@ def _silent_parameters(directions: Array) -> tuple[int, ...]:
 
 
 def _complement(directions: Array) -> Array:
-    """(t, t-k) orthonormal directions across (t, k) directions."""
+    """(t, t-k) orthonormal directions that are orthogonal to (t, k) directions."""
     t, k = directions.shape
     if not k:
         return np.eye(t)
@@ -240,7 +242,7 @@ def _independent(directions: Array) -> Array:
 
 
 def _range(A: Array) -> Array:
-    """Orthonormal basis of the range of A: (n, m), columns compared at unit length."""
+    """Orthonormal basis of the range of A: (n, m); its columns are scaled to unit length first."""
     length = np.linalg.norm(A, axis=0)
     nonzero = length > 0.0
     U, s, _ = np.linalg.svd(A[:, nonzero] / length[nonzero], full_matrices=False)
@@ -250,16 +252,16 @@ def _range(A: Array) -> Array:
 def parameter_groups(
     null: NullSpace, names: Sequence[str], size: Array, units: Sequence[str]
 ) -> tuple[ParameterGroup, ...]:
-    """Write a null space in the names of the parameters: groups, and the combinations that remain identifiable in each.
+    """Describe a null space by groups of parameters and their identifiable combinations.
 
     Args:
         null: The null space.
         names: Names of the t wanted parameters.
-        size: (t,) their magnitudes, which decide which coefficients are round-off [theta-unit].
-        units: Their units, which decide which parameters are lumped into others.
+        size: (t,) their magnitudes, by which coefficients are recognised as round-off [theta-unit].
+        units: Their units, which determine the parameters that are lumped into others.
 
     Returns:
-        The groups; parameters without any effect make the last one, without combinations.
+        The groups. Parameters without any effect form the last one, which has no combinations.
     """
     if not null.count:
         return ()
@@ -269,7 +271,7 @@ def parameter_groups(
     base = np.setdiff1d(np.arange(len(N)), lumped)
     coefficients = _lumping_coefficients(N, size, lumped, base)
 
-    # Lumped parameters and those that they are lumped into belong together.
+    # A lumped parameter and the parameters into which it is lumped belong to one group.
     links = []
     for j, f in enumerate(lumped.tolist()):
         partners = base[coefficients[:, j] != 0.0].tolist()
@@ -294,7 +296,9 @@ def parameter_groups(
 
 
 def _lumping_coefficients(N: Array, size: Array, lumped: np.ndarray, base: np.ndarray) -> Array:
-    """(b, k) coefficients with which the k lumped parameters add to the b others; round-off is set to zero.
+    """(b, k) coefficients with which the k lumped parameters are added to the b others.
+
+    Coefficients that are round-off are set to zero.
 
     Args:
         N: (t, k) directions of the null space [theta-unit].
@@ -311,7 +315,7 @@ def _lumping_coefficients(N: Array, size: Array, lumped: np.ndarray, base: np.nd
 def _combination(
     names: Sequence[str], base: int, lumped: np.ndarray, coefficients: Array
 ) -> Combination:
-    """The base parameter plus the lumped parameters with their nonzero coefficients: (k,)."""
+    """Sum of a base parameter and of the lumped parameters times their coefficients: (k,)."""
     used = np.flatnonzero(coefficients).tolist()
     return Combination(
         members=(names[base], *(names[lumped[j]] for j in used)),
@@ -320,10 +324,10 @@ def _combination(
 
 
 def _lumped_parameters(N: Array, units: Sequence[str]) -> np.ndarray:
-    """Choose k parameters that are lumped into the others: independent rows of N.
+    """Choose k parameters that are lumped into the others; their rows of N are independent.
 
-    Masses go first, then first moments and inertias; of equal units, those declared last go before
-    the others.
+    Masses are chosen first, then first moments and inertias. Among parameters of one unit, those
+    declared last are chosen first.
 
     Args:
         N: (t, k) directions of the null space, relative to the sizes of the parameters.

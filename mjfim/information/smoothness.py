@@ -1,4 +1,7 @@
-"""Detection of derivatives that do not exist: at contacts, dry friction, limits and clamps two difference steps disagree."""
+"""Detection of points at which derivatives do not exist, by a disagreement of difference steps.
+
+Such points are contacts, dry friction, joint limits and clamped actuators.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,12 @@ from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
 from mjfim.records.check import Roughness
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
-# The second difference step over the first one: it changes a parameter by 0.3 %.
+# Ratio of the second difference step to the first one; the second step changes a parameter by
+# 0.3 %.
 LONGER_STEP_FACTOR = 300.0
 
-# The least factor, for parameters that are so weak that their first step is long already.
+# Smallest ratio of the second step to the first one. It holds for parameters with a weak effect,
+# whose first step is already long.
 LEAST_STEP_FACTOR = 3.0
 
 # The third step is the second one divided by this number, and at least `LEAST_MEDIUM_FACTOR` times
@@ -27,17 +32,18 @@ LEAST_STEP_FACTOR = 3.0
 MEDIUM_STEP_DIVISOR = 3.0
 LEAST_MEDIUM_FACTOR = 1.5
 
-# Where a derivative exists, the disagreement falls at least by this factor from the second to the
+# If a derivative exists, the disagreement decreases at least by this factor from the second to the
 # third step.
 SMOOTH_DECREASE = 6.0
 
-# Relative disagreement of two derivatives above which the trajectory counts as rough.
+# A trajectory is rough if two derivatives differ by more than this number (relative).
 DISAGREEMENT_TOLERANCE = 1e-2
 
-# An output whose derivative is below this share of the largest one of a parameter does not count.
+# The size of an output's derivative, to which a disagreement is related, is at least this fraction
+# of the parameter's largest derivative.
 NEGLIGIBLE_OUTPUT = 1e-3
 
-# Samples before the first disagreement at which its causes are looked for as well.
+# Number of samples before the first disagreement that are searched for its causes, too.
 SAMPLES_BEFORE = 2
 
 
@@ -45,8 +51,8 @@ def disagreement(fine: Array, coarse: Array) -> Array:
     """Relative disagreement of two derivatives of the outputs.
 
     Args:
-        fine: (N+1, ny, p) whitened derivatives by the shorter step.
-        coarse: (N+1, ny, p) whitened derivatives by the longer step.
+        fine: (N+1, ny, p) whitened derivatives with the shorter step.
+        coarse: (N+1, ny, p) whitened derivatives with the longer step.
 
     Returns:
         (N+1, p) largest difference over all outputs, each relative to its largest value over time.
@@ -70,13 +76,13 @@ def roughness(
     Args:
         plant: The plant.
         noise: Noise of the measured outputs.
-        model: The user's model (MjModel) at theta, in which the causes are looked for.
+        model: The user's model (MjModel) at theta, in which the causes are searched.
         theta: (p,) parameter values.
         trajectory: The trajectory.
-        fine: Its sensitivity by the shorter step, if it is known.
+        fine: Its sensitivity with the shorter step, if it is known.
 
     Returns:
-        The worst disagreement and what causes it; None where it is below `DISAGREEMENT_TOLERANCE`.
+        The worst disagreement and its causes; None if it is below `DISAGREEMENT_TOLERANCE`.
     """
     names, derivatives = plant.parameters.names, plant.derivatives
     factors = _longer_step_factors(plant)
@@ -84,7 +90,7 @@ def roughness(
     if fine is None:
         fine = derivatives.sensitivity(theta, trajectory)
 
-    # A trajectory that diverges when the parameters move a little is as rough as can be.
+    # A trajectory that diverges after a small change of the parameters has no derivative at all.
     if fine is None or coarse is None:
         return Roughness(
             error=np.inf,
@@ -104,8 +110,8 @@ def roughness(
     if not error[:, worst].max() > DISAGREEMENT_TOLERANCE:
         return None
 
-    # Where a derivative exists, the error of central differences falls ninefold with a third of the
-    # step: the trajectory is strongly curved, but smooth.
+    # If a derivative exists, the error of central differences decreases by a factor of nine with a
+    # third of the step. The trajectory is then smooth, only strongly curved.
     medium = np.maximum(factors / MEDIUM_STEP_DIVISOR, LEAST_MEDIUM_FACTOR)
     between = derivatives.sensitivity(theta, trajectory, medium * SENSITIVITY_STEP)
     if between is not None:
@@ -125,20 +131,20 @@ def roughness(
 
 
 def _longer_step_factors(plant: Plant) -> Array:
-    """(p,) the second difference step of each parameter over its first one."""
+    """(p,) ratio of the second to the first difference step of each parameter."""
     factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / plant.derivatives.parameter_scale
     return np.maximum(factors, LEAST_STEP_FACTOR)
 
 
 def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:
-    """Find which parameters have an effect that stands out of round-off.
+    """Find the parameters whose effect is larger than round-off.
 
     Args:
         parameters: The p parameters.
         G: (N+1, ny, p) whitened derivatives of the outputs.
 
     Returns:
-        (p,) True where a parameter has such an effect.
+        (p,) True if a parameter has such an effect.
     """
     length = np.linalg.norm(G, axis=(0, 1)) * parameters.magnitude
     strongest = length.max(initial=0.0)

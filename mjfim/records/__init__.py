@@ -1,4 +1,7 @@
-"""Frozen records that verbs take and return: arrays with names and units, each of which can be saved and loaded."""
+"""Frozen records that verbs take and return: arrays with names and units.
+
+Each record can be saved and loaded.
+"""
 
 from mjfim.records.campaign import Campaign, CampaignStatus
 from mjfim.records.check import Check

@@ -26,19 +26,21 @@ class CampaignStatus(Enum):
     )
     EXHAUSTED = "all rounds are used up before every parameter is known as accurately as wanted"
     WAITING = "the next round is designed and waits for its recording"
-    INFEASIBLE = "no design keeps the limits at the estimate; nothing more was recorded"
+    INFEASIBLE = "no design keeps the limits at the estimate; no further round was recorded"
     INTERRUPTED = "interrupted by the user; the rounds so far are complete"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EarlierRound:
-    """Recordings that existed before a campaign began: of an earlier session's round, or made without a design.
+    """Recordings that existed before this session of a campaign began.
+
+    They belong to a round of an earlier session, or were made without a design.
 
     Attributes:
         recordings: The recordings.
-        theta: (p,) parameters at which the round was designed [theta-unit], or None.
-        predicted: (p,) standard deviations that were predicted [theta-unit], or None.
-        control: (N, nu) control of the design [unit of the actuator], or None.
+        theta: (p,) parameters at which the round was designed [theta-unit]; None without a design.
+        predicted: (p,) predicted standard deviations [theta-unit]; None without a design.
+        control: (N, nu) control of the design [unit of the actuator]; None without a design.
     """
 
     recordings: tuple[Recording, ...]
@@ -59,7 +61,7 @@ class Round:
         control: (N, nu) control of the design [unit of the actuator].
         recordings: Recordings of this round.
         estimate: Estimate from all recordings up to this round.
-        design: The design; None where it was made in an earlier session.
+        design: The design; None if it was made in an earlier session.
         warnings: Sentences for the user.
     """
 
@@ -102,7 +104,8 @@ class Campaign(SavedRecord):
 
     Attributes:
         parameters: Names of the p parameters.
-        wanted: (p,) standard deviations aimed at [theta-unit]; infinite where none is.
+        wanted: (p,) target standard deviations [theta-unit]; infinite if the experiment states
+            none.
         rounds: The rounds.
         status: How the campaign ended.
         pending: Design that is not recorded yet, or None.
@@ -124,7 +127,7 @@ class Campaign(SavedRecord):
 
     @property
     def reached(self) -> bool:
-        """True where every parameter is known as accurately as wanted and the fit is not in doubt."""
+        """True if all parameters reach their target accuracies and the fit is not in doubt."""
         return self.status is CampaignStatus.REACHED
 
     @property
@@ -144,7 +147,7 @@ class Campaign(SavedRecord):
 
     @property
     def short(self) -> str:
-        """Parameters that are not known as accurately as wanted, in words; empty where all are."""
+        """Parameters that miss their target accuracies, in words; empty if none does."""
         last = self.estimate
         return "" if last is None else missed_targets(self.parameters, last.std, self.wanted)
 
@@ -166,12 +169,15 @@ class Campaign(SavedRecord):
 
 
 def missed_targets(names: Sequence[str], std: Array, wanted: Array) -> str:
-    """Return the parameters that miss their target accuracy, the worst first: `m (σ 0.012, wanted 0.01)`.
+    """Return the parameters that miss their target accuracies in words, the worst first.
 
     Args:
         names: Names of the p parameters.
         std: (p,) standard deviations [theta-unit].
-        wanted: (p,) standard deviations aimed at [theta-unit].
+        wanted: (p,) target standard deviations [theta-unit].
+
+    Returns:
+        Text such as `m (σ 0.012, wanted 0.01)`; empty if no parameter misses its target.
     """
     missed = np.flatnonzero(~(std <= wanted)).tolist()
     worst_first = sorted(missed, key=lambda j: -std[j] / wanted[j])

@@ -13,15 +13,15 @@ from mjfim.records.combinations import ParameterGroup
 from mjfim.records.design import CombinationAccuracy
 from mjfim.records.serialization import SavedRecord
 
-# Correlation of two estimates (absolute value) above which the parameters count as confounded.
+# Two parameters are confounded if the absolute correlation of their estimates exceeds this number.
 CONFOUNDED_CORRELATION = 0.95
 
-# Largest relative difference between psi by rollouts and psi by the linear recursion that passes
-# the self-test.
+# The self-test fails if psi by rollouts and psi by the linear recursion differ by more than this
+# number (relative).
 RECURSION_TOLERANCE = 1e-3
 
-# Largest relative difference between the analytic slope of the cost and finite differences that
-# passes the self-test.
+# The self-test fails if the analytic slope of the cost and finite differences differ by more than
+# this number (relative).
 SLOPE_TOLERANCE = 1e-2
 
 
@@ -33,15 +33,15 @@ class ParameterCheck:
         name: Name of the parameter.
         unit: Its unit; may be empty.
         value: Value at which the check was made [unit].
-        nuisance: True where the experiment does not aim at this parameter.
+        nuisance: True if this is a nuisance parameter.
         size: Magnitude of its value, or of the whole vector or tensor of which it is a component
             [unit].
-        std: Predicted standard deviation [unit]; infinite where it is not identifiable alone.
+        std: Predicted standard deviation [unit]; infinite if it is not identifiable alone.
         relative: `std` over `size`.
-        wanted: Standard deviation aimed at [unit]: stated, or 5 % of `size`.
-        stated: True where `wanted` was stated in the experiment.
-        repetitions: Repetitions of this experiment that reach `wanted`; 0 where no number of
-            repetitions does.
+        wanted: Target standard deviation [unit], stated in the experiment or 5 % of `size`.
+        stated: True if `wanted` is stated in the experiment.
+        repetitions: Number of repetitions of this experiment that reach `wanted`; 0 if no number
+            does.
         seconds: Duration of these repetitions [s].
     """
 
@@ -90,12 +90,12 @@ class ConfoundedPair:
 
 @dataclass(frozen=True, kw_only=True)
 class Roughness:
-    """Disagreement of dy/dtheta by two difference steps, a sign that the motion is not smooth.
+    """Disagreement of dy/dtheta between two difference steps, because the motion is not smooth.
 
     Attributes:
         error: Largest relative disagreement.
-        parameter: Name of the parameter where it occurs.
-        sample: Sample at which it first shows.
+        parameter: Name of the parameter with this disagreement.
+        sample: First sample with a disagreement.
         time: Time of this sample [s].
         causes: Contacts, dry friction or active limits at this sample, in words.
     """
@@ -109,13 +109,13 @@ class Roughness:
     def __str__(self) -> str:
         cause = ", ".join(self.causes)
         if not cause:
-            cause = "no contact, friction or limit acts there: the motion may be chaotic"
+            cause = "no contact, friction or limit acts there; the motion may be chaotic"
         size = f"{100 * self.error:.2g} %" if np.isfinite(self.error) else "an unlimited amount"
 
         return (
-            f"not smooth: derivatives by two difference steps disagree by {size} for "
+            f"not smooth: derivatives with two different difference steps disagree by {size} for "
             f"{self.parameter}, first at sample {self.sample} (t = {self.time:.4g} s; {cause}); σ "
-            "and the design are unreliable, because they use these derivatives"
+            "and the design are unreliable, because they depend on these derivatives"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -133,14 +133,14 @@ class Roughness:
 class SelfTest:
     """Test of the derivatives along a trajectory.
 
-    Errors are relative; infinite where a perturbed motion diverges, NaN where the criterion itself
+    Errors are relative. They are infinite if a perturbed motion diverges, and NaN if the criterion
     is infinite.
 
     Attributes:
-        roughness: Disagreement of two difference steps that is too large, or None.
-        recursion: Error of psi by rollouts against `psi_{k+1} = A psi + E`.
-        slope: Error of DJ . zeta against differences of J(P(xi + gamma zeta)).
-        likely_cause: Likely cause of a failure of the last two, in words; may be empty.
+        roughness: Disagreement between two difference steps if it is too large, otherwise None.
+        recursion: Difference between psi by rollouts and psi by `psi_{k+1} = A psi + E`.
+        slope: Difference between DJ . zeta and finite differences of J(P(xi + gamma zeta)).
+        likely_cause: Likely cause, in words, if `recursion` or `slope` is too large; else empty.
     """
 
     roughness: Roughness | None
@@ -150,7 +150,7 @@ class SelfTest:
 
     @property
     def passed(self) -> bool:
-        """True where all derivatives agree."""
+        """True if all derivatives agree."""
         return (
             self.roughness is None
             and not self.recursion > RECURSION_TOLERANCE
@@ -176,19 +176,19 @@ class Check(SavedRecord):
         source: The motion that was checked: a control, a trajectory or recordings, in words.
         horizon: Its duration [s].
         rows: Predicted accuracy of each parameter.
-        wanted: Names of the t parameters that are no nuisance.
-        information: (p, p) information, priors included, initial-state deviations marginalised
-            [1 / (unit of theta_i times unit of theta_j)].
-        eigenvalues: (s,) ascending, of the information that the criterion sees.
-        correlation: (t, t) correlation of the estimates of `wanted`; NaN where one is not
+        wanted: Names of the t parameters that are not nuisance parameters.
+        information: (p, p) information with priors, in which deviations of the initial state are
+            marginalised [1 / (unit of theta_i times unit of theta_j)].
+        eigenvalues: (s,) ascending eigenvalues of the information that the criterion uses.
+        correlation: (t, t) correlation of the estimates of `wanted`; NaN where a parameter is not
             identifiable alone.
         confounded: Pairs of parameters with strongly correlated estimates.
         not_separable: Groups of parameters that no experiment with these outputs can separate.
-        not_excited: Groups that another control would separate.
+        not_excited: Groups of parameters that another control would separate.
         self_test: Test of the derivatives.
         verdict: Sentences for the user.
-        combined: Accuracies of the identifiable combinations (`std_initial` and `std_final` are
-            equal).
+        combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
+            are equal.
     """
 
     source: str
@@ -217,16 +217,23 @@ class Check(SavedRecord):
 
     @property
     def condition(self) -> float:
-        """Largest over smallest eigenvalue; infinite where the smallest is not positive."""
+        """Ratio of the largest to the smallest eigenvalue; infinite if the information is singular.
+
+        The information is singular if its smallest eigenvalue is not positive.
+        """
         smallest = self.eigenvalues[0] if len(self.eigenvalues) else 0.0
         return float(self.eigenvalues[-1] / smallest) if smallest > 0.0 else np.inf
 
     @property
     def ok(self) -> bool:
-        """True where derivatives agree, every parameter is identifiable and one repetition reaches every stated accuracy."""
+        """True if the check found no fault.
+
+        The derivatives agree, all parameters are identifiable, and one repetition reaches every
+        stated accuracy.
+        """
         known = {row.name for row in self.rows if np.isfinite(row.std)}
-        # A prior can separate parameters that the data cannot separate; such a group is then no
-        # fault.
+
+        # A prior may separate parameters that the data cannot separate.
         separable = all(set(group.members) <= known for group in self.not_separable)
 
         stated = [row for row in self.rows if row.stated and not row.nuisance]

@@ -1,4 +1,4 @@
-"""Records of parameter combinations that can be identified although the parameters cannot."""
+"""Records of identifiable combinations of parameters that are not identifiable alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-# Coefficients that differ from one by less than this are not written out.
+# A coefficient that differs from 1 by less than this number is not written.
 UNIT_COEFFICIENT_TOLERANCE = 1e-6
 
 
@@ -20,7 +20,7 @@ class Combination:
 
     Attributes:
         members: Names of the parameters.
-        coefficients: Coefficient of each; the first one is 1.
+        coefficients: Coefficient of each parameter; the first one is 1.
     """
 
     members: tuple[str, ...]
@@ -40,8 +40,8 @@ class ParameterGroup:
 
     Attributes:
         members: Names of the parameters.
-        combinations: The identifiable combinations, fewer than members; none where no member has
-            any effect.
+        combinations: The identifiable combinations, fewer than members; empty if no member has an
+            effect.
     """
 
     members: tuple[str, ...]
@@ -50,7 +50,7 @@ class ParameterGroup:
     def __str__(self) -> str:
         names = join_names(self.members)
         if not self.combinations:
-            return f"{names}: no effect on anything that is measured"
+            return f"{names}: no effect on any measured output"
         return f"{names} only as {', '.join(str(c) for c in self.combinations)}"
 
     def summary(self) -> dict[str, Any]:
@@ -66,11 +66,11 @@ class ParameterGroup:
 
 
 def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -> Array:
-    """Return the coefficients of all combinations of some groups as a matrix.
+    """Return the coefficients of all combinations of several groups as a matrix.
 
     Args:
         groups: Groups of parameters.
-        names: Names of the t parameters, one for each column.
+        names: Names of the t parameters, one per column.
 
     Returns:
         (c, t) coefficients, one row per combination.
@@ -93,7 +93,7 @@ def join_names(names: Sequence[str]) -> str:
 
 
 def _factor(coefficient: float) -> str:
-    """Return a coefficient in front of a name; empty where it is one."""
+    """Return the text of a coefficient in front of a name; empty if the coefficient is 1."""
     if abs(coefficient - 1.0) < UNIT_COEFFICIENT_TOLERANCE:
         return ""
     return f"{coefficient:.4g} "

@@ -1,4 +1,4 @@
-"""Records of a comparison: the best control that each method found, and which method is the best."""
+"""Records of a comparison of methods, each with the best control that it found."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ class MethodOutcome(Enum):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MethodResult(RenamedFields):
-    """The best control that one method found. Without a control, numbers are NaN.
+    """The best control that one method found. All numbers are NaN if it found none.
 
     Attributes:
         method: Key of the method.
-        title: Its name for the user.
-        outcome: How it ended.
+        title: Name of the method in reports.
+        outcome: Outcome of the method.
         control: (N, nu) control, or None [unit of the actuator].
         cost: J.
         criterion: phi, the information term of the cost.
         std: (p,) Cramér-Rao standard deviations [theta-unit].
-        min_eigenvalue: Smallest eigenvalue of the information per second that the criterion sees.
+        min_eigenvalue: Smallest eigenvalue of the information per second that the criterion uses.
         worst_relative_std: `(lambda_min(S I S))^-1/2`: standard deviation of the worst combination
             of parameters, relative to their scales S.
         seconds: Wall time [s].
         steps: MuJoCo steps taken.
         margins: Worst margin of each kind of limit [unit of the limit].
-        relative_margins: These margins over half of the limits' ranges.
+        relative_margins: These margins divided by half of the limits' ranges.
         found_by: Name of the attempt that led to the control.
         note: Remark about the result; may be empty.
     """
@@ -82,12 +82,12 @@ class MethodResult(RenamedFields):
 
     @property
     def sound(self) -> bool:
-        """True where the control keeps all limits and its information is no artefact of saturated actuators."""
+        """True if the control keeps all limits without relying on saturated actuators."""
         return self.outcome is MethodOutcome.INSIDE
 
     @property
     def tightest(self) -> tuple[str, float]:
-        """Kind and relative size of the smallest margin; an empty kind where nothing is limited."""
+        """Kind and relative size of the smallest margin; an empty kind without limits."""
         return min(self.relative_margins.items(), key=lambda item: item[1], default=("", np.inf))
 
     def summary(self) -> dict[str, Any]:
@@ -112,23 +112,23 @@ class MethodResult(RenamedFields):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Comparison(SavedRecord):
-    """Result of `mjfim.compare`: methods side by side, each with the same budget, in the order in which they ran.
+    """Result of `mjfim.compare`: methods in the order in which they ran, all with equal budgets.
 
     Attributes:
         source: Name of the experiment.
         criterion: "E", "A", "D" or "c".
-        nats: For D-optimality: number by which differences of J are divided to obtain the change
-            per parameter; else 0.
+        nats: For D-optimality, the number by which differences of J are divided to obtain the
+            change per parameter; 0 for other criteria.
         parameters: Names of the p parameters.
-        units: Unit of each.
-        scale: (p,) scale of each [theta-unit].
-        nuisance: Names of the parameters that the experiment does not aim at.
+        units: Units of the parameters.
+        scale: (p,) scales of the parameters [theta-unit].
+        nuisance: Names of the nuisance parameters.
         rows: Result of each method.
         seconds: Time that each method had [s].
         steps: MuJoCo steps that each method had; may be infinite.
         seed: Seed of the random numbers.
-        weighted: True where J has more terms than the criterion.
-        interrupted: True where the user interrupted the comparison.
+        weighted: True if J has further terms besides the criterion.
+        interrupted: True if the user interrupted the comparison.
     """
 
     source: str
@@ -153,23 +153,23 @@ class Comparison(SavedRecord):
 
     @property
     def wanted(self) -> tuple[int, ...]:
-        """Indices of the parameters that are no nuisance."""
+        """Indices of the parameters that are not nuisance parameters."""
         return tuple(j for j, name in enumerate(self.parameters) if name not in self.nuisance)
 
     @property
     def design(self) -> MethodResult | None:
-        """Result of mjfim's own design; None where the comparison ended before it."""
+        """Result of mjfim's own design; None if the comparison ended before it."""
         return next((row for row in self.rows if row.method == DESIGN), None)
 
     @property
     def rival(self) -> MethodResult | None:
-        """The best baseline whose result is sound."""
+        """The best sound result of a baseline; None if there is none."""
         baselines = (row for row in self.rows if row.method != DESIGN and row.sound)
         return min(baselines, key=lambda row: row.cost, default=None)
 
     @property
     def best(self) -> MethodResult | None:
-        """The best result that is sound, the design included."""
+        """The best sound result of all methods, including the design; None if there is none."""
         return min((row for row in self.rows if row.sound), key=lambda row: row.cost, default=None)
 
     @property
@@ -191,11 +191,11 @@ class Comparison(SavedRecord):
         """Return the fraction by which the J of one result is lower than that of another.
 
         Args:
-            row: The one result.
-            other: The other one.
+            row: The result with the lower J.
+            other: The result with which it is compared.
 
         Returns:
-            Fraction of the other's J; for D-optimality: fraction of its geometric mean of
+            Fraction of the J of `other`. For D-optimality, fraction of the geometric mean of its
             variances.
         """
         if self.nats:
@@ -204,16 +204,16 @@ class Comparison(SavedRecord):
 
     @property
     def ok(self) -> bool:
-        """True where all methods ran, the design is sound, and no baseline is better."""
+        """True if all methods ran, the design is sound, and no baseline is better."""
         design = self.design
         return not self.interrupted and design is not None and design.sound and not self.beating
 
     @property
     def verdict(self) -> tuple[str, ...]:
-        """Sentences for the user, the important one first."""
+        """Sentences for the user, the most important one first."""
         sentences = [_verdict(self)]
         if self.interrupted:
-            sentences.append("Interrupted: only the methods shown are finished.")
+            sentences.append("Interrupted: only the methods in the table are finished.")
         return tuple(sentences)
 
     def summary(self) -> dict[str, Any]:
@@ -237,11 +237,12 @@ class Comparison(SavedRecord):
 
 def _verdict(comparison: Comparison) -> str:
     """Return a sentence that says whether the design is the best."""
-    design, rival = comparison.design, comparison.rival
+    design = comparison.design
+    rival = comparison.rival
 
     # Without a design, or without a sound baseline, there is nothing to compare.
     if design is None:
-        return "The design was not run: there is nothing to compare the baselines with."
+        return "The design was not run, so there is nothing to compare the baselines with."
     if rival is None:
         return (
             f"No baseline found a control that keeps all limits; the design {design.outcome.value}."

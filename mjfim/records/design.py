@@ -1,4 +1,4 @@
-"""Records of a design: its iterates, its information before and after, its limits."""
+"""Records of a design, its iterates, its information and its limits."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mjfim.errors import RenamedFields
 from mjfim.records.serialization import SavedRecord
 from mjfim.records.trajectory import Trajectory
 
-# Arrays of a trajectory that design.npz holds under their own names.
+# Fields of a trajectory whose names are also names of arrays in design.npz.
 TRAJECTORY_ARRAYS = ("t", "qpos", "qvel", "act", "ctrl")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation(SavedRecord):
-    """A trajectory and the information that it carries about the parameters.
+    """A trajectory and the information that it gives about the parameters.
 
     Attributes:
         trajectory: The trajectory.
@@ -28,15 +28,15 @@ class Evaluation(SavedRecord):
         sensitivity: (N+1, nx, p) psi [x-unit / theta-unit].
         information: (p, p) Fisher information, summed over the measured samples [1 / (unit of
             theta_i times unit of theta_j)].
-        eigenvalues: (s,) ascending, of the information per second that the cost sees: scaled,
-            nuisance marginalised, identifiable combinations only.
-        std: (p,) Cramér-Rao standard deviations [theta-unit]; infinite where a parameter is not
+        eigenvalues: (s,) ascending eigenvalues of the information per second that the cost uses:
+            scaled, with nuisance parameters marginalised, for identifiable combinations only.
+        std: (p,) Cramér-Rao standard deviations [theta-unit]; infinite if a parameter is not
             identifiable alone.
         min_eigenvalue: (N+1,) smallest eigenvalue of the information per second, accumulated up to
             each sample.
         criterion: phi, the information term of the cost.
         cost: J.
-        growth: Largest open-loop amplification of a small deviation along the trajectory; NaN where
+        growth: Largest open-loop amplification of a small deviation along the trajectory; NaN if
             it was not computed.
     """
 
@@ -77,8 +77,8 @@ class Status(Enum):
         "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
     )
     ROUGH = (
-        "ended where derivatives hardly exist (contact, dry friction or saturated actuators): "
-        "the numbers are indications, see warnings"
+        "ended where derivatives are unreliable (contact, dry friction or saturated actuators): "
+        "the numbers are only approximate, see warnings"
     )
     STALLED = (
         "stalled: no step along the descent direction lowers the cost any more, "
@@ -90,14 +90,14 @@ class Status(Enum):
     )
     INFEASIBLE = (
         "found no trajectory that keeps all limits; the margins show which limit is violated: "
-        "widen it, or begin with a gentler control"
+        "widen it, or begin with an initial control of smaller amplitude"
     )
     LEFT = "discarded: another start was more promising"
     INTERRUPTED = "interrupted by the user; this is the best trajectory so far"
 
     @property
     def success(self) -> bool:
-        """True where the result is a (local) optimum to the requested tolerance."""
+        """True if the result is a (local) optimum to the requested tolerance."""
         return self in (Status.CONVERGED, Status.SMOOTHED)
 
 
@@ -109,14 +109,14 @@ class HistoryRow:
         iteration: Number of the iterate, from 0.
         cost: J.
         criterion: phi, the information term of the cost.
-        min_eigenvalue: Smallest eigenvalue of the information per second that the cost sees.
+        min_eigenvalue: Smallest eigenvalue of the information per second that the cost uses.
         slope: |DJ . zeta|, predicted change of the cost for a full step.
         gamma: Step length that led to this iterate.
         seconds: Wall time since the optimisation began [s].
         steps: MuJoCo steps since the optimisation began.
-        rate: Sample rate of the plant on which the optimisation ran [Hz] (coarse-to-fine).
+        rate: Sample rate of the plant of this iterate [Hz]; lower than stated on a coarse plant.
         mu: Weight of the barrier of hard limits; 0 without limits.
-        margin: Worst margin over half of its range; NaN without limits.
+        margin: Worst margin divided by half of its range; NaN without limits.
     """
 
     iteration: int
@@ -138,8 +138,8 @@ class StartResult:
 
     Attributes:
         name: Name of the initial control.
-        cost: J that was reached.
-        status: How the optimisation from it ended.
+        cost: J at the end of the optimisation from it.
+        status: How this optimisation ended.
         iterations: Number of iterations.
     """
 
@@ -203,7 +203,7 @@ class LimitUsage:
 
 
 def _npz_names() -> dict[str, str]:
-    """Return the names of arrays in design.npz that users know, by path in the record."""
+    """Return the short names of arrays in design.npz, by path in the record."""
     names = {}
     for evaluation, prefix in (("final", ""), ("initial", "initial_")):
         for array in TRAJECTORY_ARRAYS:
@@ -215,11 +215,11 @@ def _npz_names() -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Design(SavedRecord):
-    """Result of `mjfim.design`: the designed trajectory beside the initial one.
+    """Result of `mjfim.design`: the designed trajectory and the initial one.
 
-    Saved as design.json and design.npz. The arrays of the designed trajectory are named t, qpos,
-    qvel, act, ctrl, gain and sensitivity in design.npz, those of the initial one likewise with the
-    prefix `initial_`; `Design.load` reads design.npz.
+    It is saved as design.json and design.npz, and `Design.load` reads design.npz. The arrays of the
+    designed trajectory are named t, qpos, qvel, act, ctrl, gain and sensitivity in design.npz;
+    those of the initial trajectory have the prefix `initial_`.
 
     Attributes:
         status: How the optimisation ended.
@@ -232,17 +232,17 @@ class Design(SavedRecord):
         steps: MuJoCo steps taken.
         seconds: Wall time [s].
         limits: Worst margin per kind of limit, positive inside [unit of the limit].
-        usage: Usage of every limit at every engine step.
+        usage: Position between the bounds of every limit, at every engine step.
         warnings: Sentences for the user.
         found_by: Name of the initial control that led to the design.
         starts: Results of all initial controls.
-        nuisance: Names of the parameters that the design did not aim at.
+        nuisance: Names of the nuisance parameters.
         combinations: Groups of parameters that are not identifiable alone, in words.
         combined: Accuracies of the identifiable combinations of these groups.
-        prior: (p, p) information from before this experiment [1 / (unit of theta_i times unit of
+        prior: (p, p) information known before this experiment [1 / (unit of theta_i times unit of
             theta_j)].
-        data: (p, p) information of this experiment alone, the nuisance parameters of a single
-            experiment marginalised.
+        data: (p, p) information of this experiment alone, in which nuisance parameters that
+            belong to a single experiment are marginalised.
     """
 
     status: Status
@@ -274,22 +274,22 @@ class Design(SavedRecord):
 
     @property
     def wanted(self) -> tuple[int, ...]:
-        """Indices of the parameters that are no nuisance."""
+        """Indices of the parameters that are not nuisance parameters."""
         return tuple(j for j, name in enumerate(self.parameters) if name not in self.nuisance)
 
     @property
     def success(self) -> bool:
-        """True where the optimisation converged and the trajectory keeps all limits."""
+        """True if the optimisation converged and the trajectory keeps all limits."""
         return self.status.success and self.within_limits
 
     @property
     def within_limits(self) -> bool:
-        """True where no margin is negative."""
+        """True if no margin is negative."""
         return all(margin >= 0.0 for margin in self.limits.values())
 
     @property
     def iterations(self) -> int:
-        """Number of the last iterate; 0 where there is none."""
+        """Number of the last iterate; 0 if there is none."""
         return self.history[-1].iteration if self.history else 0
 
     @property

@@ -1,4 +1,4 @@
-"""Records of an identification: the estimate, its uncertainty, and doubts about the fit."""
+"""Records of an identification: the estimate, its uncertainty, and tests of the fit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NORMAL_95 = 1.96
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate(SavedRecord):
-    """Result of `mjfim.identify`: parameters from recordings.
+    """Result of `mjfim.identify`: parameters estimated from recordings.
 
     Attributes:
         parameters: Names of the p parameters.
@@ -27,40 +27,40 @@ class Estimate(SavedRecord):
         std: (p,) formal standard deviations: Cramér-Rao at the estimate [theta-unit].
         covariance: (p, p) formal covariance.
         initial_theta: (p,) initial guess [theta-unit].
-        chi2: Sum of squared whitened residuals. With a robust loss: of the residuals that are no
-            outliers, scaled by what noise would have there.
+        chi2: Sum of squared whitened residuals. With a robust loss, outliers are left out, and the
+            sum is scaled so that its expected value for pure noise stays `dof`.
         dof: Degrees of freedom of `chi2`.
         status: How the fit ended, in words.
-        success: True where the fit converged and every parameter was determined inside its bounds.
-        misfit: True where the residuals are not noise of the stated size; the formal `std` then
-            underestimates the errors.
+        success: True if the fit converged and all parameters are determined inside their bounds.
+        misfit: True if the residuals are not noise of the stated size; the formal `std` is then
+            too small.
         iterations: Number of iterations.
         residual_rms: Root mean square residual of each output [unit of the output].
         at_bound: Names of the parameters that ended at a bound.
         predicted: Outputs of the fitted model for each recording, (M, ny) [unit of the output].
-        recordings: The recordings as they were fitted.
+        recordings: The fitted recordings.
         warnings: Sentences for the user.
         combinations: Groups of parameters that the recordings determine in combination only, in
             words.
-        data: (p, p) information of the recordings, priors left out, private nuisance parameters
-            marginalised.
+        data: (p, p) information of the recordings without priors, in which nuisance parameters
+            that belong to a single recording are marginalised.
         std_sandwich: (p,) standard deviations that allow for autocorrelated residuals [theta-unit].
-        interval: (p, 2) 95 % interval: the hull of formal, sandwich and bootstrap intervals and of
-            the disagreement between recordings [theta-unit].
-        between_recordings: (p,) standard deviation from recording to recording beyond what their
-            standard deviations explain [theta-unit].
+        interval: (p, 2) 95 % interval, which covers the formal, sandwich and bootstrap intervals
+            and the disagreement between recordings [theta-unit].
+        between_recordings: (p,) standard deviation between recordings that their standard
+            deviations do not explain [theta-unit].
         sigma: Noise of each output, stated or estimated [unit of the output].
         reasons: Reasons for `misfit`, in sentences.
         whiteness: Tests of the residuals of each output.
-        worst_residual: Interval in which the residuals are largest; None where the fit is good.
+        worst_residual: Interval in which the residuals are largest; None if the fit is good.
         predictions: Prediction errors on data that were not fitted.
-        sloppy: Names of the parameters whose interval is wide for their value.
+        sloppy: Names of the parameters whose interval is wide compared with their value.
         missing_terms: Terms missing in the model that would explain the residuals.
-        per_recording: Values, recording by recording, of parameters that differ between recordings;
-            `theta` holds the first.
+        per_recording: Values for each recording of the parameters that differ between recordings;
+            `theta` holds their values for the first recording.
         robust_uncertainty: Robust uncertainty of the common unknowns, or None.
-        motion: The first recording's motion as fitted, or None.
-        interrupted: True where the user interrupted the fit.
+        motion: Motion of the fitted model for the first recording, or None.
+        interrupted: True if the user interrupted the fit.
         seconds: Wall time [s].
         steps: MuJoCo steps taken.
         units: Unit of each parameter.
@@ -120,7 +120,8 @@ class Estimate(SavedRecord):
 
         # Formal values replace robust ones that were not computed.
         if len(self.interval) != count:
-            theta, half_width = np.asarray(self.theta), NORMAL_95 * np.asarray(self.std)
+            theta = np.asarray(self.theta)
+            half_width = NORMAL_95 * np.asarray(self.std)
             interval = np.column_stack([theta - half_width, theta + half_width])
             object.__setattr__(self, "interval", interval)
         if len(self.std_sandwich) != count:
@@ -182,10 +183,10 @@ class WorstResidual:
     Attributes:
         output: Name of the output.
         recording: Name of the recording.
-        begin: Begin of the interval [s].
+        begin: Beginning of the interval [s].
         end: End of the interval [s].
         size: Root mean square of the residuals in it [standard deviations of the noise].
-        share: Share of the sum of all squared residuals that lies in it, 0 to 1.
+        share: Fraction of the sum of all squared residuals that lies in the interval, 0 to 1.
     """
 
     output: str
@@ -197,8 +198,8 @@ class WorstResidual:
 
     def __str__(self) -> str:
         interval = f"{self.begin:.3g} to {self.end:.3g} s of {self.recording}"
-        size = f"{self.size:.2g} sigmas, {100 * self.share:.0f} % of all squares"
-        return f"worst in {self.output}, {interval}: {size}"
+        size = f"{self.size:.2g} σ, {100 * self.share:.0f} % of the sum of squares"
+        return f"largest residuals in {self.output}, {interval}: {size}"
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of `worst` in estimate.json."""
@@ -219,9 +220,9 @@ class PredictionErrors(SavedRecord):
     Attributes:
         name: Name of the recording.
         outputs: Names of the ny outputs.
-        rms: (ny,) root mean square errors [unit of the output]; NaN where nothing was measured or
-            the model diverged.
-        mae: (ny,) mean absolute errors, likewise.
+        rms: (ny,) root mean square errors [unit of the output]; NaN for an output without
+            measurements, and if the model diverges.
+        mae: (ny,) mean absolute errors [unit of the output]; NaN as in `rms`.
     """
 
     name: str
@@ -250,14 +251,14 @@ class PredictionErrors(SavedRecord):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Prediction:
-    """Prediction errors on data that were not fitted, of the identified and of the nominal model.
+    """Prediction errors of the identified and of the nominal model on data that were not fitted.
 
     Attributes:
-        name: Name of the recording, or of the part of one.
+        name: Name of the recording, or of a part of it.
         identified: Errors of the identified model.
         nominal: Errors of the nominal model.
-        held_out: True where the data were stated as held out; False where they were left out of a
-            further fit.
+        held_out: True if the user held out the data; False if they were left out of a fit for
+            cross-validation.
     """
 
     name: str
@@ -267,8 +268,12 @@ class Prediction:
 
     @property
     def ratio(self) -> float:
-        """Geometric mean over outputs of identified over nominal root mean square error; NaN where none is comparable."""
-        identified, nominal = self.identified.rms, self.nominal.rms
+        """Ratio of the identified to the nominal model's root mean square error.
+
+        It is the geometric mean over the outputs; NaN if no output has both errors.
+        """
+        identified = self.identified.rms
+        nominal = self.nominal.rms
         finite = np.isfinite(identified) & np.isfinite(nominal)
         comparable = finite & (nominal > 0.0) & (identified > 0.0)
         if not comparable.any():
@@ -292,15 +297,15 @@ class Prediction:
 
 @dataclass(frozen=True, kw_only=True)
 class MissingTerm:
-    """A physical term that the model lacks and that would explain residuals.
+    """A physical term that the model lacks and that would explain part of the residuals.
 
     Attributes:
         description: The term in words.
         path: Target of a parameter that would add it.
         value: Estimated value of that parameter [unit].
         unit: Its unit; may be empty.
-        sigmas: `value` over its standard deviation.
-        share: Share of all squared residuals that the term explains, 0 to 1.
+        sigmas: `value` divided by its standard deviation.
+        share: Fraction of the sum of squared residuals that the term explains, 0 to 1.
     """
 
     description: str
@@ -312,7 +317,8 @@ class MissingTerm:
 
     def __str__(self) -> str:
         amount = f"{self.value:.2g} {self.unit}".strip()
-        evidence = f"about {amount} ({self.sigmas:.0f} σ, {100 * self.share:.2g} % of all squares)"
+        share = f"{100 * self.share:.2g} % of the sum of squares"
+        evidence = f"about {amount} ({self.sigmas:.0f} σ, {share})"
         return f'{self.description}, {evidence}; to estimate it, add: target = "{self.path}"'
 
     def summary(self) -> dict[str, Any]:
@@ -329,18 +335,20 @@ class MissingTerm:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Uncertainty:
-    """Uncertainty of the c common unknowns, robust to autocorrelated residuals and to recordings that disagree.
+    """Robust uncertainty of the c unknowns that all recordings have in common [theta-unit].
+
+    It allows for autocorrelated residuals and for recordings that disagree.
 
     Attributes:
         sandwich: (c,) standard deviations that allow for autocorrelated residuals.
-        interval: (c, 2) 95 % intervals: the hull of formal, sandwich and bootstrap intervals.
-        between: (c,) standard deviation from recording to recording beyond what their standard
-            deviations explain.
+        interval: (c, 2) 95 % intervals, which cover the formal, sandwich and bootstrap intervals.
+        between: (c,) standard deviation between recordings that their standard deviations do not
+            explain.
         apart: Indices of the unknowns on which recordings disagree.
-        each: (K, c) estimates from every recording alone; NaN where a recording has too little
+        each: (K, c) estimates from each recording alone; NaN where a recording has too little
             information.
         blocks: Number of blocks of the bootstrap.
-        draws: (n, c) draws of the bootstrap.
+        draws: (n, c) bootstrap replicates of the estimate.
     """
 
     sandwich: Array
@@ -361,8 +369,9 @@ class Whiteness:
         count: Number of residuals.
         variance: Their mean square; 1 for noise of the stated size.
         correlation: Lag-1 autocorrelation, -1 to 1.
-        p: Probability that white noise looks like this, corrected for the number of tests.
-        inflation: Largest variance of the mean of a run of residuals over that of white noise.
+        p: p-value of the hypothesis of white noise, corrected for the number of tests.
+        inflation: Variance of the mean of successive residuals divided by that of white noise, the
+            largest over several numbers of residuals.
         time: Integrated autocorrelation time [rows].
     """
 

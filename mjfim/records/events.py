@@ -1,4 +1,4 @@
-"""Events that long work reports while it runs, by calling `callback(event)`."""
+"""Events by which long computations report their progress, by calling `callback(event)`."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class StudyEvent:
     """Progress of a study that consists of several parts.
 
     Attributes:
-        study: The verb: "compare", "monte_carlo", "campaign", "shortest_experiment", ...
+        study: Name of the study, such as "compare", "monte_carlo" or "campaign".
         part: Name of the part that is running.
         index: Number of the part, from 0.
-        count: Number of parts; None where it is not known beforehand.
-        share: Share of this part that is done, 0 to 1.
-        message: One line about what was found so far; may be empty.
-        result: Result of the part once it is complete, such as the `Round` of a campaign; None
-            before.
+        count: Number of parts; None if it is not known beforehand.
+        share: Completed share of this part, 0 to 1.
+        message: One line about the results so far; may be empty.
+        result: Result of a complete part, such as the `Round` of a campaign; None while the part
+            is running.
     """
 
     study: str

@@ -11,16 +11,16 @@ from mjfim.records.serialization import SavedRecord
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrialStatistics:
-    """Estimates from simulated recordings along one trajectory, beside the Cramér-Rao bound.
+    """Estimates from simulated recordings of one trajectory, and the Cramér-Rao bound.
 
     Attributes:
         estimates: (trials, p) estimated parameters; rows of NaN for failed trials.
         mean: (p,) mean of the estimates.
         covariance: (p, p) sample covariance of the estimates.
         crlb: (p, p) Cramér-Rao lower bound of the covariance.
-        efficiency: (p,) variance of the bound over observed variance; 1 where the bound is reached.
-        efficiency_interval: (p, 2) 95 % confidence interval of each efficiency (chi-square on the
-            variance).
+        efficiency: (p,) ratio of the bound to the observed variance; 1 if the bound is reached.
+        efficiency_interval: (p, 2) 95 % confidence interval of each efficiency, from the
+            chi-squared distribution of the sample variance.
         trials: Number of trials.
         failed: Number of trials whose fit failed.
         seconds: Wall time [s].

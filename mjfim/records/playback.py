@@ -9,7 +9,7 @@ from mjfim.arrays import Array, freeze
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Playback:
-    """A design at the controller's rate: M rows of control, and the final state.
+    """A design at the controller's rate, with M rows of control and the final state.
 
     Attributes:
         t: (M+1,) times [s].

@@ -1,4 +1,4 @@
-"""Record of one experiment's measurements."""
+"""Record of the measurements of one experiment."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mjfim.records.serialization import SavedRecord
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording(SavedRecord):
-    """Measured (or simulated) outputs under a known control, at the times at which they were logged.
+    """Measured or simulated outputs under a known control, at the times of the log.
 
     Attributes:
-        t: (M,) times [s], increasing, at any intervals.
+        t: (M,) increasing times [s]; the intervals may differ.
         ctrl: (M-1, nu) controls, held from each row to the next [unit of the actuator].
         y: (M, ny) measured outputs in the order of `outputs` [unit of the output]; NaN where an
             output was not measured.

@@ -1,4 +1,4 @@
-"""Records of a robustness study: robots that differ from the model, and how a design fared on them."""
+"""Records of a robustness study, which plays a design on robots that differ from the model."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ CONFIDENCE = 0.95
 # Half width of an interval of this probability [standard deviations].
 INTERVAL_HALF_WIDTH = 1.959964
 
-# Share of the robots whose interval has to hold the true value of every parameter.
+# Required fraction of robots whose interval contains the true value, for every parameter.
 REQUIRED_COVERAGE = 0.90
 
-# Delay of the control of a simulated robot, where none is stated [s]; rounded up to whole
-# timesteps.
+# Default delay of the control of a simulated robot [s]; it is rounded up to whole timesteps.
 LATENCY = 5e-3
 
-# Smallest share of half a range that counts as needed reserve; less is round-off.
+# Smallest reserve, as a fraction of half a range; smaller values are round-off.
 MIN_RESERVE = 1e-9
 
 
@@ -32,11 +31,11 @@ class RobotConditions:
     """How the simulated robots differ from the model.
 
     Attributes:
-        wrong: Share by which every parameter differs from its guess, up or down at random.
+        wrong: Relative error of the guess of every parameter; its sign is random.
         latency: Delay of the control [s].
-        feedback: True where the controller adds the gains times the measured deviation.
-        loudness: Noise of the robot over the stated noise.
-        seed: Seed of everything random.
+        feedback: True if the controller adds the gains times the measured deviation.
+        loudness: Ratio of the robot's noise to the stated noise.
+        seed: Seed of the random numbers.
     """
 
     wrong: float = 0.2
@@ -48,20 +47,18 @@ class RobotConditions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RobotRun:
-    """One robot that has played the design, and the estimate from its recording.
+    """One simulated robot on which the design was played, and the estimate from its recording.
 
     Attributes:
         theta: (p,) true parameters [theta-unit].
-        estimate: (p,) estimated parameters [theta-unit]; NaN where the robot could not be
-            identified.
+        estimate: (p,) estimated parameters [theta-unit]; NaN if the robot could not be identified.
         covariance: (p, p) covariance of the estimate [theta-unit²].
-        margins: (l,) smallest margin of each limit over half of its range; negative where it was
-            exceeded.
-        fit: Sum of squared whitened residuals over the degrees of freedom.
-        misfit: True where the residuals contradict the model or the noise.
-        restarted: True where the first starting point of the fit ended in a misfit, so that others
-            were tried.
-        trouble: Why there is no estimate, or why it is in doubt; else empty.
+        margins: (l,) smallest margin of each limit divided by half of its range; negative if the
+            limit is exceeded.
+        fit: Sum of squared whitened residuals divided by the degrees of freedom.
+        misfit: True if the residuals contradict the model or the noise.
+        restarted: True if the fit from the first initial guess was a misfit and others were tried.
+        trouble: Reason why there is no estimate, or why it is in doubt; else empty.
     """
 
     theta: Array
@@ -82,10 +79,15 @@ class RobotRun:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def squared_distance(self, chosen: np.ndarray) -> float:
-        """Squared Mahalanobis distance of the truth from the estimate of some parameters; chi-squared distributed.
+        """Squared Mahalanobis distance between true and estimated values of several parameters.
+
+        It has a chi-squared distribution if the covariance is right.
 
         Args:
             chosen: Indices of the parameters.
+
+        Returns:
+            The squared distance.
         """
         error = (self.estimate - self.theta)[chosen]
         covariance = self.covariance[np.ix_(chosen, chosen)]
@@ -94,15 +96,16 @@ class RobotRun:
 
 @dataclass(frozen=True, kw_only=True)
 class AssessedLimit:
-    """A limit that is looked at on every robot.
+    """A limit whose margin is evaluated on every robot.
 
     Attributes:
-        kind: Kind of the limit: position, velocity, acceleration, control, control_rate, force,
-            joint_force or clearance.
+        kind: Kind of the limit: `position`, `velocity`, `acceleration`, `control`, `control_rate`,
+            `force`, `joint_force` or `clearance`.
         name: Name of the joint or actuator; "nearest pair" for a clearance.
         lower: Lower bound [unit of the quantity].
         upper: Upper bound [unit of the quantity].
-        scale: Half of the range, by which margins are divided [unit of the quantity].
+        scale: Half of the range, by which margins are divided [unit of the quantity]; the range
+            is from `lower` to `upper`.
     """
 
     kind: str
@@ -114,7 +117,7 @@ class AssessedLimit:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Robustness(SavedRecord):
-    """How a design fared on n robots, g of which could be identified.
+    """Result of a robustness study with n robots, g of which could be identified.
 
     Attributes:
         conditions: How the robots differ from the model.
@@ -124,17 +127,18 @@ class Robustness(SavedRecord):
         wrong: (p,) root mean square of the errors of the guess [theta-unit].
         z: (g, p) errors of the estimates in standard deviations.
         error: (g, p) errors of the estimates [theta-unit].
-        std: (g, p) formal standard deviations [theta-unit]; NaN for what can only be found in
-            combination with others.
+        std: (g, p) formal standard deviations [theta-unit]; NaN for unknowns that are identifiable
+            only in combination with others.
         predicted: (p,) standard deviations predicted before any run [theta-unit].
-        joint: Number of robots whose joint confidence region holds the truth: of the parameters
-            that the experiment states, and of all unknowns.
-        margins: (n, l) smallest margins over half of their ranges.
-        planned: (l,) margins of the design on the model over half of their ranges.
-        fit: Mean of the sums of squared whitened residuals over their degrees of freedom.
+        joint: Numbers of robots whose joint confidence region contains the true values: the region
+            of the parameters that the experiment states, and the region of all unknowns.
+        margins: (n, l) smallest margins divided by half of their ranges.
+        planned: (l,) margins of the design on the model divided by half of their ranges.
+        fit: Mean over robots of the sum of squared whitened residuals divided by the degrees of
+            freedom.
         misfits: Number of misfits.
-        restarted: Number of fits that needed another starting point.
-        troubles: Number of robots by the sentence that says what went wrong.
+        restarted: Number of fits that needed another initial guess.
+        troubles: Number of robots by the sentence that states their problem.
     """
 
     conditions: RobotConditions
@@ -167,12 +171,12 @@ class Robustness(SavedRecord):
 
     @property
     def identified(self) -> np.ndarray:
-        """(p,) True where a parameter is found by itself, not only in combination with others."""
+        """(p,) True if a parameter is identifiable alone, not only in combination with others."""
         return np.asarray(np.isfinite(self.std).all(axis=0)) & (len(self.std) > 0)
 
     @property
     def inside(self) -> np.ndarray:
-        """(p,) number of robots whose interval holds the true value."""
+        """(p,) number of robots whose interval contains the true value."""
         return np.asarray((np.abs(self.z) <= INTERVAL_HALF_WIDTH).sum(axis=0))
 
     @property
@@ -187,7 +191,10 @@ class Robustness(SavedRecord):
 
     @property
     def kept(self) -> np.ndarray:
-        """(n, l) True where a robot keeps a limit; a force at its limit is clamped, which does not count as kept."""
+        """(n, l) True if a robot keeps a limit.
+
+        A force at its limit is clamped by the simulation, which does not count as kept.
+        """
         clamped = [limit.kind in ("force", "joint_force") for limit in self.limits]
         return np.where(clamped, self.margins > 0.0, self.margins >= 0.0)
 
@@ -198,24 +205,32 @@ class Robustness(SavedRecord):
 
     @property
     def lost(self) -> Array:
-        """(l,) share of half of each range by which the worst robot comes closer to the limit than the design."""
+        """(l,) distance by which the worst robot is closer to a limit than the design.
+
+        It is divided by half of the limit's range.
+        """
         worst = self.margins.min(axis=0)
         return np.asarray(np.maximum(self.planned - worst, 0.0))
 
     @property
     def covered(self) -> bool:
-        """True where every parameter's interval holds the true value often enough."""
+        """True if the intervals of all parameters contain the true values often enough."""
         inside = self.inside[self.identified]
         often = inside >= REQUIRED_COVERAGE * self.runs - 1e-9
         return bool(often.all()) and bool(self.identified.any())
 
     @property
     def ok(self) -> bool:
-        """True where the intervals cover often enough and every robot keeps all limits."""
+        """True if the intervals cover often enough and every robot keeps all limits."""
         return self.covered and self.all_kept == self.runs
 
     def reserve(self) -> dict[str, float]:
-        """Share of half of each range by which a design has to stay away from its limits, by kind, rounded up to 1 %."""
+        """Reserve that a design needs so that all robots keep the limits, by kind of limit.
+
+        Returns:
+            Distance to the limit divided by half of its range, rounded up to 0.01; kinds that need
+            no reserve are left out.
+        """
         needed: dict[str, float] = {}
         for limit, share in zip(self.limits, self.lost.tolist(), strict=True):
             if share > MIN_RESERVE:

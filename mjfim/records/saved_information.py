@@ -1,4 +1,4 @@
-"""Record of the information that a design or an estimate saved in its JSON file."""
+"""Record of the Fisher information in the JSON file of a design or of an estimate."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from mjfim.errors import RecordingError
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SavedInformation:
-    """Fisher information about named parameters, from a design.json (predicted) or an estimate.json (from data).
+    """Fisher information about named parameters, read from a design.json or an estimate.json.
 
-    Only the JSON file is read, so it may be moved away from the npz file that belongs to it.
+    That of a design is predicted, that of an estimate comes from data. The npz file is not needed,
+    so a JSON file may be moved without it.
 
     Attributes:
         parameters: Names of the p parameters.
@@ -43,8 +44,8 @@ class SavedInformation:
             Its information.
 
         Raises:
-            RecordingError: The file cannot be read, is neither of the two, or its matrices are not
-                finite numbers.
+            RecordingError: The file cannot be read, has another content, or its matrices have a
+                wrong shape or numbers that are not finite.
         """
         path = Path(path)
         try:
@@ -73,7 +74,7 @@ class SavedInformation:
 
 
 def _information(values: dict[str, Any]) -> tuple[Array, bool]:
-    """Return the information matrix of a file, and whether the file's prior is included in it."""
+    """Return the information matrix of a file, and whether it includes the file's prior."""
     if "data" in values:
         return np.array(values["data"], dtype=np.float64), False
 

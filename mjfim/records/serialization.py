@@ -1,15 +1,13 @@
-"""Records on disk: a JSON file for people and an npz file from which the record is built again.
+"""Saving and loading of records, without pickles.
 
-No pickles.
-
-A saved record consists of two files with one stem, for example `design`:
+A saved record consists of two files whose names differ in the ending only, for example:
 
 * `design.json` holds the record's summary: the keys that users and other programs read.
-* `design.npz` holds the record itself, complete. Every array has a name of its own; the text array
-  `record` holds everything else as JSON, and names the array wherever the record has one.
+* `design.npz` holds the complete record. Each array of the record is an array of the file; the text
+  array `record` holds all other fields as JSON, with the name of an array in place of the array.
 
-JSON knows neither infinity nor NaN. Summaries contain `null` instead; the text `record` contains
-"inf", "-inf" or "nan", and the type of the field shows that this is a number.
+JSON has neither infinity nor NaN. Summaries contain `null` instead; the text array `record`
+contains "inf", "-inf" or "nan", and the type of the field shows that this is a number.
 """
 
 from __future__ import annotations
@@ -34,10 +32,10 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import RecordingError, RenamedFields
 
-# Name of the text array in an npz file that holds everything of a record that is no array.
+# Name of the text array in an npz file that holds all fields of a record that are not arrays.
 RECORD = "record"
 
-# Words for the numbers that JSON cannot express.
+# Words for numbers that JSON does not have.
 NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
@@ -48,20 +46,20 @@ def as_json(values: Mapping[str, Any]) -> str:
     """Render values as readable JSON.
 
     Args:
-        values: Mappings, sequences, arrays, numbers, strings and None, nested at will.
+        values: Mappings, sequences, arrays, numbers, strings and None, which may be nested.
 
     Returns:
-        Standard JSON with a line break at its end. Non-finite numbers become null, because JSON has
-        no name for them.
+        Standard JSON with a line break at its end. Numbers that are not finite become null, because
+        JSON has no word for them.
     """
     return json.dumps(_plain(values), indent=2, allow_nan=False) + "\n"
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Write values as a JSON file, whole or not at all.
+    """Write values as a JSON file; an incomplete file never remains.
 
     Args:
-        path: File to write; its folder is made if it does not exist.
+        path: File to write; its folder is created if it does not exist.
         values: Contents, as for `as_json`.
     """
     with replacing(path) as temporary:
@@ -115,7 +113,7 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
 
     Args:
         path: File to read.
-        kind: The kind of file that is expected, for messages: "design", "estimate", ...
+        kind: Expected kind of file, for messages, such as "design" or "estimate".
 
     Returns:
         Arrays by name.
@@ -140,17 +138,17 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
     ) as error:
         reason = str(error)
         if "pickle" in reason:
-            reason = "it is not NumPy's, or holds pickles, which are refused"
+            reason = "it was not written by NumPy, or holds pickles, which are refused"
         raise RecordingError(
             f"{path}: not a {kind} archive (npz without pickles): {reason}"
         ) from None
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays as a compressed npz file, whole or not at all.
+    """Write arrays as a compressed npz file; an incomplete file never remains.
 
     Args:
-        path: File to write; its folder is made if it does not exist.
+        path: File to write; its folder is created if it does not exist.
         arrays: Arrays of numbers or text by name.
     """
     with replacing(path) as temporary, temporary.open("wb") as stream:
@@ -165,7 +163,7 @@ class MalformedRecordError(ValueError):
 
 
 class _Encoder:
-    """Turns a record into plain JSON values, and collects its arrays on the way.
+    """Converter of a record to plain JSON values, which collects the record's arrays.
 
     Attributes:
         arrays: The arrays by name.
@@ -175,20 +173,23 @@ class _Encoder:
         """Start with no arrays.
 
         Args:
-            names: Names of arrays that users know, by path in the record; other arrays are named by
-                their path.
+            names: Short names of arrays, by path in the record; the names of other arrays are
+                their paths.
         """
         self.arrays: dict[str, np.ndarray] = {}
         self._known_names = names
         self._name_of: dict[int, tuple[str, np.ndarray]] = {}
 
     def encode(self, hint: Any, value: Any, path: str) -> Any:
-        """Return plain values for one field.
+        """Return the plain value of one field, and collect its arrays.
 
         Args:
             hint: Type of the field.
             value: Its value.
-            path: Names of the fields that lead here, joined by dots.
+            path: Path of the field: the names of the fields that lead to it, joined by dots.
+
+        Returns:
+            A value that JSON can hold; the name of the array in place of an array.
         """
         if _optional(hint) is not None:
             return None if value is None else self.encode(_optional(hint), value, path)
@@ -218,7 +219,7 @@ class _Encoder:
         return _encode_scalar(hint, value, path)
 
     def _keep(self, value: np.ndarray, path: str) -> str:
-        """Keep an array under a name, and return the name; an array that occurs twice is kept once."""
+        """Collect an array and return its name; an array that occurs twice is collected once."""
         array = np.asarray(value)
         if id(array) in self._name_of:
             return self._name_of[id(array)][0]
@@ -245,7 +246,7 @@ def _encode_table(value: BaseModel, path: str) -> dict[str, Any]:
 
 
 def _encode_scalar(hint: Any, value: Any, path: str) -> Any:
-    """Return the JSON value of a single entry: a member of an enumeration, a truth value, a number or a text."""
+    """Return the JSON value of a member of an enumeration, a truth value, a number or a text."""
     if issubclass(hint, Enum):
         return value.name
     if hint in (bool, int, str):
@@ -313,13 +314,15 @@ def _decode_scalar(hint: Any, value: Any, path: str) -> Any:
     """Build a member of an enumeration, a truth value, a number or a text."""
     if issubclass(hint, Enum):
         if value not in hint.__members__:
-            raise MalformedRecordError(f"the field {path!r} holds {value!r}, no {hint.__name__}")
+            raise MalformedRecordError(
+                f"the field {path!r} holds {value!r}, which is not a {hint.__name__}"
+            )
         return hint[value]
     if hint is float:
         if isinstance(value, str) and value in NOT_FINITE:
             return NOT_FINITE[value]
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise MalformedRecordError(f"the field {path!r} holds {value!r}, no number")
+            raise MalformedRecordError(f"the field {path!r} holds {value!r}, which is not a number")
         return float(value)
     return _expect(hint, value, path)
 
@@ -337,12 +340,14 @@ def _array(value: Any, arrays: Mapping[str, np.ndarray], path: str) -> Array:
 def _expect(kind: type, value: Any, path: str) -> Any:
     """Return the value if it has the expected JSON type."""
     if type(value) is not kind:
-        raise MalformedRecordError(f"the field {path!r} holds {value!r}, no {kind.__name__}")
+        raise MalformedRecordError(
+            f"the field {path!r} holds {value!r}, which is not of type {kind.__name__}"
+        )
     return value
 
 
 def _optional(hint: Any) -> Any:
-    """Return the type beside None of an optional field, or None where the field is not optional."""
+    """Return the type of an optional field without None; None if the field is not optional."""
     if get_origin(hint) not in (Union, UnionType):
         return None
     others = [entry for entry in get_args(hint) if entry is not NoneType]
@@ -365,16 +370,16 @@ def _join(path: str, name: str | int) -> str:
     return f"{path}.{name}" if path else str(name)
 
 
-# ---- what a record inherits
+# ---- base class of records
 
 
 class SavedRecord(RenamedFields):
-    """Saving and loading, for records that are dataclasses.
+    """Base class of records that can be saved and loaded; a record is a dataclass.
 
     Attributes:
         file_stem: Name of the record's files without their endings.
-        made_by: How a user makes the files: a command or a call.
-        array_names: Names of arrays in the npz file that users know, by path in the record.
+        made_by: Command or call with which a user makes the files.
+        array_names: Short names of arrays in the npz file, by path in the record.
     """
 
     file_stem: ClassVar[str]
@@ -382,14 +387,15 @@ class SavedRecord(RenamedFields):
     array_names: ClassVar[Mapping[str, str]] = {}
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of the record's JSON file: the values that users and other programs read."""
+        """Return the contents of the record's JSON file, which users and other programs read."""
         raise NotImplementedError
 
     def save(self, folder: str | Path) -> None:
-        """Write the record's two files, each whole or not at all.
+        """Write the record's two files; an incomplete file never remains.
 
         Args:
-            folder: Folder for `<file_stem>.json` and `<file_stem>.npz`; made if it does not exist.
+            folder: Folder for `<file_stem>.json` and `<file_stem>.npz`; it is created if it does
+                not exist.
         """
         self.save_archive(folder)
         write_json(Path(folder) / f"{self.file_stem}.json", self.summary())
@@ -398,7 +404,7 @@ class SavedRecord(RenamedFields):
         """Write the npz file alone, from which `load` builds the record.
 
         Args:
-            folder: Folder for `<file_stem>.npz`; made if it does not exist.
+            folder: Folder for `<file_stem>.npz`; it is created if it does not exist.
         """
         encoder = _Encoder(self.array_names)
         kind = type(self)
@@ -419,8 +425,8 @@ class SavedRecord(RenamedFields):
             The record, equal to the one that was saved.
 
         Raises:
-            RecordingError: The npz file is missing, damaged, of another record, or of a version of
-                mjfim that did not save whole records. The message says how to make it anew.
+            RecordingError: The npz file is missing or damaged, holds another kind of record, or
+                was written by an early version of mjfim. The message says how to write it again.
         """
         archive = cls._archive_of(Path(path))
         arrays = read_arrays(archive, cls.file_stem)
@@ -430,7 +436,8 @@ class SavedRecord(RenamedFields):
             record: Self = _decode_record(cls, values, arrays, "")
         except (MalformedRecordError, TypeError, ValueError, IndexError) as error:
             raise RecordingError(
-                f"{archive}: not a {cls.__name__} of this version of mjfim: {error}; {cls._cure()}"
+                f"{archive}: not a {cls.__name__} of this version of mjfim: {error}; "
+                f"{cls._advice()}"
             ) from None
         return record
 
@@ -452,7 +459,8 @@ class SavedRecord(RenamedFields):
 
         if not archive.is_file():
             raise RecordingError(
-                f"{archive}: this file is missing; {cls.__name__}.load needs it; {cls._cure()}"
+                f"{archive}: this file is missing, but {cls.__name__}.load needs it; "
+                f"{cls._advice()}"
             )
         return archive
 
@@ -461,9 +469,9 @@ class SavedRecord(RenamedFields):
         """Return the plain values of the record that an npz file holds."""
         if RECORD not in arrays:
             raise RecordingError(
-                f"{archive}: the array {RECORD!r} is missing, from which {cls.__name__}.load "
-                "builds the record: written by an older version of mjfim, or not by mjfim; "
-                f"{cls._cure()}"
+                f"{archive}: the array {RECORD!r} is missing, which {cls.__name__}.load needs; the "
+                "file was written by an older version of mjfim or by another program; "
+                f"{cls._advice()}"
             )
 
         try:
@@ -471,7 +479,7 @@ class SavedRecord(RenamedFields):
             kind, values = content["type"], content["fields"]
         except (ValueError, KeyError, TypeError):
             raise RecordingError(
-                f"{archive}: the array {RECORD!r} is not mjfim's; {cls._cure()}"
+                f"{archive}: the array {RECORD!r} was not written by mjfim; {cls._advice()}"
             ) from None
 
         if kind != cls.__name__ or not isinstance(values, dict):
@@ -479,6 +487,6 @@ class SavedRecord(RenamedFields):
         return values
 
     @classmethod
-    def _cure(cls) -> str:
-        """Return how the files of this record are made anew."""
-        return f"make it anew with {cls.made_by}"
+    def _advice(cls) -> str:
+        """Return the end of a message, which says how to write the files again."""
+        return f"write it again with {cls.made_by}"

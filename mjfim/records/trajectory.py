@@ -1,8 +1,8 @@
-"""Records of a trajectory: the curve itself, its linearisation, and its sensitivity to the parameters.
+"""Records of a trajectory, its linearisation, and its sensitivity to the parameters.
 
-Letters are the paper's: `x` state, `u` control, `theta` parameters, `psi` sensitivity dx/dtheta,
-`I` Fisher information. Sizes: N samples; nq, nv, na, nu as in MuJoCo; `nx = 2 nv + na` (tangent
-space); ny outputs; p parameters. Arrays are read-only.
+The letters are those of the paper: `x` state, `u` control, `theta` parameters, `psi` sensitivity
+dx/dtheta, `I` Fisher information. The sizes are N samples; nq, nv, na and nu as in MuJoCo;
+`nx = 2 nv + na` for the tangent space; ny outputs; p parameters. Arrays are read-only.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Linearization:
     """First derivatives along a trajectory, in the tangent space of the state.
 
     Attributes:
-        A: (N, nx, nx) F_x.
+        A: (N, nx, nx) F_x [x-unit / x-unit].
         B: (N, nx, nu) F_u [x-unit / u-unit].
         E: (N, nx, p) F_theta [x-unit / theta-unit].
         C: (N+1, ny, nx) h_x [y-unit / x-unit].
@@ -93,7 +93,7 @@ class Linearization:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sensitivity:
-    """First derivatives of a trajectory by the parameters, at fixed control.
+    """First derivatives of a trajectory with respect to the parameters, at fixed control.
 
     Attributes:
         psi: (N+1, nx, p) dx/dtheta [x-unit / theta-unit]; zero at the initial state.

@@ -578,12 +578,12 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "rate": (
         edited("rate = 100.0", "rate = 30.0"),
         E,
-        [HOME, "rate: 30 Hz", "0.01 s", "100, 50, 25"],
+        [HOME, "rate: at 30 Hz", "0.01 s", "100, 50, 25"],
     ),
     "rate above the timestep": (
         edited("rate = 100.0", "rate = 200.0"),
         E,
-        [HOME, "rate: 200 Hz", "100, 50, 25"],
+        [HOME, "rate: at 200 Hz", "100, 50, 25"],
     ),
     "rate negative": (
         edited("rate = 100.0", "rate = -1.0"),
@@ -724,7 +724,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "combination of another criterion": (
         edited("[cost]", "[cost]\ncombination = { m = 1 }"),
         E,
-        [HOME, "cost", "no other criterion takes one"],
+        [HOME, "cost", "other criteria allow neither"],
     ),
     "combination of nothing": (
         edited("[cost]", '[cost]\ncriterion = "c"\ncombination = { m = 0 }'),
@@ -838,12 +838,12 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "qpos length": (
         edited('keyframe = "hanging"', "qpos = [0, 0, 0]"),
         E,
-        [HOME, "initial.qpos", "3 numbers", "the model has 2"],
+        [HOME, "initial.qpos", "3 numbers", "this model needs 2"],
     ),
     "act of a model without": (
         edited('keyframe = "hanging"', "act = [0]"),
         E,
-        [HOME, "initial.act", "1 numbers", "the model has 0"],
+        [HOME, "initial.act", "1 numbers", "this model needs 0"],
     ),
     "keyframe and qpos": (
         edited('keyframe = "hanging"', 'keyframe = "hanging"\nqpos = [0, 0]'),

@@ -113,7 +113,10 @@ def test_a_worst_residual_in_words() -> None:
             output="angle", recording="run.csv", begin=1.25, end=2.5, size=7.93, share=0.412
         )
     )
-    assert sentence == "worst in angle, 1.25 to 2.5 s of run.csv: 7.9 sigmas, 41 % of all squares"
+    assert (
+        sentence
+        == "largest residuals in angle, 1.25 to 2.5 s of run.csv: 7.9 σ, 41 % of the sum of squares"
+    )
 
 
 def seen(

@@ -202,9 +202,7 @@ def test_a_wanted_parameter_confounded_with_a_nuisance_has_an_infinite_criterion
     assert np.isnan(made.covariance(J.T @ J)).all()
 
 
-def test_combinations_project_the_information_and_show_which_parameters_are_identifiable_alone() -> (
-    None
-):
+def test_combinations_project_the_information_and_show_which_parameters_are_identifiable() -> None:
     rng = np.random.default_rng(17)
     J = rng.normal(size=(30, 3)) @ np.array(
         [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]

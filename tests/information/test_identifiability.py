@@ -25,7 +25,9 @@ REST = {"qpos": (0.0, np.pi), "control": {"kind": "constant", "amplitude": 0.0}}
 
 TWO = """
 <mujoco model="two">
-  <option timestep="0.01" integrator="implicitfast" gravity="0 0 0"><flag contact="disable"/></option>
+  <option timestep="0.01" integrator="implicitfast" gravity="0 0 0">
+    <flag contact="disable"/>
+  </option>
   <worldbody>
     <body name="left">
       <joint name="left" type="slide" axis="1 0 0" damping="0.3"/>
@@ -67,7 +69,7 @@ def test_an_experiment_that_shows_everything_needs_no_random_controls(
         raise AssertionError("not needed")
 
     def look_without_simulations(task: DesignTask) -> Identifiability:
-        """Identifiability along the initial control on a plant that simulates no further control."""
+        """Identifiability along the initial control; the plant simulates no further control."""
         curve = task.initial
         found = task.plant.derivatives.sensitivity(task.theta, curve)
         monkeypatch.setattr(task.plant, "simulate", refused)

@@ -196,7 +196,7 @@ def test_an_empty_null_space_gives_no_groups_and_silent_parameters_make_one() ->
     J = np.random.default_rng(9).normal(size=(60, 5)) / SIZES
     J[:, [1, 3]] = 0.0
     (group,) = parameter_groups(look(J), "abcde", SIZES, [""] * 5)
-    assert str(group) == "b and d: no effect on anything that is measured"
+    assert str(group) == "b and d: no effect on any measured output"
 
 
 LENGTH = 0.7
@@ -209,7 +209,8 @@ DOUBLE = """
       <inertial pos="0.05 0.02 0.3" mass="1.5" fullinertia="0.05 0.06 0.02 0.001 0.002 -0.001"/>
       <body name="b" pos="0 0 0.7">
         <joint name="jb" type="hinge" axis="0 1 0" damping="0.1"/>
-        <inertial pos="-0.03 0.01 0.25" mass="0.8" fullinertia="0.02 0.025 0.01 0.0005 -0.001 0.001"/>
+        <inertial pos="-0.03 0.01 0.25" mass="0.8"
+          fullinertia="0.02 0.025 0.01 0.0005 -0.001 0.001"/>
       </body>
     </body>
   </worldbody>

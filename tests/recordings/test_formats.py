@@ -172,7 +172,7 @@ def test_unknown_endings(tmp_path: Path) -> None:
         read_columns(tmp_path / "log.xlsx", ALL)
     with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
         read_columns(tmp_path / "gone.csv", ALL)
-    with pytest.raises(RecordingError, match=r"no ROS 2 bag"):
+    with pytest.raises(RecordingError, match=r"is not a ROS 2 bag"):
         read_columns(tmp_path, ALL)
 
 

@@ -188,7 +188,7 @@ def test_unit_of_a_control(read: Read) -> None:
         ("qvel:pin", {"unit": "m/s"}, r"valid: deg/s, rad/s, rev/s, rpm"),
         ("ruler", {"unit": "rpm"}, r"ruler\.unit: .*valid: m/s, mm/s"),
         ("cell[0]", {"unit": "m"}, r"cell\[0\]\.unit: .*valid: none; use scale for any other unit"),
-        ("qpos:rail", {"unwrap": True}, r"qpos:rail\.unwrap: only angles"),
+        ("qpos:rail", {"unwrap": True}, r"qpos:rail\.unwrap: only an angle"),
         ("qpos:pinn", {}, r": unknown column 'qpos:pinn' \(did you mean 'qpos:pin'\?\)"),
         ("ctrl:twist", {}, r"unknown column 'ctrl:twist'.*ctrl:turn"),
     ],
@@ -405,7 +405,7 @@ def test_dead_channels(read: Read) -> None:
     """A measured column that never moves is refused, a constant control is not."""
     with pytest.raises(
         RecordingError,
-        match=r"column 'enc' is 1\.5 in all of its 400 rows, which suggests a dead channel; remove it",
+        match=r"column 'enc' is 1\.5 in all of its 400 rows, which suggests a dead channel; remove",
     ):
         read({"enc": np.full(M, 1.5), "q": wave()}, columns={"encoder": "enc", "qpos:pin": "q"})
     with pytest.raises(RecordingError, match=r"column 'encoder' holds no number; remove it"):
@@ -560,7 +560,8 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     )
     np.savez(tmp_path / "d.npz", t=T, qpos=qpos[:, :2], ctrl=ctrl)
     with pytest.raises(
-        RecordingError, match=r"'qpos' has 2 columns; the model needs 3: qpos:rail, qpos:pin, qpos:stop"
+        RecordingError,
+        match=r"'qpos' has 2 columns; the model needs 3: qpos:rail, qpos:pin, qpos:stop",
     ):
         read_recording(tmp_path / "d.npz", task.system.channels)
     stated = task_of(tmp_path, {"columns": {"qpos:pin": "qpos[1]"}})

@@ -97,7 +97,7 @@ TEXTS = (
 
 
 class AwkwardValues:
-    """Builds a value of any type that records have, from numbers and texts that are easily spoilt."""
+    """Builds a value of any type that records have, from numbers and texts that are easily lost."""
 
     def __init__(self, count: int, optional: bool) -> None:
         """Build tuples, dictionaries and arrays with `count` entries; optional values are present
@@ -241,7 +241,7 @@ def test_a_comparison_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> N
 
 
 def test_a_campaign_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
-    """One round with its design, recording and estimate, and a design that waits for its recording."""
+    """One round with its design, recording and estimate, and a design that is not recorded yet."""
     wanted = task.experiment.replace(parameters={"m": {"wanted": 1e-6}})
 
     def measure(design: Design, number: int) -> Recording | None:
@@ -294,24 +294,24 @@ def with_fields(
     return apply
 
 
-ANEW = r"make it anew with `mjfim design EXPERIMENT -o DIR`"
+AGAIN = r"write it again with `mjfim design EXPERIMENT -o DIR`"
 
 FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], None], str]] = {
     "an older version": (
         lambda arrays: arrays.pop(RECORD),
-        rf"design\.npz: the array 'record' is missing, .* older version of mjfim, .*{ANEW}",
+        rf"design\.npz: the array 'record' is missing, .* older version of mjfim .*{AGAIN}",
     ),
     "another text": (
         lambda arrays: arrays.update({RECORD: np.array("hello")}),
-        rf"design\.npz: the array 'record' is not mjfim's; {ANEW}",
+        rf"design\.npz: the array 'record' was not written by mjfim; {AGAIN}",
     ),
     "another list": (
         lambda arrays: arrays.update({RECORD: np.array("[1]")}),
-        r"design\.npz: the array 'record' is not mjfim's",
+        r"design\.npz: the array 'record' was not written by mjfim",
     ),
     "a missing array": (
         lambda arrays: arrays.pop("initial_qpos"),
-        rf"the array 'initial_qpos' of the field 'initial\.trajectory\.qpos' is missing; {ANEW}",
+        rf"the array 'initial_qpos' of the field 'initial\.trajectory\.qpos' is missing; {AGAIN}",
     ),
     "an array of texts": (
         lambda arrays: arrays.update(theta=np.array(["a"])),
@@ -331,26 +331,26 @@ FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], None], str]] = {
     ),
     "an unknown status": (
         with_fields(lambda content: content["fields"].update(status="BORED")),
-        r"the field 'status' holds 'BORED', no Status",
+        r"the field 'status' holds 'BORED', which is not a Status",
     ),
     "a text for a number": (
         with_fields(lambda content: content["fields"].update(slope="steep")),
-        r"the field 'slope' holds 'steep', no number",
+        r"the field 'slope' holds 'steep', which is not a number",
     ),
     "a number for a text": (
         with_fields(lambda content: content["fields"].update(parameters=[1])),
-        r"the field 'parameters\.0' holds 1, no str",
+        r"the field 'parameters\.0' holds 1, which is not of type str",
     ),
     "a truth value for a count": (
         with_fields(lambda content: content["fields"].update(steps=True)),
-        r"the field 'steps' holds True, no int",
+        r"the field 'steps' holds True, which is not of type int",
     ),
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_damaged_files_are_described(name: str, saved: Path) -> None:
-    """The file, what is wrong, and how to make it anew."""
+    """The file, what is wrong, and how to write it again."""
     change, message = FAULTS[name]
     rewritten(saved / "design.npz", change)
     with pytest.raises(RecordingError, match=message):
@@ -368,11 +368,12 @@ def test_missing_files_are_named(saved: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"gone: no such file or folder"):
         Design.load(tmp_path / "gone")
     with pytest.raises(
-        RecordingError, match=r"estimate\.npz: this file is missing; Estimate\.load needs it; make"
+        RecordingError,
+        match=r"estimate\.npz: this file is missing, but Estimate\.load needs it; write",
     ):
         Estimate.load(saved)
     (saved / "design.npz").unlink()
-    with pytest.raises(RecordingError, match=rf"design\.npz: this file is missing; .*{ANEW}"):
+    with pytest.raises(RecordingError, match=rf"design\.npz: this file is missing, .*{AGAIN}"):
         Design.load(saved / "design.json")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(
