@@ -55,12 +55,15 @@ PREDICTION_NAME_WIDTH = 40
 # Smallest divisor of the improvement of an eigenvalue; avoids a division by zero.
 TINY = 1e-300
 
+# Cell of a standard deviation that is infinite, because others absorb the parameter's effect.
 NOT_ALONE = "not alone"
 
+# Remark on predicted standard deviations.
 BEST_CASE = (
-    "σ is the Cramér-Rao bound: a best case, true if the model and the stated noise are right."
+    "σ is the Cramér-Rao bound: the best case, reached if the model and the stated noise are right."
 )
 
+# Digits as subscripts.
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
@@ -95,14 +98,14 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
     if design.nuisance:
         names = ", ".join(design.nuisance)
         parts.append(
-            Paragraph(text=f"nuisance parameters, at which the design does not aim: {names}")
+            Paragraph(text=f"nuisance parameters, whose accuracy the design ignores: {names}")
         )
     if design.combinations:
         parts.append(
             Paragraph(
                 text=(
-                    "Some parameters are not identifiable alone: the design is made for their "
-                    "combinations; see design.json"
+                    "Some parameters are not identifiable alone; the design is optimized for "
+                    "combinations of them, see design.json"
                 )
             )
         )
@@ -173,7 +176,7 @@ def _relative(std: float, value: float) -> Quantity:
 
 
 def improvement(before: float, after: float) -> str:
-    """Return in words by which factor a standard deviation became smaller.
+    """Return the factor by which a standard deviation became smaller, in words.
 
     Args:
         before: Standard deviation before.
@@ -218,7 +221,7 @@ def eigenvalue_table(design: Design) -> SummaryTable:
 
     return SummaryTable(
         key="eigenvalues",
-        title="Eigenvalues of the information, and cost",
+        title="Eigenvalues of the Fisher information, and cost",
         columns=columns("trajectory", *headings, "criterion", "J"),
         rows=tuple(rows),
         detail=True,
@@ -274,8 +277,8 @@ def _start_parts(design: Design) -> list[Part]:
     )
     table = SummaryTable(
         key="starts",
-        title="Starts",
-        columns=columns("start", "cost", "iterations", "outcome", left=["outcome"]),
+        title="Initial controls from which the search started",
+        columns=columns("initial control", "cost", "iterations", "outcome", left=["outcome"]),
         rows=rows,
         detail=True,
     )
@@ -323,9 +326,10 @@ def describe_estimate(estimate: Estimate) -> Summary:
     parts.append(
         Paragraph(
             text=(
-                "The formal σ is the true accuracy only if model and noise are right. The honest "
-                "σ is a quarter of the interval, which allows for residuals that are not noise "
-                "and for recordings that disagree, but not for the bias of a wrong model."
+                "The formal σ is the true accuracy only if the model and the noise are right. The "
+                "honest σ is a quarter of the width of the 95 % interval, which allows for "
+                "residuals that are not white noise and for recordings that disagree, but not "
+                "for the bias of a wrong model."
             ),
             emphasis=Emphasis.WEAK,
         )
@@ -421,14 +425,15 @@ def _prediction_table(predictions: Sequence[Prediction]) -> SummaryTable:
     return SummaryTable(
         key="predictions",
         title=(
-            "Prediction of data that were not fitted: rms error of the identified / the nominal "
-            "model"
+            "Prediction of recordings that were not fitted: rms error of the identified / of the "
+            "nominal model"
         ),
-        columns=columns("data", *(outputs[j] for j in shown), "ratio"),
+        columns=columns("recording", *(outputs[j] for j in shown), "ratio"),
         rows=tuple(rows),
         note=""
         if held_out
-        else "* predicted from a fit to the rest; --held-out keeps recordings out of the fit",
+        else "* predicted by a fit to the other recordings, but part of the final fit; "
+        "--held-out keeps a recording out of the final fit",
     )
 
 
@@ -457,8 +462,8 @@ def describe_logs(logs: Sequence[LogSummary]) -> Summary:
     ]
     clocks = SummaryTable(
         key="clocks",
-        title="Logs as they were read",
-        columns=columns("log", "rows", "time", "rate", "jitter", "longest gap", "left out"),
+        title="Logs that were read",
+        columns=columns("log", "rows", "time", "rate", "jitter", "longest gap", "rejected"),
         rows=tuple(rows),
     )
 
@@ -469,7 +474,7 @@ def describe_logs(logs: Sequence[LogSummary]) -> Summary:
             by_name.setdefault(column.name, []).append(column)
     ranges = SummaryTable(
         key="ranges",
-        title="Range of their columns (all logs)",
+        title="Range of each column over all logs",
         columns=columns(
             "column", "from", "smallest", "largest", "resolution", "empty", left=["from"]
         ),
@@ -642,11 +647,11 @@ def describe_check(check: Check) -> Summary:
 
     for title, groups in (
         (
-            "Identifiable in combination only, with this control and with random ones from the "
-            "initial state",
+            "Identifiable only in combination, with this control and with random controls from "
+            "this initial state",
             check.not_separable,
         ),
-        ("Not excited here; another control would show", check.not_excited),
+        ("Not excited by this control, but by another one", check.not_excited),
     ):
         if groups:
             items = tuple(_group_lines(group, check) for group in groups)
@@ -693,7 +698,7 @@ def _check_row(row: ParameterCheck) -> Row:
 
 
 def _group_lines(group: ParameterGroup, check: Check) -> str:
-    """Return a group's members, and a line per combination with its value and its σ."""
+    """Return the members of a group, and a line per combination with its value and its σ."""
     if not group.combinations:
         return str(group)
 
@@ -722,8 +727,8 @@ def _self_test_sentence(check: Check) -> str:
     passed = "passed" if test.passed else "FAILED"
     agreement = "agree" if test.roughness is None else "disagree"
     return (
-        f"derivative self-test {passed}: psi recursion {test.recursion:.1e}, slope "
-        f"{test.slope:.1e}, two steps {agreement}"
+        f"derivative self-test {passed}: relative error of psi {test.recursion:.1e}, of the slope "
+        f"{test.slope:.1e}; two step sizes {agreement}"
     )
 
 
@@ -749,8 +754,8 @@ def describe_comparison(comparison: Comparison) -> Summary:
             parts.append(Paragraph(text=f"{row.title}: {'; '.join(remarks)}"))
 
     legend = (
-        "worst σ: of the worst combination of parameters, relative to their scales; "
-        "worst margin: over half of the range of its limit."
+        "worst σ: standard deviation of the worst combination of parameters, relative to their "
+        "scales; worst margin: smallest margin of all limits, in percent of half of the range."
     )
     parts.append(Paragraph(text=f"{legend} {BEST_CASE}", emphasis=Emphasis.WEAK))
     emphasis = Emphasis.STRONG if comparison.ok else Emphasis.STRONG_WARNING
@@ -775,7 +780,7 @@ def _method_table(comparison: Comparison) -> SummaryTable:
     headings = ["method"]
     if comparison.weighted:
         headings.append("J")
-    headings += [f"φ ({comparison.criterion})", "J over design's", "worst σ"]
+    headings += [f"φ ({comparison.criterion})", "J against design", "worst σ"]
     headings += ["time", "steps", "worst margin"]
     return SummaryTable(
         key="methods",
@@ -867,7 +872,7 @@ def describe_robustness(result: Robustness) -> Summary:
     """
     sentences = [Paragraph(text=f"• {sentence}") for sentence in robustness_sentences(result)]
     return Summary(
-        title="The design on robots that differ from the model",
+        title="A design played on robots that differ from the model",
         outcome="",
         parts=(_unknown_table(result), _limit_table(result), *sentences),
     )
@@ -894,14 +899,14 @@ def _unknown_table(result: Robustness) -> SummaryTable:
 
     return SummaryTable(
         key="unknowns",
-        title=f"Does information arrive? {result.runs} robots, each identified from the guess",
+        title=f"Accuracy of {result.runs} robots, each identified from the guess",
         columns=columns(
             "unknown",
-            "wrong by",
-            "sigma predicted",
-            "sigma stated",
-            "error, rms",
-            f"inside 95 % of {result.runs}",
+            "error of guess",
+            "σ predicted",
+            "σ formal",
+            "rms error",
+            f"in 95 % interval, of {result.runs}",
         ),
         rows=tuple(rows),
     )
@@ -930,15 +935,15 @@ def _limit_table(result: Robustness) -> SummaryTable:
 
     return SummaryTable(
         key="limits",
-        title="Do limits hold? Margins in percent of half of each range; negative: outside",
+        title="Margins of the limits, in percent of half of each range; negative: exceeded",
         columns=columns(
             "limit",
-            "tightest of",
+            "tightest",
             "planned",
             "worst robot",
-            "taken at most",
+            "largest loss",
             "robots that keep it",
-            left=["tightest of"],
+            left=["tightest"],
         ),
         rows=tuple(rows),
     )
@@ -951,38 +956,54 @@ def robustness_sentences(result: Robustness) -> Iterator[str]:
         result: The study.
 
     Yields:
-        Sentences: on the intervals, on fits in doubt, on the limits, and on the reserve that a
+        Sentences on the intervals, on doubtful fits, on the limits, and on the reserve that a
         design needs.
     """
+    yield from _coverage_sentences(result)
+    for sentence, count in result.troubles.items():
+        yield f"{count} of {result.runs} runs: {sentence}"
+    yield from _limit_sentences(result)
+
+    reserve = result.reserve()
+    if reserve:
+        needed = " ".join(f"{kind}={share:g}" for kind, share in reserve.items())
+        yield (
+            "such robots keep the limits if the design stays away from them by these shares of "
+            f"half of each range: {needed} (make such a design with --reserve {needed})"
+        )
+
+
+def _coverage_sentences(result: Robustness) -> Iterator[str]:
+    """Yield sentences on the intervals and on the fits."""
     n = result.runs
     low, high = (int(k) for k in binom.interval(0.99, n, CONFIDENCE))
     inside = result.inside[result.identified]
     stated, every = result.joint
     yield (
         f"95 % intervals hold the true value in {inside.min(initial=n)} to {inside.max(initial=0)} "
-        f"of {n} runs (chance alone: {low} to {high}); joint region of the experiment's parameters "
-        f"in {stated}, of all unknowns in {every}; chi2 / dof {result.fit:.3f}, {result.misfits} "
-        f"misfits, {result.restarted} searches begun again"
+        f"of {n} runs (expected by chance: {low} to {high})"
     )
-    for sentence, count in result.troubles.items():
-        yield f"{count} of {n} runs: {sentence}"
+    yield (
+        f"joint 95 % regions hold the true values of the experiment's parameters in {stated}, and "
+        f"of all unknowns in {every} of {n} runs"
+    )
+    yield (
+        f"fits: mean chi2 / dof {result.fit:.3f}, {result.misfits} misfits, {result.restarted} "
+        "repeated from other initial guesses"
+    )
 
-    yield f"all limits hold at every engine step on {result.all_kept} of {n} robots"
+
+def _limit_sentences(result: Robustness) -> Iterator[str]:
+    """Yield how many robots keep all limits, and a sentence for every limit that some do not."""
+    yield f"{result.all_kept} of {result.runs} robots keep all limits at every engine step"
+
     worst = result.margins.min(axis=0)
     missed = ~result.kept.all(axis=0)
     for i in np.flatnonzero(missed).tolist():
         limit = result.limits[i]
         excess = -worst[i] * limit.scale
-        manner = f"exceeded by up to {excess:.3g}" if excess > 0.0 else "clamped"
+        manner = f"exceeded by up to {excess:.3g}" if excess > 0.0 else "reached and clamped"
         yield f"{limit.kind} of {limit.name} is {manner}"
-
-    reserve = result.reserve()
-    if reserve:
-        needed = " ".join(f"{kind}={share:g}" for kind, share in reserve.items())
-        yield (
-            "reserve that a design needs so that such robots keep the limits, in shares of half "
-            f"ranges: {needed} (make such a design with --reserve {needed})"
-        )
 
 
 # ---- campaigns
@@ -996,30 +1017,41 @@ def describe_campaign(campaign: Campaign, parameters: ParameterSet, *, simulated
         parameters: The parameters of the experiment.
         simulated: True where the recordings were simulated at the true values.
     """
-    rows = []
-    estimate = campaign.estimate
-    indices = parameters.interest.tolist() if estimate is not None else []
-    for j in indices:
-        if estimate is None:
-            break
-        theta, std = float(estimate.theta[j]), float(estimate.std[j])
-        aim = float(campaign.wanted[j])
-        cells = [
-            estimate.parameters[j],
-            f"{parameters.guess[j]:.5g}",
-            f"{theta:.5g}",
-            f"{std:.2g}",
-            f"{aim:.2g}" if np.isfinite(aim) else "-",
-        ]
-        if simulated:
-            cells.append(f"{(theta - parameters.true[j]) / std:+.1f} σ")
-        emphasis = Emphasis.NORMAL if std <= aim else Emphasis.WARNING
-        rows.append(Row(cells=tuple(cells), emphasis=emphasis))
-
     headings = ["parameter", "guess", "estimate", "formal σ", "wanted σ"]
     if simulated:
-        headings.append("off by")
+        headings.append("error")
+
+    rows = []
+    if campaign.estimate is not None:
+        for j in parameters.interest.tolist():
+            true = float(parameters.true[j]) if simulated else None
+            rows.append(_campaign_row(campaign, campaign.estimate, parameters, j=j, true=true))
+
     table = SummaryTable(
         key="campaign", title=str(campaign), columns=columns(*headings), rows=tuple(rows)
     )
     return Summary(title="Campaign", outcome="", parts=(table,))
+
+
+def _campaign_row(
+    campaign: Campaign,
+    estimate: Estimate,
+    parameters: ParameterSet,
+    *,
+    j: int,
+    true: float | None,
+) -> Row:
+    """Return the row of parameter j; `true` is its true value, None if that is not known."""
+    value, std = float(estimate.theta[j]), float(estimate.std[j])
+    wanted = float(campaign.wanted[j])
+    cells = [
+        estimate.parameters[j],
+        f"{parameters.guess[j]:.5g}",
+        f"{value:.5g}",
+        f"{std:.2g}",
+        f"{wanted:.2g}" if np.isfinite(wanted) else "-",
+    ]
+    if true is not None:
+        cells.append(f"{(value - true) / std:+.1f} σ")
+    emphasis = Emphasis.NORMAL if std <= wanted else Emphasis.WARNING
+    return Row(cells=tuple(cells), emphasis=emphasis)

@@ -1,6 +1,4 @@
-"""Export to mujoco.sysid: sysid and mjfim simulate, compare and weigh alike, so they find the same
-values.
-"""
+"""Export to mujoco.sysid: with equal models, data and weights sysid and mjfim find equal values."""
 
 from __future__ import annotations
 
@@ -36,12 +34,12 @@ installed = pytest.mark.skipif(
 
 
 def cart(**tables: Any) -> DesignTask:
-    """The cart-pendulum of the models. tables: replaced as a whole"""
+    """The cart-pendulum of the models, with some tables of its experiment replaced."""
     return DesignTask.resolve(Experiment.from_file(CART).model_copy(update=tables))
 
 
 def noiseless(task: DesignTask, theta: Array | None = None) -> Recording:
-    """Of the initial control, at the true values."""
+    """Outputs of the initial control without noise, at the true values."""
     values = task.parameters.true if theta is None else theta
     y, _ = task.plant.measure(values[None], task.control)
     return Recording(
@@ -53,7 +51,7 @@ def noiseless(task: DesignTask, theta: Array | None = None) -> Recording:
 
 
 def residual(exported: Any, theta: Array, weighted: bool) -> Array:
-    """All in one row."""
+    """All residuals in one row."""
     found, _, _ = exported.residual(weighted)(theta, exported.parameters.copy())
     return np.concatenate(found)
 
@@ -92,7 +90,7 @@ def test_states_are_compared_as_sysid_does_and_sensors_without_its_lag() -> None
 
 
 def coarse(folder: Path) -> tuple[DesignTask, Recording]:
-    """Two engine steps a sample, velocities measured every other one."""
+    """Two engine steps per sample; velocities are measured at every second sample."""
     noise = {**UNEQUAL, "qvel:slide": {"sigma": 0.005, "rate": 25.0}}
     values = Experiment.from_file(CART).model_dump(exclude_unset=True) | {
         "rate": 50.0,
@@ -144,7 +142,7 @@ CASES = {
 @installed
 @pytest.mark.parametrize("case", CASES)
 def test_sysid_gets_the_same_model_data_and_weights(case: str, tmp_path: Path) -> None:
-    """Whitened residuals away from the guess, and what the MjSpec compiles to there."""
+    """Whitened residuals and the compiled MjSpec agree at parameters near the guess."""
     task, recording = CASES[case](tmp_path)
     exported, p = export(task.system, [recording]), task.parameters
     theta = np.clip(p.guess + 0.02 * p.magnitude * np.cos(np.arange(len(p))), p.lower, p.upper)
@@ -183,8 +181,8 @@ def test_times_off_the_grid_are_read_between_the_steps() -> None:
 
 
 @installed
-def test_the_report_draws_components_and_what_is_measured_now_and_then(tmp_path: Path) -> None:
-    """sysid's own report counts signals where it draws their components."""
+def test_the_report_draws_components_and_outputs_of_a_low_rate(tmp_path: Path) -> None:
+    """The report of sysid indexes signals although it draws their components."""
     task, recording = whole(tmp_path)
     exported = export(task.system, [recording])
     assert "tip[2]" in report(exported, fit_with_sysid(exported, weighted=True))
@@ -206,10 +204,10 @@ def test_the_report_draws_components_and_what_is_measured_now_and_then(tmp_path:
 
 
 @installed
-def test_the_command_compares_both_and_leaves_the_report(
+def test_the_command_compares_both_and_writes_the_report(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Unequal sensors: weighted, sysid finds what mjfim finds; as is, it is several sigmas off."""
+    """With unequal noise the weighted fit agrees with mjfim; the unweighted one does not."""
     task = cart(noise=UNEQUAL)
     text = CART.read_text(encoding="utf-8").replace(
         "state = 0.05", "\n".join(f'"{k}" = {v}' for k, v in UNEQUAL.items())
@@ -225,7 +223,7 @@ def test_the_command_compares_both_and_leaves_the_report(
     shown = run("export-sysid", experiment, *files, "-o", tmp_path / "out")
     assert shown.exit_code == 0, shown.stderr
     assert not shown.stderr and capfd.readouterr() == ("", ""), "messages of sysid"
-    assert "The same data, two estimators" in shown.stdout and "iter:" not in shown.stdout
+    assert "Estimates from these recordings" in shown.stdout and "iter:" not in shown.stdout
     found = json.loads((tmp_path / "out" / "comparison.json").read_text(encoding="utf-8"))
     assert (
         found["parameters"] == ["m", "l", "c"]
@@ -252,7 +250,7 @@ def test_the_command_compares_both_and_leaves_the_report(
     [
         ({"nuisance": {"initial": 0.1}}, "numbers of the model only"),
         ({"nuisance": {"delay": 0.01}}, "delay: sysid fits"),
-        ({"fit": {"segments": 1.0}}, "every start as stated"),
+        ({"fit": {"segments": 1.0}}, "stated initial state only"),
     ],
 )
 def test_what_sysid_cannot_fit_is_refused(tables: dict[str, Any], said: str) -> None:

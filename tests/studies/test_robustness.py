@@ -552,7 +552,7 @@ def test_the_verb_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: 
     assert found["runs"] == 6 and len(found["parameters"]) == 5
     assert found["conditions"]["latency"] == 0.005
     assert {row["kind"] for row in found["limits"]} == {"velocity", "control"}
-    assert "Does information arrive? 6 robots" in done.stdout
+    assert "Accuracy of 6 robots" in done.stdout
 
     loaded = Robustness.load(tmp_path / "out")
     assert loaded.summary()["limits"] == found["limits"]

@@ -1,1 +1,1 @@
-"""Recordings and parameters for `mujoco.sysid`, and both estimators on the same data."""
+"""Recordings and parameters for `mujoco.sysid`, and a comparison of its fits with mjfim's."""

@@ -1,4 +1,4 @@
-"""Fits by `mujoco.sysid` beside the estimate of mjfim, on the same recordings.
+"""Fits of recordings by `mujoco.sysid`, beside the estimate of mjfim.
 
 sysid fits twice: weighted by the noise that the experiment states, and unweighted, where each
 signal counts relative to the norm of its measured values.
@@ -36,9 +36,9 @@ class SysidFit:
 
     Attributes:
         theta: (p,) parameters [theta-unit].
-        chi2: Sum of squared residuals there, whitened by the stated noise.
-        seconds: Time that it took [s].
-        status: Last message of sysid.
+        chi2: Sum of squared residuals at theta, whitened by the stated noise.
+        seconds: Time of the fit [s].
+        status: Last message of sysid about the end of the fit.
         parameters: `ParameterDict` at the optimum, for the report.
         result: `OptimizeResult`, for the report.
     """
@@ -53,7 +53,7 @@ class SysidFit:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SysidComparison:
-    """Both estimators on the same recordings.
+    """Estimates of mjfim and of sysid from one set of recordings.
 
     Attributes:
         exported: The experiment in the types of sysid.
@@ -216,11 +216,11 @@ def describe_sysid_comparison(comparison: SysidComparison) -> Summary:
 
     table = SummaryTable(
         key="estimators",
-        title="The same data, two estimators",
+        title="Estimates from these recordings by mjfim and by mujoco.sysid",
         columns=columns(
             "parameter",
             "true",
-            "start",
+            "guess",
             "mjfim",
             "formal σ",
             "95 % interval",

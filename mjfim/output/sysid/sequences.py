@@ -58,7 +58,7 @@ def silenced() -> Iterator[None]:
         logger.setLevel(before)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Exported:
     """An experiment in the form that `sysid.optimize` and `sysid.default_report` take.
 
@@ -83,28 +83,35 @@ class Exported:
             weighted: True for residuals that are whitened by the stated noise, followed by those of
                 the priors; False for the residuals of sysid, without priors.
         """
-        h, noise = (
-            float(self.system.model.opt.timestep),
-            self.system.noise if weighted else None,
+        comparison = WhitenedComparison(
+            layout=self.layout,
+            timestep=float(self.system.model.opt.timestep),
+            noise=self.system.noise if weighted else None,
         )
-        of: Callable[..., Any] = sysid.build_residual_fn
-        data = of(
+        residual_of_data: Callable[..., Any] = sysid.build_residual_fn(
             models_sequences=[self.sequences],
             build_model=build,
-            modify_residual=WhitenedComparison(self.layout, h, noise),
+            modify_residual=comparison,
             resample_true=False,
         )
-        p = self.system.parameters
-        weight = np.sqrt(np.diag(p.prior_information))
 
-        def whole(x: Array, parameters: Any, **options: Any) -> tuple[list[Array], Any, Any]:
-            residuals, predicted, measured = data(x, parameters, **options)
-            priors = (weight * (p.guess - x.T)).T[
-                weight > 0.0
-            ]  # x: (p,), or (p, k) for differences
-            return [*residuals, priors], predicted, measured
+        guess = self.system.parameters.guess
+        prior_weights = np.sqrt(np.diag(self.system.parameters.prior_information))
+        has_prior = prior_weights > 0.0
+        if not weighted or not has_prior.any():
+            return residual_of_data
 
-        return whole if weighted and weight.any() else data
+        def residual_with_priors(
+            theta: Array, parameters: Any, **options: Any
+        ) -> tuple[list[Array], Any, Any]:
+            """Return the residuals of the data and those of the priors, and both TimeSeries."""
+            residuals, predicted, measured = residual_of_data(theta, parameters, **options)
+
+            # theta is (p,), or (p, k) where sysid computes finite differences.
+            of_priors = (prior_weights * (guess - theta.T)).T[has_prior]
+            return [*residuals, of_priors], predicted, measured
+
+        return residual_with_priors
 
 
 def build(parameters: Any, spec: Any) -> Any:
@@ -128,43 +135,56 @@ def export(system: System, recordings: Sequence[Recording]) -> Exported:
         MjfimError: sysid cannot express the problem, or is not installed.
     """
     require_extra()
-    _require_alike(system)
-    parameters, layout, spec = (
-        parameters_of(system),
-        SignalLayout.of(system),
-        system.source.spec.copy(),
-    )
-    _require_followed(system, parameters, spec)
-    tracks = [align(system, recording) for recording in recordings]
-    nq, nv = system.model.nq, system.model.nv
-    start = system.plant.initial_state(system.parameters.guess)
-    state = sysid.create_initial_state(
-        system.model, start[:nq], start[nq : nq + nv], start[nq + nv :]
-    )
-    with silenced():  # it counts state signals among sensors
+    _check_expressible(system)
+
+    parameters = parameters_of(system)
+    layout = SignalLayout.of(system)
+    spec = system.source.spec.copy()
+    _check_parameters_take_effect(system, parameters, spec)
+
+    aligned = [align(system, recording) for recording in recordings]
+    controls = [control_of(system, recording) for recording in aligned]
+    outputs = [layout.series(recording.t, recording.y) for recording in aligned]
+
+    # sysid logs a warning, because it counts state signals among the sensors.
+    with silenced():
         sequences = sysid.ModelSequences(
             system.model_path.stem,
             spec,
-            [track.name for track in tracks],
-            [state] * len(tracks),
-            [control_of(system, track) for track in tracks],
-            [layout.series(track.t, track.y) for track in tracks],
+            [recording.name for recording in aligned],
+            [_initial_state(system)] * len(aligned),
+            controls,
+            outputs,
             allow_missing_sensors=True,
         )
-    return Exported(system, sequences, parameters, layout, _notes(system))
+    return Exported(
+        system=system,
+        sequences=sequences,
+        parameters=parameters,
+        layout=layout,
+        notes=_notes(system),
+    )
 
 
-def control_of(system: System, track: AlignedRecording) -> Any:
+def _initial_state(system: System) -> Any:
+    """Return the stated initial state, at the guess, in the form of sysid."""
+    state = system.plant.initial_state(system.parameters.guess)
+    nq, nv = system.model.nq, system.model.nv
+    qpos, qvel, act = state[:nq], state[nq : nq + nv], state[nq + nv :]
+    return sysid.create_initial_state(system.model, qpos, qvel, act)
+
+
+def control_of(system: System, recording: AlignedRecording) -> Any:
     """Return the control at every engine step as a TimeSeries, held over each sample.
-
-    sysid drops the last row; one more row makes it step past the end, so that the sensors there are
-    evaluated.
 
     Args:
         system: The experiment.
-        track: The recording on the grid of the experiment.
+        recording: The recording on the time grid of the experiment.
     """
-    steps = np.repeat(track.ctrl, system.grid.substeps, axis=0)
+    steps = np.repeat(recording.ctrl, system.grid.substeps, axis=0)
+
+    # sysid drops the last row. One more row makes it step past the end, so that the sensors at the
+    # end are evaluated.
     held = np.concatenate([steps, steps[-1:], steps[-1:]])
     t = np.arange(len(held)) * float(system.model.opt.timestep)
     return sysid.TimeSeries(t, held, sysid.TimeSeries.compute_all_control_mapping(system.model))
@@ -176,89 +196,107 @@ def parameters_of(system: System) -> Any:
     Args:
         system: The experiment.
     """
-    p, theta = system.parameters, np.array(system.parameters.guess)
-    paths = [ParameterPath.parse(target.path) for q in p.parameters for target in q.targets]
-    whole = any(path.field in FIELDS_WRITTEN_WHOLE for path in paths)
-
-    def modifier(j: int) -> Callable[[Any, Any], None]:
-        def write(spec: Any, parameter: Any) -> None:
-            theta[j] = float(parameter.value[0])
-            if j == len(p) - 1:
-                write_spec(
-                    spec,
-                    system.model,
-                    system.model_at(theta) if whole else system.model,
-                    p,
-                    theta,
-                )
-
-        return write
+    p = system.parameters
+    theta = np.array(p.guess)
+    modifiers = [_modifier(system, theta, j) for j in range(len(p))]
 
     lower = np.where(np.isfinite(p.lower), p.lower, p.guess - UNSTATED_BOUND * p.magnitude)
     upper = np.where(np.isfinite(p.upper), p.upper, p.guess + UNSTATED_BOUND * p.magnitude)
     found = sysid.ParameterDict()
     for j, name in enumerate(p.names):
-        found.add(sysid.Parameter(name, p.guess[j], lower[j], upper[j], modifier=modifier(j)))
+        parameter = sysid.Parameter(name, p.guess[j], lower[j], upper[j], modifier=modifiers[j])
+        found.add(parameter)
     return found
 
 
-def _require_alike(system: System) -> None:
-    """Raise ExperimentError where sysid could not fit the same problem."""
-    e, p = system.experiment, system.parameters
-    if p.outside_model.any():
-        name = p.names[int(np.argmax(p.outside_model))]
-        raise ExperimentError(
-            f"{e.source}: {name}: sysid fits numbers of the model only; take starts, biases, "
-            "delays out"
-        )
-    if e.fit.segments is not None or e.fit.start != "stated":
-        raise ExperimentError(
-            f"{e.source}: fit: sysid takes every start as stated; take segments and start out"
-        )
+def _modifier(system: System, theta: Array, j: int) -> Callable[[Any, Any], None]:
+    """Return the function with which sysid writes parameter j into a spec.
 
-
-def _require_followed(system: System, parameters: Any, spec: Any) -> None:
-    """Make sure that the compile of moved parameters is the model that mjfim simulates.
-
-    Raises ModelError.
+    Args:
+        system: The experiment.
+        theta: (p,) values that all modifiers share [theta-unit]; each one changes its entry.
+        j: Number of the parameter.
     """
-    p, moved = system.parameters, parameters.copy()
+    parameters = system.parameters
+    targets = [target for parameter in parameters.parameters for target in parameter.targets]
+    paths = [ParameterPath.parse(target.path) for target in targets]
+    needs_compiled = any(path.field in FIELDS_WRITTEN_WHOLE for path in paths)
+
+    def write(spec: Any, parameter: Any) -> None:
+        """Keep the value of parameter j; after the last parameter, write all values."""
+        theta[j] = float(parameter.value[0])
+        if j == len(parameters) - 1:
+            wanted = system.model_at(theta) if needs_compiled else system.model
+            write_spec(spec, system.model, wanted, parameters, theta)
+
+    return write
+
+
+def _check_expressible(system: System) -> None:
+    """Check that sysid can state this problem; raise ExperimentError if it cannot."""
+    experiment, parameters = system.experiment, system.parameters
+    if parameters.outside_model.any():
+        name = parameters.names[int(np.argmax(parameters.outside_model))]
+        raise ExperimentError(
+            f"{experiment.source}: {name}: sysid fits numbers of the model only; remove initial "
+            "states, biases and delays from the unknowns"
+        )
+
+    if experiment.fit.segments is not None or experiment.fit.start != "stated":
+        raise ExperimentError(
+            f"{experiment.source}: fit: sysid simulates from the stated initial state only; remove "
+            "`segments` and `start`"
+        )
+
+
+def _check_parameters_take_effect(system: System, parameters: Any, spec: Any) -> None:
+    """Check that a spec with other parameter values compiles to the model that mjfim simulates.
+
+    Numbers that the compiler derives are stated in the spec if this is necessary. Raises ModelError
+    if it does not help.
+    """
+    p = system.parameters
     theta = np.clip(p.guess + PROBE_STEP * p.magnitude, p.lower, p.upper)
-    moved.update_from_vector(theta)
-    for settled in (False, True):
-        if settled:
+    changed = parameters.copy()
+    changed.update_from_vector(theta)
+
+    for states_derived in (False, True):
+        if states_derived:
             state_derived_values(spec, system.model)
         try:
-            if same_dynamics(build(moved, spec), system.model_at(theta)):
+            if same_dynamics(build(changed, spec), system.model_at(theta)):
                 return
         except ValueError as error:
-            if settled:
+            if states_derived:
                 raise ModelError(
-                    f"{system.model_path}: MuJoCo refuses the parameters a little off: {error}"
+                    f"{system.model_path}: MuJoCo refuses parameter values near the guess: {error}"
                 ) from None
+
     raise ModelError(
-        f"{system.model_path}: a compile with other parameters gives another model than mjfim "
-        "simulates"
+        f"{system.model_path}: with other parameter values the MJCF compiles to a different model "
+        "from the one that mjfim simulates"
     )
 
 
 def _notes(system: System) -> tuple[str, ...]:
-    """Sentences about settings of the experiment that sysid does not take."""
+    """Return sentences about settings of the experiment that sysid does not take."""
     fit, p = system.experiment.fit, system.parameters
-    with_prior = [q.name for q in p.parameters if q.prior is not None]
-    unbounded = [
-        n
-        for n, low, high in zip(p.names, p.lower, p.upper, strict=True)
-        if not np.isfinite(high - low)
-    ]
-    notes = [f"sysid without weights gets no priors: {', '.join(with_prior)}"] if with_prior else []
+    notes = []
+
+    with_prior = [parameter.name for parameter in p.parameters if parameter.prior is not None]
+    if with_prior:
+        notes.append(f"the unweighted fit by sysid ignores the priors of {', '.join(with_prior)}")
+
+    is_bounded = np.isfinite(p.upper - p.lower)
+    unbounded = [name for name, bounded in zip(p.names, is_bounded, strict=True) if not bounded]
     if unbounded:
         notes.append(
-            f"sysid wants bounds: {', '.join(unbounded)} within {UNSTATED_BOUND:g} sizes of the "
-            "guess"
+            f"sysid needs finite bounds: {', '.join(unbounded)} may differ from the guess by "
+            f"{UNSTATED_BOUND:g} parameter sizes"
         )
+
     if fit.loss != "linear":
-        notes.append(f"sysid minimises squares, mjfim the loss {fit.loss!r}")
+        notes.append(f"sysid minimises squared residuals, mjfim the loss {fit.loss!r}")
     if fit.noise != "stated":
         notes.append("sysid is weighted by the stated noise, mjfim by the noise that it estimates")
     return tuple(notes)

@@ -1,16 +1,17 @@
 """Outputs of an experiment as signals of `mujoco.sysid`, and their residuals.
 
-sysid stamps the sensor values of a step with the time after the step, though they belong to the
-state before it; states are not delayed. So positions and velocities become state signals, and
+sysid gives the sensor values of a step the time after the step, although they belong to the state
+before it; states are not delayed. Therefore positions and velocities become state signals, and
 sensors are read one step earlier. sysid divides residuals by the norm of each measured signal,
 whatever its noise, and takes weights by name for sensors only; here residuals are whitened, or
-divided in the manner of sysid.
+divided by these norms.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from mujoco import sysid
@@ -20,29 +21,40 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Output
 
 # Largest distance of a time from an engine step at which it counts as on that step [engine steps].
 ON_STEP_TOLERANCE = 1e-6
 
+# Names that sysid gives to the state of joints without a name.
+UNNAMED_SIGNALS = ("_qpos", "_qvel")
 
-@dataclass(frozen=True, eq=False)
+
+# Type of a signal in sysid and its indices in sensordata or in the state, by name.
+SignalMapping = dict[str, tuple[Any, np.ndarray]]
+
+# Whether a column belongs to a sensor, and its index in sensordata or in the state.
+Place = tuple[bool, int]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SignalLayout:
     """Columns of a sysid TimeSeries that holds the outputs of an experiment.
 
     Attributes:
         mapping: Type and columns of each signal by name, in the form that sysid takes.
         sensed: (c,) True for columns of sensors.
-        source: (c,) place of each column in sensordata or in the state (qpos, qvel, act).
+        source: (c,) index of each column in sensordata or in the state (qpos, qvel, act).
         outputs: (ny,) column of each output of the experiment.
         shown: Type and column of each of the ny outputs by name; sysid's report can draw single
             components only.
     """
 
-    mapping: dict[str, tuple[Any, np.ndarray]]
+    mapping: SignalMapping
     sensed: np.ndarray
     source: np.ndarray
     outputs: np.ndarray
-    shown: dict[str, tuple[Any, np.ndarray]]
+    shown: SignalMapping
 
     @staticmethod
     def of(system: System) -> SignalLayout:
@@ -55,39 +67,28 @@ class SignalLayout:
             ExperimentError: An output belongs to a joint or body without a name.
         """
         qpos, qvel, act, _ = sysid.TimeSeries.compute_all_state_mappings(system.model)
-        wholes = {
-            False: qpos | qvel | act,
-            True: sysid.TimeSeries.compute_all_sensor_mapping(system.model),
-        }
-        mapping: dict[str, tuple[Any, np.ndarray]] = {}
-        columns: list[tuple[bool, int]] = []
-        sought = [
-            (o.sensor is not None, o.state if o.sensor is None else o.sensor)
-            for o in system.outputs.outputs
-        ]
-        for output, (sensed, place) in zip(system.outputs.outputs, sought, strict=True):
-            hits = [name for name, (_, indices) in wholes[sensed].items() if place in indices]
-            if not hits or hits[0] in ("_qpos", "_qvel"):
-                raise ExperimentError(
-                    f"output {output.name!r}: sysid goes by names; give joint and body one in the "
-                    "MJCF"
-                )
-            kind, indices = wholes[sensed][hits[0]]
-            if hits[0] not in mapping:
-                mapping[hits[0]] = (kind, np.arange(len(columns), len(columns) + len(indices)))
+        states = qpos | qvel | act
+        sensors = sysid.TimeSeries.compute_all_sensor_mapping(system.model)
+
+        # Every signal that has a measured component takes one column per component.
+        mapping: SignalMapping = {}
+        columns: list[Place] = []
+        places = [_place(output) for output in system.outputs.outputs]
+        for output, (sensed, index) in zip(system.outputs.outputs, places, strict=True):
+            signals = sensors if sensed else states
+            name = _signal_name(signals, index, output.name)
+            if name not in mapping:
+                kind, indices = signals[name]
+                mapping[name] = (kind, len(columns) + np.arange(len(indices)))
                 columns += [(sensed, int(i)) for i in indices]
-        at = np.array([columns.index(pair) for pair in sought], dtype=np.intp)  # type: ignore[arg-type]
-        labels = {
-            int(column): (name if len(indices) == 1 else f"{name}[{k}]", kind)
-            for name, (kind, indices) in mapping.items()
-            for k, column in enumerate(indices)
-        }
+
+        outputs = [columns.index(place) for place in places]
         return SignalLayout(
-            mapping,
-            np.array([sensed for sensed, _ in columns], dtype=bool),
-            np.array([place for _, place in columns], dtype=np.intp),
-            at,
-            {labels[c][0]: (labels[c][1], np.array([i])) for i, c in enumerate(at.tolist())},
+            mapping=mapping,
+            sensed=np.array([sensed for sensed, _ in columns], dtype=bool),
+            source=np.array([index for _, index in columns], dtype=np.intp),
+            outputs=np.array(outputs, dtype=np.intp),
+            shown=_single_signals(mapping, outputs),
         )
 
     def series(self, t: Array, y: Array) -> Any:
@@ -102,7 +103,38 @@ class SignalLayout:
         return sysid.TimeSeries(np.array(t), data, self.mapping)
 
 
-@dataclass(frozen=True, eq=False)
+def _place(output: Output) -> Place:
+    """Return where the value of an output comes from."""
+    if output.sensor is not None:
+        return True, output.sensor
+    return False, cast("int", output.state)
+
+
+def _signal_name(signals: SignalMapping, index: int, output: str) -> str:
+    """Return the name of the signal that holds an index; raise ExperimentError if it has none."""
+    for name, (_, indices) in signals.items():
+        if index in indices and name not in UNNAMED_SIGNALS:
+            return name
+    raise ExperimentError(
+        f"output {output!r}: sysid finds signals by name; name the joint and the body in the MJCF"
+    )
+
+
+def _single_signals(mapping: SignalMapping, outputs: Sequence[int]) -> SignalMapping:
+    """Return a signal of one component for each of the columns `outputs`, in their order."""
+    names: dict[int, tuple[str, Any]] = {}
+    for name, (kind, columns) in mapping.items():
+        for k, column in enumerate(columns):
+            names[int(column)] = (name if len(columns) == 1 else f"{name}[{k}]", kind)
+
+    single: SignalMapping = {}
+    for i, column in enumerate(outputs):
+        name, kind = names[column]
+        single[name] = (kind, np.array([i]))
+    return single
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class WhitenedComparison:
     """Residuals of measured and predicted outputs, in the form of `modify_residual` of sysid.
 
@@ -137,27 +169,43 @@ class WhitenedComparison:
             everything: True where the TimeSeries are to be drawn.
             state: States of the rollout, with the time in the first column.
         """
-        layout, later = self.layout, measured.times > 0.0
-        t, seen = measured.times[later], measured.data[later]
-        y = np.empty(seen.shape)
-        for sensed, values, first in ((False, state[:, 1:], 1), (True, predicted.data, 0)):
-            chosen = layout.sensed == sensed
-            if chosen.any():
-                y[:, chosen] = interpolated(
-                    values[:, layout.source[chosen]], t / self.timestep - first
-                )
-        seen, y = seen[:, layout.outputs], y[:, layout.outputs]
-        present = np.isfinite(seen)
-        drawn = bridged(t, seen) if everything else seen
-        pair = (sysid.TimeSeries(t, y, layout.shown), sysid.TimeSeries(t, drawn, layout.shown))
-        r = np.where(present, seen - y, 0.0)
+        after_start = measured.times > 0.0
+        t = measured.times[after_start]
+        y = measured.data[after_start][:, self.layout.outputs]
+        y_predicted = self._predicted_outputs(predicted.data, state, t)
+        present = np.isfinite(y)
+
+        shown = self.layout.shown
+        drawn = interpolate_gaps(t, y) if everything else y
+        pair = (sysid.TimeSeries(t, y_predicted, shown), sysid.TimeSeries(t, drawn, shown))
+
+        residual = np.where(present, y - y_predicted, 0.0)
         if self.noise is not None:
-            return self.noise.whiten_present(r, present), *pair
-        with np.errstate(invalid="ignore"):  # of what a recording does not hold
-            return sysid.normalize_residual(r, np.where(present, seen, 0.0))[present], *pair
+            return self.noise.whiten_present(residual, present), *pair
+
+        # The norm of a signal that was not measured is 0; its residuals are left out.
+        with np.errstate(invalid="ignore"):
+            normalized = sysid.normalize_residual(residual, np.where(present, y, 0.0))
+        return normalized[present], *pair
+
+    def _predicted_outputs(self, sensors: Array, state: Array, t: Array) -> Array:
+        """Return the (M, ny) predicted outputs [y-unit] at the times t (M,) [s].
+
+        Args:
+            sensors: (n, nsensordata) sensor values; row 0 belongs to the time 0.
+            state: (n, 1 + nx) time and state after every engine step; row 0 is after the first.
+            t: (M,) times [s].
+        """
+        columns = np.empty((len(t), len(self.layout.source)))
+        for sensed, values, first_step in ((False, state[:, 1:], 1), (True, sensors, 0)):
+            chosen = self.layout.sensed == sensed
+            if chosen.any():
+                rows = t / self.timestep - first_step
+                columns[:, chosen] = interpolated(values[:, self.layout.source[chosen]], rows)
+        return columns[:, self.layout.outputs]
 
 
-def bridged(t: Array, y: Array) -> Array:
+def interpolate_gaps(t: Array, y: Array) -> Array:
     """Fill gaps of measured outputs linearly; a curve through single samples could not be seen.
 
     Args:
@@ -166,20 +214,23 @@ def bridged(t: Array, y: Array) -> Array:
     """
     filled = np.array(y)
     for column in filled.T:
-        seen = np.isfinite(column)
-        if seen.any():
-            column[~seen] = np.interp(t[~seen], t[seen], column[seen])
+        known = np.isfinite(column)
+        if known.any():
+            column[~known] = np.interp(t[~known], t[known], column[known])
     return filled
 
 
-def interpolated(values: Array, place: Array) -> Array:
-    """Return rows of values between the engine steps by a cubic spline.
+def interpolated(values: Array, rows: Array) -> Array:
+    """Return values at whole engine steps, and between them by a cubic spline.
 
     Args:
         values: (n, c) values at the engine steps.
-        place: (M,) engine steps, which need not be whole numbers.
+        rows: (M,) numbers of the rows, which need not be whole.
+
+    Returns:
+        (M, c) values.
     """
-    near = np.rint(place)
-    if np.abs(place - near).max() <= ON_STEP_TOLERANCE:
-        return np.asarray(values[near.astype(int)])
-    return np.asarray(CubicSpline(np.arange(len(values)), values)(place))
+    nearest = np.rint(rows)
+    if np.abs(rows - nearest).max() <= ON_STEP_TOLERANCE:
+        return np.asarray(values[nearest.astype(int)])
+    return np.asarray(CubicSpline(np.arange(len(values)), values)(rows))
