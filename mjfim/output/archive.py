@@ -32,7 +32,7 @@ PERIOD_TOLERANCE = 1e-6
 
 
 def write_design(folder: Path, design: Design, system: System) -> None:
-    """Write design.npz, design.csv, reference.csv and design.json, each whole or not at all.
+    """Write design.npz, design.csv, reference.csv and design.json, each complete or not at all.
 
     `Design.load` reads the design back. design.json names the experiment file, relative to the
     folder.
@@ -107,16 +107,16 @@ def write_recording(path: Path, recording: Recording, system: System) -> None:
 
 
 def read_design(path: Path) -> dict[str, Trajectory]:
-    """Read the trajectories of a design.npz, of any version of mjfim or made by another program.
+    """Read the trajectories of a design.npz.
 
-    `Design.load` reads the whole design.
+    The file may come from any version of mjfim or from another program. `Design.load` reads the
+    whole design.
 
     Args:
         path: The npz file.
 
     Returns:
-        The designed trajectory as `final`, and as `initial` the initial one where the file holds
-        it.
+        The designed trajectory as `final`, and the initial one as `initial` if the file holds it.
 
     Raises:
         RecordingError: The file cannot be read, lacks an array, or its arrays do not fit each
@@ -130,8 +130,10 @@ def read_design(path: Path) -> dict[str, Trajectory]:
         if not missing:
             found[name] = _trajectory(path, prefix, arrays)
         elif name == "final":
-            held = ", ".join((*TRAJECTORY_ARRAYS, "gain", "sensitivity"))
-            raise RecordingError(f"{path}: array {missing[0]!r} is missing; a design holds {held}")
+            expected = ", ".join((*TRAJECTORY_ARRAYS, "gain", "sensitivity"))
+            raise RecordingError(
+                f"{path}: array {missing[0]!r} is missing; a design holds {expected}"
+            )
     return found
 
 

@@ -44,7 +44,7 @@ class CampaignFolder:
         self.path = path
         self.system = system
 
-    # ---- what is there
+    # ---- contents of the folder
 
     def round(self, number: int) -> Path:
         """Return the folder of a round.
@@ -121,22 +121,22 @@ class CampaignFolder:
                 control=trajectory.ctrl,
             )
 
-    # ---- what is added
+    # ---- additions to the folder
 
     def add_recordings(self, files: Sequence[Path]) -> None:
-        """Copy recordings that are not in the folder yet to the round that waits for them.
+        """Copy new recordings to the first round that has a design but no recording.
 
         Args:
-            files: The recordings; those that are in the folder already are left out.
+            files: The recordings; those whose contents are in the folder already are not copied.
 
         Raises:
-            RecordingError: A recording cannot be read, or no round waits for it.
+            RecordingError: A recording cannot be read, or no round lacks a recording.
         """
         known: set[bytes] = set()
         for number in range(1, self.designed + 1):
             known.update(path.read_bytes() for path in self.recordings(number))
 
-        # Read all files first: none is copied where one is unusable.
+        # Read all files first, so that none is copied if one of them is unusable.
         for file in files:
             read_recording(file, self.system.channels)
 
@@ -144,9 +144,9 @@ class CampaignFolder:
         waiting = self.recorded + 1
         if new and waiting > self.designed:
             raise RecordingError(
-                f"{new[0]}: no design waits for a recording in {self.path}; repeat the call "
-                "without it to design the next round (is it a recording of an earlier one, "
-                "changed?)"
+                f"{new[0]}: every design in {self.path} has a recording already; repeat the call "
+                "without this file to design the next round (or is it a changed recording of an "
+                "earlier round?)"
             )
 
         for i, file in enumerate(new):
@@ -154,7 +154,7 @@ class CampaignFolder:
             shutil.copyfile(file, self.round(waiting) / name)
 
     def write_design(self, design: Design, number: int, system: System) -> None:
-        """Write the files of a round's design, among them those that the robot plays.
+        """Write the files of a round's design, which include those that the robot plays.
 
         Args:
             design: The design.

@@ -82,8 +82,8 @@ def test_the_terminal_and_markdown_show_the_same_numbers(task: DesignTask, desig
     for row in summary.table("accuracy").rows:
         for cell in row.cells:
             assert str(cell) in terminal and str(cell) in markdown
-    assert "Eigenvalues of the information" in markdown
-    assert "Eigenvalues of the information" not in terminal
+    assert "Eigenvalues of the Fisher information" in markdown
+    assert "Eigenvalues of the Fisher information" not in terminal
     assert design.status.value in terminal
 
 

@@ -15,6 +15,12 @@ from mjfim.records.campaign import Campaign
 # Largest number of parameters that are drawn; those with a target accuracy come first.
 MAX_PARAMETERS = 8
 
+# Characters to which the names of parameters and the title are shortened.
+PARAMETER_NAME_WIDTH, TITLE_WIDTH = 18, 100
+
+# Digits of the tick values of a logarithmic axis, from few to many ticks per decade.
+TICK_DIGITS = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8))
+
 
 def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: bool) -> Figure:
     """Draw standard deviation and estimate of each parameter over the rounds.
@@ -24,139 +30,156 @@ def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: 
         parameters: The parameters of the experiment.
         simulated: True where the true values are known.
     """
-    p = parameters
-    order = sorted(p.interest.tolist(), key=lambda j: not np.isfinite(campaign.wanted[j]))[
-        :MAX_PARAMETERS
-    ]
-    new = style.new_figure(9.0, 1.2 + 1.75 * len(order))
-    panels = new.subplots(len(order), 2, squeeze=False, sharex=True)
-    for row, j in enumerate(order):
-        last = row == len(order) - 1
-        unit = f" [{p.parameters[j].unit}]" if p.parameters[j].unit else ""
-        _draw_std(panels[row, 0], campaign, j)
-        _draw_estimate(panels[row, 1], campaign, j, float(p.true[j]) if simulated else None)
-        name = style.shorten(p.names[j], 18)
-        style.format_axes(panels[row, 0], "round" if last else "", f"σ of {name}{unit}")
-        style.format_axes(panels[row, 1], "round" if last else "", f"{name}{unit}")
-        for axes in panels[row]:
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-            axes.set_xlim(0.5, max(len(campaign.rounds), 2) + 0.5)
+    shown = _shown_parameters(campaign, parameters)
+    figure = style.new_figure(9.0, 1.2 + 1.75 * len(shown))
+    panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
+    for (left, right), j in zip(panels, shown, strict=True):
+        name = style.shorten(parameters.names[j], PARAMETER_NAME_WIDTH)
+        unit = parameters.parameters[j].unit or "model unit"
+        style.format_axes(left, ylabel=f"σ of {name} [{unit}]")
+        style.format_axes(right, ylabel=f"{name} [{unit}]")
+
+        true = float(parameters.true[j]) if simulated else None
+        _draw_std(left, campaign, j)
+        _draw_estimate(right, campaign, j, true)
+
+    # The numbers of the rounds are on the shared horizontal axis.
+    panels[0, 0].xaxis.set_major_locator(MaxNLocator(integer=True))
+    panels[0, 0].set_xlim(0.5, max(len(campaign.rounds), 2) + 0.5)
     for column in (0, 1):
-        new.align_ylabels(panels[:, column])
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=style.INITIAL_COLOUR,
-            marker="o",
-            mfc="white",
-            linestyle="",
-            label="predicted before the round",
-        ),
-        Line2D(
-            [], [], color=style.OPTIMIZED_COLOUR, marker="o", label="after it, from all recordings"
-        ),
-        Line2D([], [], color=style.TEXT_COLOUR, linestyle="--", label="wanted"),
-    ]
-    if simulated:
-        handles.append(Line2D([], [], color=style.MEASURED_COLOUR, label="true"))
+        panels[-1, column].set_xlabel("round")
+        figure.align_ylabels(panels[:, column])
+
+    outcome = campaign.status.value.split(":")[0]
+    title = f"{len(campaign.rounds)} rounds of design, recording and estimate: {outcome}"
     note = (
-        "Bars and the last round's band: ± 1 and ± 2 formal σ, which are accuracy only if the "
-        "model and the noise are right."
+        "Bars, and the band of the last round: ± 1 and ± 2 formal σ, which are the true accuracy "
+        "only if the model and the noise are right."
     )
-    title = (
-        f"{len(campaign.rounds)} rounds of design, recording and estimate: "
-        f"{campaign.status.value.split(':')[0]}"
+    handles = _handles(simulated=simulated)
+    style.add_title(figure, style.shorten(title, TITLE_WIDTH), handles, note)
+    return figure
+
+
+def _shown_parameters(campaign: Campaign, parameters: ParameterSet) -> list[int]:
+    """Return the numbers of the parameters that are drawn, those with a target accuracy first."""
+    has_target = np.isfinite(campaign.wanted)
+    order = sorted(parameters.interest.tolist(), key=lambda j: not has_target[j])
+    return order[:MAX_PARAMETERS]
+
+
+def _handles(*, simulated: bool) -> list[Line2D]:
+    """Return the entries of the legend."""
+    predicted = Line2D(
+        [],
+        [],
+        color=style.INITIAL_COLOUR,
+        marker="o",
+        markerfacecolor="white",
+        linestyle="",
+        label="predicted before the round",
     )
-    style.add_title(new, style.shorten(title, 100), handles, note)
-    return new
+    estimated = Line2D(
+        [],
+        [],
+        color=style.OPTIMIZED_COLOUR,
+        marker="o",
+        label="estimated after the round, from all recordings",
+    )
+    wanted = Line2D([], [], color=style.TEXT_COLOUR, linestyle="--", label="wanted")
+    handles = [predicted, estimated, wanted]
+    if simulated:
+        handles.append(Line2D([], [], color=style.MEASURED_COLOUR, label="true value"))
+    return handles
 
 
 def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
     """Draw predicted and formal standard deviations of parameter j over the rounds."""
-    number = np.array([r.number for r in campaign.rounds])
+    rounds = np.array([r.number for r in campaign.rounds])
     predicted = np.array([r.predicted[j] for r in campaign.rounds])
-    after = np.array([r.attained[j] for r in campaign.rounds])
+    attained = np.array([r.attained[j] for r in campaign.rounds])
+    wanted = float(campaign.wanted[j])
+
     axes.set_yscale("log")
     axes.plot(
-        number,
+        rounds,
         predicted,
         color=style.INITIAL_COLOUR,
         marker="o",
-        mfc="white",
+        markerfacecolor="white",
         linestyle="",
         markersize=8,
         zorder=2,
     )
-    axes.plot(number, after, color=style.OPTIMIZED_COLOUR, marker="o", markersize=4, zorder=3)
-    aim = float(campaign.wanted[j])
-    values = np.concatenate([predicted, after, [aim]])
-    values = values[np.isfinite(values) & (values > 0.0)]
-    if len(values):
-        axes.set_ylim(values.min() / 1.5, values.max() * 1.5)
-    if np.isfinite(aim):
-        axes.axhline(aim, color=style.TEXT_COLOUR, linestyle="--", linewidth=1.0)
-        axes.axhspan(axes.get_ylim()[0], aim, color=style.TEXT_COLOUR, alpha=0.06, linewidth=0.0)
-        axes.text(
-            0.99,
-            aim,
-            style.format_number(aim, 2),
-            transform=axes.get_yaxis_transform(),
-            ha="right",
-            va="bottom",
-            fontsize=style.SMALL_FONT,
-            color=style.TEXT_COLOUR,
-        )
+    axes.plot(rounds, attained, color=style.OPTIMIZED_COLOUR, marker="o", markersize=4, zorder=3)
+
+    values = np.concatenate([predicted, attained, [wanted]])
+    usable = values[np.isfinite(values) & (values > 0.0)]
+    if len(usable):
+        axes.set_ylim(usable.min() / 1.5, usable.max() * 1.5)
+    if np.isfinite(wanted):
+        _draw_target(axes, wanted)
+
     low, high = axes.get_ylim()
     axes.set_yticks(_tick_values(low, high))
     axes.yaxis.set_major_formatter(lambda value, _: style.format_number(float(value), 1))
     axes.minorticks_off()
 
 
+def _draw_target(axes: Axes, wanted: float) -> None:
+    """Draw the wanted standard deviation as a line; the region below it is shaded."""
+    axes.axhline(wanted, color=style.TEXT_COLOUR, linestyle="--", linewidth=1.0)
+    axes.axhspan(axes.get_ylim()[0], wanted, color=style.TEXT_COLOUR, alpha=0.06, linewidth=0.0)
+    axes.text(
+        0.99,
+        wanted,
+        style.format_number(wanted, 2),
+        transform=axes.get_yaxis_transform(),
+        ha="right",
+        va="bottom",
+        fontsize=style.SMALL_FONT,
+        color=style.TEXT_COLOUR,
+    )
+
+
 def _tick_values(low: float, high: float) -> list[float]:
-    """Round numbers on a logarithmic axis, so dense that at least two lie within its limits."""
+    """Return round numbers on a logarithmic axis, so dense that at least two are within it."""
     powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    found: list[float] = []
-    for digits in ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8)):
-        every = np.sort(np.outer(powers, digits).ravel())
-        found = every[(every >= low) & (every <= high)].tolist()
-        if len(found) >= 2:
+    ticks: list[float] = []
+    for digits in TICK_DIGITS:
+        candidates = np.sort(np.outer(powers, digits).ravel())
+        within = (candidates >= low) & (candidates <= high)
+        ticks = candidates[within].tolist()
+        if len(ticks) >= 2:
             break
-    return found
+    return ticks
 
 
 def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -> None:
-    """Draw the estimates of parameter j over the rounds, with the true value where it is known."""
-    number = np.array([r.number for r in campaign.rounds])
+    """Draw the estimates of parameter j over the rounds, with the true value if it is known."""
+    rounds = np.array([r.number for r in campaign.rounds])
     theta = np.array([r.estimate.theta[j] for r in campaign.rounds])
     std = np.array([r.attained[j] for r in campaign.rounds])
     known = np.isfinite(std)
     bar = np.where(known, std, 0.0)
-    axes.errorbar(number, theta, 2 * bar, color=style.OPTIMIZED_COLOUR, linestyle="", linewidth=0.9)
+
+    colour = style.OPTIMIZED_COLOUR
+    axes.errorbar(rounds, theta, 2 * bar, color=colour, linestyle="", linewidth=0.9)
     axes.errorbar(
-        number,
-        theta,
-        bar,
-        color=style.OPTIMIZED_COLOUR,
-        linestyle="",
-        linewidth=2.4,
-        marker="o",
-        markersize=4,
+        rounds, theta, bar, color=colour, linestyle="", linewidth=2.4, marker="o", markersize=4
     )
     if known[-1]:
-        for times in (1, 2):
-            band = (theta[-1] - times * bar[-1], theta[-1] + times * bar[-1])
-            axes.axhspan(*band, color=style.OPTIMIZED_COLOUR, alpha=0.07, linewidth=0.0)
+        for factor in (1, 2):
+            low, high = theta[-1] - factor * bar[-1], theta[-1] + factor * bar[-1]
+            axes.axhspan(low, high, color=colour, alpha=0.07, linewidth=0.0)
     if true is not None:
         axes.axhline(true, color=style.MEASURED_COLOUR, linewidth=1.4)
+
     guess = float(campaign.rounds[0].theta[j])
-    axes.text(
-        0.99,
-        0.97,
-        f"first design at {style.format_number(guess, 4)}",
-        transform=axes.transAxes,
-        ha="right",
-        va="top",
+    axes.set_title(
+        f"the first design assumes {style.format_number(guess, 4)}",
+        loc="right",
         fontsize=style.SMALL_FONT,
         color=style.MUTED_COLOUR,
+        pad=3,
     )

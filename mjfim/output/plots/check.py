@@ -72,7 +72,7 @@ def check_figure(check: Check) -> Figure:
             label="not identifiable alone",
         ),
     ]
-    verdict = "identifiable" if check.ok else "see the verdict in check.json"
+    verdict = "all parameters identifiable" if check.ok else "see the verdict in check.json"
     title = f"Accuracy that {check.source} ({check.horizon:g} s) can give: {verdict}"
     add_title(figure, title, handles, BEST_CASE)
     return figure
@@ -170,9 +170,9 @@ def _draw_correlations(axes: Axes, check: Check) -> None:
     _add_colour_bar(axes, image)
 
     mark = "bold" if len(names) <= MAX_WRITTEN_CELLS else "dots"
-    title = f"{mark}: |correlation| > {CONFOUNDED_CORRELATION:g}, hardly distinguishable"
+    title = f"correlations; {mark}: above {CONFOUNDED_CORRELATION:g}, hardly distinguishable"
     if np.isnan(correlation).any():
-        title += "; grey: not alone"
+        title += "; grey: not identifiable alone"
     axes.set_title(title, fontsize=SMALL_FONT, color=MUTED_COLOUR)
 
 
@@ -208,9 +208,12 @@ def _write_correlations(axes: Axes, correlation: Array) -> None:
 
 def _mark_confounded(axes: Axes, correlation: Array) -> None:
     """Draw a dot into each cell of `correlation` (n, n) with hardly distinguishable parameters."""
-    for (i, j), value in np.ndenumerate(correlation):
-        if i != j and np.isfinite(value) and abs(value) > CONFOUNDED_CORRELATION:
-            axes.plot(j, i, marker="o", color=TEXT_COLOUR, markersize=2.0)
+    # Comparisons with NaN are false.
+    confounded = np.abs(correlation) > CONFOUNDED_CORRELATION
+    np.fill_diagonal(confounded, False)
+
+    rows, columns = np.nonzero(confounded)
+    axes.plot(columns, rows, linestyle="", marker="o", color=TEXT_COLOUR, markersize=2.0)
 
 
 def _add_colour_bar(axes: Axes, image: AxesImage) -> None:

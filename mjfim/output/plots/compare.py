@@ -75,7 +75,7 @@ def compare_figure(comparison: Comparison) -> Figure:
 
     note = (
         f"{' '.join(comparison.verdict)} Each method had {budget_in_words(comparison)}. "
-        "Predicted standard deviations are a best case."
+        "Predicted standard deviations are the best case."
     )
     add_title(figure, "The design compared with other methods", _handles(comparison), note)
     return figure
@@ -146,10 +146,10 @@ def _ratios(comparison: Comparison) -> _Ratios | None:
     against_design = design is not None and bool(np.isfinite(design.std[wanted]).any())
 
     reference = comparison.scale[wanted]
-    title = "σ of each parameter over its scale"
+    title = "σ of each parameter, divided by its scale"
     if design is not None and against_design:
         reference = design.std[wanted]
-        title = "σ of each parameter over the design's"
+        title = "σ of each parameter, divided by that of the design"
 
     std = np.array([row.std[wanted] for row in comparison.rows])
     values = std.reshape(len(comparison.rows), len(wanted)) / reference
@@ -212,11 +212,15 @@ def _name_parameters(axes: Axes, comparison: Comparison) -> None:
 
 def _name_methods(axes: Axes, comparison: Comparison) -> None:
     """Write the names of the methods beside the cells, each in its colour."""
-    titles = [shorten(row.title, METHOD_NAME_WIDTH) for row in comparison.rows]
-    axes.set_yticks(range(len(titles)), titles, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
-    for label, row in zip(axes.get_yticklabels(), comparison.rows, strict=True):
-        label.set_color(_method_colour(comparison, row) if row.sound else MUTED_COLOUR)
-        label.set_fontweight("bold" if row.method == DESIGN else "normal")
+    rows = comparison.rows
+    titles = [shorten(row.title, METHOD_NAME_WIDTH) for row in rows]
+    axes.set_yticks(range(len(rows)), titles, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
+
+    for label, row in zip(axes.get_yticklabels(), rows, strict=True):
+        colour = _method_colour(comparison, row) if row.sound else MUTED_COLOUR
+        label.set_color(colour)
+        if row.method == DESIGN:
+            label.set_fontweight("bold")
 
 
 def _add_colour_bar(axes: Axes, image: AxesImage, ratios: _Ratios) -> None:
@@ -256,11 +260,11 @@ def _draw_worst_combination(axes: Axes, comparison: Comparison) -> None:
     worst = np.array([row.worst_relative_std for row in rows])
     known = worst[np.isfinite(worst)]
 
-    format_axes(axes, "standard deviation, relative to the parameters' scales [–]")
+    format_axes(axes, "standard deviation relative to the parameters' scales [–]")
     axes.grid(False, axis="y")
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_yticks([])
-    title = "σ of the worst combination, and the worst margin of all limits"
+    title = "σ of the worst combination, and smallest margin of all limits"
     axes.set_title(title, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
     if not len(known):
         write_message(axes, "no method found a usable control")

@@ -115,7 +115,9 @@ def trajectories(design: Design, labels: Labels) -> Figure:
         "λ_min: smallest eigenvalue of the Fisher information per measurement rate, "
         "accumulated up to time t."
     )
-    add_title(figure, "Trajectories and the information they gather", trajectory_handles(), note)
+    add_title(
+        figure, "Trajectories and the information that they gather", trajectory_handles(), note
+    )
     return figure
 
 
@@ -211,8 +213,8 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
             _label_phase_axes(axes, labels, int(dof), int(j))
 
     note = (
-        "Each loop starts at the dot (time 0, no sensitivity); ′ is the time derivative. "
-        "Blue boxes enlarge the initial loop."
+        "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative. "
+        "A blue box shows the initial curve enlarged."
     )
     if len(dofs) < nv or len(parameters) < count:
         note += (
@@ -253,7 +255,9 @@ def _most_sensitive_dofs(design: Design, nv: int) -> NDArray[np.intp]:
 
     Their numbers are in ascending order.
     """
-    relative_psi = np.abs(design.final.sensitivity[:, :nv] * _parameter_sizes(design))
+    psi = design.final.sensitivity[:, :nv]
+    relative_psi = np.abs(psi * _parameter_sizes(design))
+
     largest = relative_psi.max(axis=(0, 2))
     descending = np.argsort(-largest, kind="stable")
     return np.sort(descending[:MAX_PHASE_DOFS])
@@ -362,8 +366,8 @@ def convergence(design: Design) -> Figure:
     note = f"{design.status.value}."
     if has_barrier:
         note += (
-            " Dashed: a new barrier stage of the limits begins; "
-            "slope and cost are then of log J and barrier."
+            " Dashed lines: a new barrier stage begins; with limits, the slope is that of log J "
+            "plus the barrier."
         )
     add_title(figure, "Convergence", handles, note)
     return figure

@@ -57,7 +57,7 @@ def limits(design: Design) -> Figure:
         lowest = i + columns >= len(kinds)
         _draw_kind(axes, design, kind, "time [s]" if lowest else "")
 
-    note = "Every engine step of the untouched model; the grey zones are out of bounds."
+    note = "All engine steps of the stated model are shown; beyond the bounds it is grey."
     end_limits = [
         _margin_in_words(kind, margin)
         for kind, margin in design.limits.items()
@@ -83,7 +83,8 @@ def _draw_kind(axes: Axes, design: Design, kind: str, xlabel: str) -> None:
         frameon=False,
     )
 
-    format_axes(axes, xlabel, "required / actual distance" if is_clearance else "half ranges")
+    ylabel = "required / actual distance [–]" if is_clearance else "value / half range [–]"
+    format_axes(axes, xlabel, ylabel)
     margin = design.limits.get(kind, np.nan)
     axes.set_title(
         _margin_in_words(kind, margin),

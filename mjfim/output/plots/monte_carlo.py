@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from scipy.stats import norm
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError
@@ -45,6 +46,9 @@ MIN_RELATIVE_RANGE = 1e-9
 # Number of points of the normal curve.
 CURVE_POINTS = 400
 
+# Smallest and largest number of bars of a histogram.
+MIN_BINS, MAX_BINS = 8, 60
+
 
 def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Figure:
     """Draw the estimates of one parameter along each trajectory (the paper's figures 4 to 6).
@@ -74,12 +78,14 @@ def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Figure:
     overlay = figure.add_subplot(grid[1, :])
     format_axes(overlay, label, "density / peak [–]")
     _draw_overlay(overlay, study, index)
-    overlay.set_title("common axis", loc="left", fontsize=SMALL_FONT, color=MUTED_COLOUR)
+    overlay.set_title(
+        "all trajectories on one axis", loc="left", fontsize=SMALL_FONT, color=MUTED_COLOUR
+    )
 
     title = f"Monte Carlo estimates of {labels.parameters[index]}"
     note = (
-        "Simulated noise of the stated sigma on the model itself; "
-        "the panels above have different ranges."
+        "Simulated recordings of the model with noise of the stated σ. "
+        "The upper panels have different ranges."
     )
     add_title(figure, title, _handles(study, index, labels), note)
     return figure
@@ -147,17 +153,17 @@ def _densities(values: Array, limits: tuple[float, float]) -> tuple[Array, Array
 
     Values outside the limits count in the normalisation.
     """
-    bins = int(np.clip(2.0 * len(values) ** 0.5, 8, 60))
+    count = len(values)
+    bins = int(np.clip(2.0 * np.sqrt(count), MIN_BINS, MAX_BINS))
     counts, edges = np.histogram(values, bins=bins, range=limits)
-    heights = counts / (len(values) * np.diff(edges))
-    return heights, edges
+
+    widths = np.diff(edges)
+    return counts / (count * widths), edges
 
 
 def _normal_density(x: Array, mean: float, std: float) -> Array:
     """Return the density of a normal distribution at x (n,)."""
-    distance = (x - mean) / std
-    density = np.exp(-0.5 * distance**2) / (std * np.sqrt(2.0 * np.pi))
-    return np.asarray(density, dtype=np.float64)
+    return np.asarray(norm.pdf(x, loc=mean, scale=std), dtype=np.float64)
 
 
 def _draw_histogram(

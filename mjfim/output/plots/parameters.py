@@ -103,7 +103,7 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     ]
     note = BEST_CASE
     if not np.isfinite(stds).all():
-        note += " ∞: this trajectory does not determine the parameter by itself."
+        note += " ∞: the parameter is not identifiable alone from this trajectory."
     add_title(figure, "Predicted accuracy (Cramér–Rao)", handles, note)
     return figure
 
@@ -196,16 +196,18 @@ def _write_columns(axes: Axes, accuracies: _Accuracies) -> None:
     ]
 
     # Right edge of each column [points], behind the right end of the axis.
-    _write_column(axes, 62.0, "of value", initial_texts, INITIAL_COLOUR)
-    _write_column(axes, 122.0, "of value", final_texts, OPTIMIZED_COLOUR)
+    _write_column(axes, 62.0, "σ / value", initial_texts, INITIAL_COLOUR)
+    _write_column(axes, 122.0, "σ / value", final_texts, OPTIMIZED_COLOUR)
     _write_column(axes, 178.0, "ratio", ratio_texts, TEXT_COLOUR)
 
 
 def _write_column(axes: Axes, right: float, heading: str, texts: list[str], colour: str) -> None:
     """Write a heading and a text per row, aligned at `right` points behind the end of the axis."""
     _write_at_offset(axes, 1.0, "axes fraction", (right, 6.0), heading, colour)
+
+    rows = axes.get_yaxis_transform()
     for row, text in enumerate(texts):
-        _write_at_offset(axes, row, axes.get_yaxis_transform(), (right, 0.0), text, colour)
+        _write_at_offset(axes, row, rows, (right, 0.0), text, colour)
 
 
 def _write_at_offset(
@@ -375,7 +377,7 @@ def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
     value = format_with_uncertainty(float(estimate.theta[j]), half_width)
     text = f"{guess} → {value} {unit}".rstrip()
     if estimate.parameters[j] in estimate.at_bound:
-        text += "   at its bound"
+        text += "   (at its bound)"
     return text
 
 
@@ -402,14 +404,14 @@ def _interval_handles() -> list[Line2D]:
 def _interval_note(estimate: Estimate, *, guess_of_zero: bool) -> str:
     """Say what the two intervals mean."""
     note = (
-        "Formal: a best case that holds if the model and the noise are right. "
-        "The thin line allows for residuals that are autocorrelated."
+        "The formal interval is right only if the model and the noise are right. "
+        "The 95 % interval also allows for autocorrelated residuals."
     )
     if estimate.misfit:
         note += (
-            " Here the residuals are not noise: "
-            "no interval covers what a wrong model does to the parameters."
+            " Here the residuals are not explained by noise: "
+            "no interval covers the bias of a wrong model."
         )
     if guess_of_zero:
-        note += " A guess of 0 has no relative scale and is given as text only."
+        note += " For a guess of 0 there is no relative difference: see the text."
     return note

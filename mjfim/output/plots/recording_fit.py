@@ -72,13 +72,13 @@ def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] |
         Patch(color=GRID_COLOUR, label="±2σ of the noise"),
     ]
     note = (
-        "Residual: measured − predicted; 4.6 % outside ±2σ is expected "
-        "if the model and the noise are right."
+        "Residual: measured − predicted. If the model and the noise are right, 4.6 % of the "
+        "samples are outside ±2σ."
     )
     if len(columns) < len(recording.outputs):
         note += (
-            f" Shown: the {len(columns)} of {len(recording.outputs)} outputs "
-            "with the largest residual over sigma."
+            f" Shown: those {len(columns)} of {len(recording.outputs)} outputs "
+            "whose residuals over σ are largest."
         )
     add_title(figure, f"Fit to {Path(recording.name).name}", handles, note)
     return figure
@@ -127,8 +127,11 @@ def _draw_outputs(axes: Axes, recording: Recording, predicted: Array, column: in
     """Draw one output: measured samples as dots, `predicted` (n, ny) as a line."""
     rows, size = _drawn_samples(len(recording.t))
     t = recording.t[rows]
-    axes.plot(t, recording.y[rows, column], ".", color=MEASURED_COLOUR, markersize=size)
-    axes.plot(t, predicted[rows, column], color=TEXT_COLOUR, linewidth=1.2)
+    y = recording.y[rows, column]
+    y_predicted = predicted[rows, column]
+
+    axes.plot(t, y, ".", color=MEASURED_COLOUR, markersize=size)
+    axes.plot(t, y_predicted, color=TEXT_COLOUR, linewidth=1.2)
 
 
 def _draw_residual(axes: Axes, t: Array, residual: Array, sigma: float) -> None:

@@ -82,12 +82,12 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
 
     handles = [
         Line2D([], [], color=MEASURED_COLOUR, label="residual"),
-        Line2D([], [], color=TEXT_COLOUR, label="white noise of σ"),
-        Patch(color=GRID_COLOUR, label="95 % of white noise"),
+        Line2D([], [], color=TEXT_COLOUR, label="white noise of the assumed σ"),
+        Patch(color=GRID_COLOUR, label="95 % range of white noise"),
     ]
     note = (
-        "Above the band at low frequencies: the model misses something slow. "
-        "Rows count as evenly spaced."
+        "Power above the band at low frequencies: the model lacks a slow effect. "
+        "Samples count as evenly spaced."
     )
     add_title(figure, "Spectra of the residuals", handles, note)
     return figure
@@ -102,8 +102,11 @@ def _scaled_residuals(estimate: Estimate, column: int, sigma: float) -> list[tup
     for recording, predicted in zip(estimate.recordings, estimate.predicted, strict=True):
         residual = recording.y[:, column] - predicted[:, column]
         measured = np.isfinite(residual)
-        if np.count_nonzero(measured) > TOO_SHORT:
-            parts.append((recording.t[measured], residual[measured] / sigma))
+        if np.count_nonzero(measured) <= TOO_SHORT:
+            continue
+        t = recording.t[measured]
+        scaled = residual[measured] / sigma
+        parts.append((t, scaled))
     return parts
 
 
@@ -207,8 +210,8 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
         "of the predicted recording only the initial state is estimated."
     )
     if not all(prediction.held_out for prediction in found):
-        note += " *: part of the final fit; predicted here by a fit to the others."
-    add_title(figure, "Predictions of what was not fitted", handles, note)
+        note += " *: also part of the final fit; predicted here by a fit to the other recordings."
+    add_title(figure, "Predictions of recordings that were not fitted", handles, note)
     return figure
 
 

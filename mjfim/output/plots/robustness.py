@@ -84,7 +84,7 @@ def _draw_limits(axes: Axes, result: Robustness) -> None:
             color=style.OPTIMIZED_COLOUR,
             marker=".",
             linestyle="",
-            label="robots, limit exceeded by some",
+            label="robots; some exceed the limit",
         ),
     ]
     axes.legend(
@@ -119,7 +119,7 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
             )
     axes.set_ylim(-5.2, 5.2)
     axes.set_title(
-        "Errors of the estimates; shaded: 95 %",
+        "Errors of the estimates; shaded: range of 95 %",
         fontsize=style.NORMAL_FONT,
         loc="left",
         color=style.TEXT_COLOUR,
@@ -131,7 +131,7 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
     n = result.runs
     x = np.arange(len(result.names))
     share = 100.0 * result.inside / n
-    style.format_axes(axes, "", "inside 95 % [%]")
+    style.format_axes(axes, "", "coverage [%]")
     low, high = (100.0 * k / n for k in binom.interval(CONFIDENCE, n, CONFIDENCE))
     axes.axhspan(low, high, color=style.MEASURED_COLOUR, alpha=0.12, linewidth=0.0)
     axes.axhline(
@@ -148,23 +148,23 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
             color=style.TEXT_COLOUR,
         )
     axes.set_ylim(min(85.0, float(share.min(initial=100.0)) - 3.0), 103.0)
-    title = "Coverage; dashed: wanted, shaded: range of 95 % by chance"
+    title = "Robots whose 95 % interval holds the true value; dashed: required, shaded: expected"
     axes.set_title(title, fontsize=style.NORMAL_FONT, loc="left", color=style.TEXT_COLOUR)
 
 
 def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
     """Draw the errors of the guess, the predicted and the observed errors of each unknown."""
     x = np.arange(len(result.names))
-    style.format_axes(axes, "", "error, guess = 100 [%]")
+    style.format_axes(axes, "", "error [% of the guess's]")
     before = np.where(result.wrong > 0.0, result.wrong, np.nan)
     for y, marker, colour, label in (
         (np.full(len(x), 100.0), "o", style.MUTED_COLOUR, "guess"),
-        (100.0 * result.predicted / before, "_", style.TEXT_COLOUR, "σ predicted before any run"),
+        (100.0 * result.predicted / before, "_", style.TEXT_COLOUR, "σ predicted by the design"),
         (
             100.0 * result.observed / before,
             ".",
             style.OPTIMIZED_COLOUR,
-            "root mean square error of all robots",
+            "rms error of the estimates",
         ),
     ):
         size = {"o": 4.0, "_": 20.0, ".": 9.0}[marker]

@@ -56,8 +56,8 @@ def design_table(design: Design, labels: Labels) -> Figure:
     labels.check(parameters=len(design.theta))
     summary = describe_design(design, labels.parameter_units)
     notes = (
-        "λ in s / (unit of θ)²: information per unit of measurement rate; σ in the parameter's "
-        "unit.",
+        "λ [s / (unit of θ)²]: eigenvalues of the information per unit of measurement rate; "
+        "σ in the unit of the parameter.",
         BEST_CASE,
     )
     tables = [summary.table("eigenvalues"), summary.table("accuracy")]

@@ -43,7 +43,7 @@ class Camera:
     Attributes:
         position: Position in the world [m].
         target: Point that it looks at [m].
-        stacked: True where several views are larger above each other than beside each other.
+        stacked: True where several views show the scene larger if they are above each other.
         edge_on: True where the ground is seen edge-on.
     """
 
@@ -78,7 +78,7 @@ def place_camera(
     low, high = _bounding_box(model, clouds, axes)
     width, height, depth = np.maximum(high - low, 1e-6)
 
-    # Views stand above each other if the scene is then drawn larger.
+    # Views are stacked if this draws the scene larger.
     stacked_scale = min(1.0 / (views * height), aspect / width)
     beside_scale = min(1.0 / height, aspect / (views * width))
     stacked = bool(stacked_scale > beside_scale)

@@ -167,7 +167,7 @@ def log_estimate(
         path: The file.
         model: The identified model.
         estimate: The estimate.
-        measured: Measured motion, drawn as a see-through robot; None where positions were not
+        measured: Measured motion, drawn as a transparent robot; None where positions were not
             measured.
         predicted: Predicted motion.
         labels: Labels of the model's columns.
@@ -178,7 +178,7 @@ def log_estimate(
     title = "predicted robot (orange)"
     if measured is not None:
         trajectories["measured"] = _thinned(measured)
-        title += " under the measured one (grey, see-through)"
+        title += " and measured robot (grey, transparent)"
 
     poses = {
         name: body_poses(model, trajectory.t, trajectory.qpos)

@@ -148,7 +148,7 @@ def series_view(parts: EntityParts, title: str, *, legend: bool = True) -> rrb.T
     Args:
         parts: The entity.
         title: Title of the view.
-        legend: False to hide the legend; one is enough for several small plots.
+        legend: False to hide the legend.
     """
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
     return rrb.TimeSeriesView(origin=entity_path(parts), name=title, plot_legend=corner)

@@ -160,8 +160,9 @@ class PhasePlot:
 
     def _points(self, sensitivity: Array) -> Array:
         """Return the (N+1, 2) curve in plot coordinates of a sensitivity (N+1, nx, p)."""
-        psi = sensitivity[:, [self.dof, self.nv + self.dof], self.index]
-        return np.asarray(psi / self.scale * PLOT_SCALE)
+        columns = [self.dof, self.nv + self.dof]
+        relative = sensitivity[:, columns, self.index] / self.scale
+        return np.asarray(relative * PLOT_SCALE)
 
 
 def parameters_with_phase_plot(design: Design) -> list[int]:

@@ -121,6 +121,15 @@ def time_column(t: Array) -> rr.TimeColumn:
     return rr.TimeColumn("sim_time", duration=nanoseconds)
 
 
+def rerun_quaternion(wxyz: Array) -> rr.Quaternion:
+    """Return a quaternion of MuJoCo in the order of Rerun, xyzw.
+
+    Args:
+        wxyz: (4,) quaternion in the order of MuJoCo.
+    """
+    return rr.Quaternion(xyzw=np.roll(wxyz, -1))
+
+
 def body_parts(model: mujoco.MjModel, root: EntityParts, body: int) -> EntityParts:
     """Return the parts of the path of a body; unnamed bodies are numbered.
 
@@ -153,8 +162,8 @@ def log_robot(
         root: Entity of the robot.
         poses: Poses of its bodies.
         style: Style in which it is drawn.
-        on_iteration: True to log the first pose on the timeline `iteration` too, so that the robot
-            is visible there.
+        on_iteration: True to log the first pose also on the timeline `iteration`, so that the robot
+            is visible on it.
     """
     for body in range(model.nbody):
         parts = body_parts(model, root, body)
@@ -194,8 +203,9 @@ def log_end_path(
 
 def _log_fixed_pose(rec: rr.RecordingStream, path: str, poses: BodyPoses, body: int) -> None:
     """Log the pose of a body that nothing moves, as static data."""
-    xyzw = np.roll(poses.quaternions[0, body], -1)
-    pose = rr.Transform3D(translation=poses.positions[0, body], quaternion=rr.Quaternion(xyzw=xyzw))
+    position = poses.positions[0, body]
+    quaternion = rerun_quaternion(poses.quaternions[0, body])
+    pose = rr.Transform3D(translation=position, quaternion=quaternion)
     rec.log(path, pose, static=True, strict=True)
 
 
@@ -227,11 +237,12 @@ def _log_shapes(
     moving = is_moving(model, body)
     geoms = drawn_geoms(model, body)
     for geom in geoms:
-        shape = geom_shape(model, geom, style.geom_colour(geom_rgba(model, geom), moving))
+        colour = style.geom_colour(geom_rgba(model, geom), moving)
+        shape = geom_shape(model, geom, colour)
         if shape is None:
             continue
-        xyzw = np.roll(model.geom_quat[geom], -1)
-        pose = rr.Transform3D(translation=model.geom_pos[geom], quaternion=rr.Quaternion(xyzw=xyzw))
+        quaternion = rerun_quaternion(model.geom_quat[geom])
+        pose = rr.Transform3D(translation=model.geom_pos[geom], quaternion=quaternion)
         name = model.geom(geom).name or f"geom{geom}"
         rec.log(entity_path((*parts, name)), pose, shape, static=True, strict=True)
 
@@ -260,13 +271,13 @@ def _moving_centres(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
         bodies: (n,) body of each point.
         points: (n, 3) points in the frames of their bodies [m].
     """
-    bodies = np.flatnonzero(model.body_weldid)
+    moving = np.flatnonzero(model.body_weldid)
     geoms = moving_geoms(model)
 
-    origins = np.zeros((len(bodies), 3))
+    origins = np.zeros((len(moving), 3))
     points = np.concatenate([origins, model.geom_pos[geoms]])
-    of_points = np.concatenate([bodies, model.geom_bodyid[geoms]]).astype(np.intp)
-    return of_points, points
+    bodies = np.concatenate([moving, model.geom_bodyid[geoms]])
+    return bodies.astype(np.intp), points
 
 
 def _end_path(model: mujoco.MjModel, poses: BodyPoses) -> Array:

@@ -43,7 +43,7 @@ class RobotStyle:
 
     Attributes:
         accent: Accent colour (0..255).
-        accent_share: Share of the accent colour in the moving geoms; the rest is the grey of their
+        accent_share: Share of the accent colour in the moving geoms; the rest is grey of equal
             brightness.
         opacity: Opacity of the moving geoms (0..1).
     """
@@ -174,10 +174,8 @@ def stick_figure(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.
 
 
 def _capsule(half_length: float, radius: float, rgba: list[int]) -> rr.Capsules3D:
-    """Return a capsule along z, centred on its frame; Rerun's own ones begin at the origin.
-
-    Sizes in [m].
-    """
+    """Return a capsule along z, centred on its frame. half_length, radius: [m]."""
+    # A capsule of Rerun begins at the origin of its frame.
     return rr.Capsules3D(
         lengths=[2 * half_length],
         radii=[radius],
@@ -190,7 +188,7 @@ def _capsule(half_length: float, radius: float, rgba: list[int]) -> rr.Capsules3
 def _ground_plane(
     model: mujoco.MjModel, half_x: float, half_y: float, rgba: list[int]
 ) -> rr.Mesh3D:
-    """Return a plane of finite size as a board; half sizes [m] of 0 stand for an infinite plane."""
+    """Return a plane as a board of finite size. Half sizes [m] of 0 mean an infinite plane."""
     reach = 2.0 * float(model.stat.extent)
     half_sizes = (min(half_x, reach) or reach, min(half_y, reach) or reach)
     return _checkerboard(half_sizes, rgba)
@@ -201,19 +199,21 @@ def _checkerboard(half_sizes: tuple[float, float], rgba: list[int]) -> rr.Mesh3D
 
     `half_sizes` are along x and y [m].
     """
-    indices = np.arange(BOARD_SQUARES)
-    i, j = (index.ravel() for index in np.meshgrid(indices, indices, indexing="ij"))
+    # (squares, 2) column and row of every square.
+    squares = np.stack(np.indices((BOARD_SQUARES, BOARD_SQUARES)), axis=-1).reshape(-1, 2)
 
-    # Four corners of every square, counter-clockwise.
-    shifts = ((0, 0), (1, 0), (1, 1), (0, 1))
-    corners = np.stack([np.stack([i + di, j + dj], axis=1) for di, dj in shifts], axis=1)
+    # (squares, 4, 2) corners of every square, counter-clockwise.
+    shifts = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
+    corners = squares[:, None, :] + shifts
     xy = (2.0 * corners / BOARD_SQUARES - 1.0) * half_sizes
-    z = np.zeros((*xy.shape[:2], 1))
-    vertices = np.concatenate([xy, z], axis=2).reshape(-1, 3)
 
-    brightness = np.where((i + j) % 2, 1.0, DARK_SQUARE)
+    vertices = np.zeros((4 * len(squares), 3))
+    vertices[:, :2] = xy.reshape(-1, 2)
+
+    is_bright = squares.sum(axis=1) % 2 == 1
+    brightness = np.where(is_bright, 1.0, DARK_SQUARE)
     colours = brightness[:, None] * np.array(rgba[:3])
-    first_corners = 4 * np.arange(BOARD_SQUARES**2)[:, None]
+    first_corners = 4 * np.arange(len(squares))[:, None]
     return rr.Mesh3D(
         vertex_positions=vertices,
         triangle_indices=_two_triangles(first_corners, (0, 1, 2), (0, 2, 3)),
@@ -223,13 +223,14 @@ def _checkerboard(half_sizes: tuple[float, float], rgba: list[int]) -> rr.Mesh3D
 
 
 def _two_triangles(
-    first_corners: NDArray[np.intp], one: tuple[int, ...], other: tuple[int, ...]
+    first_corners: NDArray[np.intp], first: tuple[int, ...], second: tuple[int, ...]
 ) -> NDArray[np.intp]:
     """Return (2n, 3) triangles, two for each of n squares.
 
-    Corners are the first corners (n, 1) plus the shifts `one` and `other`.
+    The corners of a triangle are the first corners (n, 1) plus the shifts `first` or `second`.
     """
-    return np.concatenate([first_corners + np.array(one), first_corners + np.array(other)])
+    triangles = [first_corners + np.array(shifts) for shifts in (first, second)]
+    return np.concatenate(triangles)
 
 
 def _height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh3D:
@@ -240,17 +241,20 @@ def _height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh
 
     heights = model.hfield_data[first : first + rows * columns].reshape(rows, columns)
     z = top * heights
-    x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
+    x = np.linspace(-half_x, half_x, columns)
+    y = np.linspace(-half_y, half_y, rows)
+    vertices = np.stack([*np.meshgrid(x, y), z], axis=2)
 
     # A normal of the surface z(x, y) is (-dz/dx, -dz/dy, 1).
-    slope_y, slope_x = np.gradient(z, 2 * half_y / (rows - 1), 2 * half_x / (columns - 1))
+    slope_y, slope_x = np.gradient(z, y, x)
     normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=2).reshape(-1, 3)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
 
+    # The first corner of every rectangle between two rows and two columns.
     row_starts = np.arange(rows - 1)[:, None] * columns
     first_corners = (row_starts + np.arange(columns - 1)).reshape(-1, 1)
     return rr.Mesh3D(
-        vertex_positions=np.stack([x, y, z], axis=2).reshape(-1, 3),
+        vertex_positions=vertices.reshape(-1, 3),
         triangle_indices=_two_triangles(
             first_corners, (0, 1, columns + 1), (0, columns + 1, columns)
         ),

@@ -11,9 +11,9 @@ from mjfim.records.estimate import Estimate
 
 # Sentences that explain the colours of the recordings.
 DESIGN_COLOURS = (
-    "Blue: the initial trajectory. Red: the optimized one. Space bar: play or pause. "
-    "The plots of ψ show sensitivities: how far a position (→) and its velocity (↑) move per unit "
-    "of a parameter."
+    "Blue: the initial trajectory. Red: the optimized trajectory. Space bar: play or pause. "
+    "The plots of ψ show sensitivities: how much a position (→) and its velocity (↑) change per "
+    "unit of a parameter."
 )
 ESTIMATE_COLOURS = "Orange: the model with these parameters. Grey: the measurements."
 

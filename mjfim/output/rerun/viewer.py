@@ -1,4 +1,4 @@
-"""The native Rerun viewer as a process of its own."""
+"""The native Rerun viewer as a separate process."""
 
 from __future__ import annotations
 
@@ -34,6 +34,6 @@ def show(path: Path) -> None:
 
     if code:
         raise MjfimError(
-            f"the Rerun viewer ended with code {code}; it needs a display, the file {str(path)!r} "
-            "does not"
+            f"the Rerun viewer ended with code {code}; it needs a display; the complete recording "
+            f"is in {str(path)!r}"
         )
