@@ -1,6 +1,4 @@
-"""Files: what was written comes back, keys and shapes are the promised ones, nothing half-written,
-nothing unpickled.
-"""
+"""Files are read back as they were written, are never incomplete, and are never unpickled."""
 
 from __future__ import annotations
 
@@ -50,13 +48,13 @@ def task() -> DesignTask:
 
 @pytest.fixture(scope="module")
 def design(task: DesignTask) -> Design:
-    """Two iterations."""
+    """A design after two iterations."""
     return design_task(task)
 
 
 @pytest.fixture(scope="module")
 def folder(task: DesignTask, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """design.json, design.npz and design.csv of it."""
+    """Folder with design.json, design.npz and design.csv of the design."""
     home = tmp_path_factory.mktemp("design") / "new" / "folder"
     archive.write_design(home, design, task.system)
     return home
@@ -69,7 +67,7 @@ def recording(task: DesignTask, design: Design) -> Recording:
 
 
 def refuse_constant(name: str) -> float:
-    """For json.loads: NaN and Infinity are not JSON."""
+    """Refuse NaN and Infinity, which are not JSON."""
     raise AssertionError(f"{name} is not JSON")
 
 
@@ -82,8 +80,8 @@ def strict_json(text: str) -> dict[str, Any]:
 # ---- designs
 
 
-def test_npz_holds_what_is_promised(folder: Path, design: Design) -> None:
-    """Names and shapes of DESIGN.md, for the design and its start."""
+def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
+    """Names and shapes of all arrays, for the designed and the initial trajectory."""
     with np.load(folder / "design.npz", allow_pickle=False) as data:
         shapes = {key: data[key].shape for key in data.files}
         kinds = {data[key].dtype for key in data.files if key != "record"}
@@ -111,7 +109,7 @@ def test_npz_holds_what_is_promised(folder: Path, design: Design) -> None:
 
 
 def test_npz_round_trip(folder: Path, design: Design) -> None:
-    """Bit by bit."""
+    """Every number is read back exactly."""
     named = archive.read_design(folder / "design.npz")
     assert set(named) == {"initial", "final"}
     for name, evaluation in (("initial", design.initial), ("final", design.final)):
@@ -123,8 +121,8 @@ def test_npz_round_trip(folder: Path, design: Design) -> None:
     assert np.abs(named["final"].ctrl - named["initial"].ctrl).max() > 1e-3
 
 
-def test_json_holds_what_is_promised(folder: Path, design: Design) -> None:
-    """Keys of DESIGN.md and the numbers of the record."""
+def test_json_holds_the_documented_keys(folder: Path, design: Design) -> None:
+    """Keys of design.json and the numbers of the record."""
     data = strict_json((folder / "design.json").read_text(encoding="utf-8"))
     wanted = {
         "status",
@@ -163,10 +161,8 @@ def test_json_holds_what_is_promised(folder: Path, design: Design) -> None:
     )
 
 
-def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
-    """Information holds the prior, which is written beside it so that a later experiment can take
-    it out.
-    """
+def test_json_names_nuisance_parameters_and_priors(tmp_path: Path) -> None:
+    """The information contains the prior, which is also written so that it can be subtracted."""
     e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     table = {"m": {"prior": 0.5}, "c": {"nuisance": True}}
     known = DesignTask.resolve(
@@ -195,9 +191,7 @@ def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
 
 
 def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
-    """Columns by name, all digits, no control in the last row; and it starts another design as it
-    is. Gains stand behind.
-    """
+    """design.csv has all digits and named columns, and can be the initial control of a design."""
     with (folder / "design.csv").open(newline="", encoding="utf-8") as stream:
         header, *rows = csv.reader(stream)
     states = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
@@ -214,13 +208,13 @@ def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
 
 
 def test_json_names_its_experiment(folder: Path) -> None:
-    """Relative to the folder of the results."""
+    """The path of the experiment is relative to the folder of the results."""
     data = strict_json((folder / "design.json").read_text(encoding="utf-8"))
     assert (folder / data["experiment"]).resolve() == MODELS / "cart_pendulum.toml"
 
 
 def test_json_has_no_nan(design: Design) -> None:
-    """What is infinite or undefined becomes null."""
+    """Infinite and undefined numbers become null."""
     blank = dataclasses.replace(
         design.final,
         std=np.array([np.inf, np.nan, 1.0]),
@@ -234,8 +228,8 @@ def test_json_has_no_nan(design: Design) -> None:
     assert data["final"]["information"] == [[None] * 3] * 3
 
 
-def test_unsatisfied_limits_are_said(design: Design) -> None:
-    """One negative margin is enough."""
+def test_unsatisfied_limits_are_named(design: Design) -> None:
+    """One negative margin makes a limit unsatisfied."""
     outside = dataclasses.replace(design, limits={"position": 0.5, "control": -0.1})
     said = outside.summary()["limits"]
     assert (said["margins"], said["satisfied"]) == ({"position": 0.5, "control": -0.1}, False)
@@ -245,7 +239,7 @@ def test_unsatisfied_limits_are_said(design: Design) -> None:
 
 
 def altered(source: Path, path: Path, **arrays: Any) -> Path:
-    """A copy of a design.npz with some arrays exchanged, or left out where None."""
+    """Copy a design.npz with some arrays replaced; None leaves an array out."""
     with np.load(source, allow_pickle=False) as data:
         kept = {key: data[key] for key in data.files}
     np.savez(path, **{key: value for key, value in {**kept, **arrays}.items() if value is not None})
@@ -253,7 +247,7 @@ def altered(source: Path, path: Path, **arrays: Any) -> Path:
 
 
 class Trap:
-    """Something whose unpickling would be noticed."""
+    """An object that records that it was unpickled."""
 
     sprung = False
 
@@ -262,12 +256,12 @@ class Trap:
 
 
 def spring() -> None:
-    """What a hostile file would run."""
+    """Record that code from the file was run."""
     Trap.sprung = True
 
 
 def test_pickles_are_refused(folder: Path, tmp_path: Path) -> None:
-    """An object array is not even looked at."""
+    """An array of objects is refused before it is unpickled."""
     path = altered(
         folder / "design.npz", tmp_path / "hostile.npz", qpos=np.array([Trap()], dtype=object)
     )
@@ -284,7 +278,7 @@ def test_pickles_are_refused(folder: Path, tmp_path: Path) -> None:
     "ignore::pytest.PytestUnraisableExceptionWarning"
 )  # NumPy leaves the file open
 def test_truncated_archives_are_refused(folder: Path, tmp_path: Path, share: float) -> None:
-    """Wherever the copy broke off."""
+    """A file is refused at whatever place it was cut off."""
     data = (folder / "design.npz").read_bytes()
     path = tmp_path / "torn.npz"
     path.write_bytes(data[: int(share * len(data))])
@@ -293,7 +287,7 @@ def test_truncated_archives_are_refused(folder: Path, tmp_path: Path, share: flo
 
 
 def test_corrupt_archives_are_refused(folder: Path, tmp_path: Path) -> None:
-    """Flipped bytes inside an array."""
+    """Changed bytes inside an array are detected."""
     data = bytearray((folder / "design.npz").read_bytes())
     data[2000:2100] = bytes(b ^ 0x55 for b in data[2000:2100])
     (tmp_path / "rotten.npz").write_bytes(data)
@@ -302,7 +296,7 @@ def test_corrupt_archives_are_refused(folder: Path, tmp_path: Path) -> None:
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    """No file, no archive."""
+    """A missing file and a file that is no archive are refused."""
     with pytest.raises(RecordingError, match=r"gone\.npz: no such design file"):
         archive.read_design(tmp_path / "gone.npz")
     (tmp_path / "text.npz").write_text("hello", encoding="utf-8")
@@ -311,7 +305,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_missing_arrays_are_named(folder: Path, tmp_path: Path) -> None:
-    """And what a design holds."""
+    """The message also names all arrays of a design."""
     path = altered(folder / "design.npz", tmp_path / "poor.npz", ctrl=None)
     with pytest.raises(
         RecordingError, match=r"poor\.npz: array 'ctrl' is missing; a design holds t, qpos, .*ctrl"
@@ -319,8 +313,8 @@ def test_missing_arrays_are_named(folder: Path, tmp_path: Path) -> None:
         archive.read_design(path)
 
 
-def test_a_design_without_a_start(folder: Path, tmp_path: Path) -> None:
-    """The arrays of the start are optional."""
+def test_a_design_without_an_initial_trajectory(folder: Path, tmp_path: Path) -> None:
+    """The arrays of the initial trajectory are optional."""
     path = altered(folder / "design.npz", tmp_path / "alone.npz", initial_t=None)
     assert set(archive.read_design(path)) == {"final"}
 
@@ -339,7 +333,7 @@ def test_a_design_without_a_start(folder: Path, tmp_path: Path) -> None:
 def test_wrong_arrays_are_refused(
     folder: Path, tmp_path: Path, task: DesignTask, arrays: dict[str, Array]
 ) -> None:
-    """Before they are simulated or drawn."""
+    """Arrays that do not fit are refused before they are simulated or drawn."""
     path = altered(folder / "design.npz", tmp_path / "odd.npz", **arrays)
     with pytest.raises(RecordingError, match=r"odd\.npz: "):
         archive.check_fits(path, archive.read_design(path)["final"], task.system)
@@ -347,7 +341,7 @@ def test_wrong_arrays_are_refused(
 
 @pytest.mark.parametrize("kind", ["empty", "bare"])
 def test_not_an_archive(tmp_path: Path, kind: str) -> None:
-    """An empty file, a single array under the wrong name."""
+    """An empty file and a single array with the name of an archive are refused."""
     path = tmp_path / "odd.npz"
     with path.open("wb") as stream:
         if kind == "bare":
@@ -357,7 +351,7 @@ def test_not_an_archive(tmp_path: Path, kind: str) -> None:
 
 
 def test_designs_of_other_experiments_are_refused(folder: Path, task: DesignTask) -> None:
-    """Another model, another rate."""
+    """A design of another model or another rate is refused."""
     path, curve = folder / "design.npz", archive.read_design(folder / "design.npz")["final"]
     archive.check_fits(path, curve, task.system)
     wide = Trajectory(
@@ -385,7 +379,7 @@ def test_designs_of_other_experiments_are_refused(folder: Path, task: DesignTask
 
 
 def test_replacing_replaces(tmp_path: Path) -> None:
-    """Folders are made, the ending is kept for writers that look at it."""
+    """Folders are made; the temporary file keeps the ending, which some writers check."""
     path = tmp_path / "a" / "b" / "x.csv"
     for text in ("old", "new"):
         with replacing(path) as temporary:
@@ -397,7 +391,7 @@ def test_replacing_replaces(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("interruption", [OSError, KeyboardInterrupt])
 def test_replacing_keeps_the_old_file(tmp_path: Path, interruption: type[BaseException]) -> None:
-    """A failure in the middle: the old file stays, no temporary is left."""
+    """After a failure the old file is complete and no temporary file remains."""
     path = tmp_path / "x.json"
     path.write_text("old", encoding="utf-8")
 
@@ -413,7 +407,7 @@ def test_replacing_keeps_the_old_file(tmp_path: Path, interruption: type[BaseExc
 
 
 def test_files_obey_the_umask(tmp_path: Path) -> None:
-    """Results are as readable as any other new file."""
+    """The permissions of results are those of any new file."""
     (tmp_path / "plain").touch()
     with replacing(tmp_path / "x.json"):
         pass
@@ -421,7 +415,7 @@ def test_files_obey_the_umask(tmp_path: Path) -> None:
 
 
 def half_written(*args: Any, **kwargs: Any) -> None:
-    """A writer that writes a little to its path or stream and gives up."""
+    """Write a few bytes to a path or a stream, then fail."""
     for place in args:
         if isinstance(place, Path):
             place.write_bytes(b"half")
@@ -441,7 +435,7 @@ def test_failing_disk_keeps_the_old_design(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each of the three files is the old one or the new one."""
+    """Each of the three files is completely old or completely new."""
     shutil.copytree(folder, tmp_path / "copy")
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
     with monkeypatch.context() as patch:
@@ -461,7 +455,7 @@ def test_failing_disk_keeps_the_old_design(
 
 
 def test_recording_round_trip(recording: Recording, task: DesignTask, tmp_path: Path) -> None:
-    """Full precision; what was not measured stays empty."""
+    """Numbers have full precision; fields without a measurement are empty."""
     path = tmp_path / "recording.csv"
     archive.write_recording(path, recording, task.system)
     again = logs.read_recording(path, task.system.channels)
@@ -474,7 +468,7 @@ def test_recording_round_trip(recording: Recording, task: DesignTask, tmp_path: 
 
 
 def test_recording_columns(recording: Recording, task: DesignTask, tmp_path: Path) -> None:
-    """t, the controls, the outputs; no word for NaN in the file."""
+    """Columns are t, controls and outputs; the file contains no word for NaN."""
     path = tmp_path / "recording.csv"
     archive.write_recording(path, recording, task.system)
     text = path.read_text(encoding="utf-8")
@@ -483,7 +477,7 @@ def test_recording_columns(recording: Recording, task: DesignTask, tmp_path: Pat
 
 
 def test_extreme_numbers_survive(task: DesignTask, tmp_path: Path) -> None:
-    """From the smallest to the largest magnitudes."""
+    """Numbers of the smallest and of the largest magnitude are read back exactly."""
     values = np.array([5e-324, 1e-300, 0.1 + 0.2, -1.7976931348623157e308])
     r = Recording(
         t=np.arange(4) * 0.01, ctrl=values[:3, None], y=values[:, None], outputs=("qpos:slide",)
@@ -493,7 +487,7 @@ def test_extreme_numbers_survive(task: DesignTask, tmp_path: Path) -> None:
 
 
 def test_foreign_recording(task: DesignTask, tmp_path: Path) -> None:
-    """A subset of the outputs, in any order, with an empty last control."""
+    """A recording may hold some outputs in any order, and no last control."""
     path = tmp_path / "lab.csv"
     path.write_text(
         "qpos:hinge,t,ctrl:force\n3.1,0,1\n3.2,0.01,2\n,0.02,3\n3.4,0.03,\n", encoding="utf-8"
@@ -520,7 +514,7 @@ def test_foreign_recording(task: DesignTask, tmp_path: Path) -> None:
     ],
 )
 def test_unusable_recordings(text: str, message: str, task: DesignTask, tmp_path: Path) -> None:
-    """File, column, fault."""
+    """The message names file, column and fault."""
     path = tmp_path / "lab.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(RecordingError, match=rf"lab\.csv: .*{message}"):
@@ -528,7 +522,7 @@ def test_unusable_recordings(text: str, message: str, task: DesignTask, tmp_path
 
 
 def test_misspelled_output_is_not_ignored(task: DesignTask, tmp_path: Path) -> None:
-    """Half of the data would be lost."""
+    """An ignored column would be lost data."""
     path = tmp_path / "lab.csv"
     path.write_text(
         "t,ctrl:force,qpos:slide,qpos:hing\n0,1,1,3\n0.01,1,1,3\n0.02,1,1,3\n", encoding="utf-8"
@@ -589,14 +583,14 @@ def changes(new: mujoco.MjModel, old: mujoco.MjModel) -> dict[str, list[tuple[in
 
 
 def load(path: Path) -> mujoco.MjModel:
-    """As a user would."""
+    """Load a model from its file, like a user."""
     return mujoco.MjModel.from_xml_path(str(path))
 
 
 def test_identified_model_differs_in_the_identified_values_only(
     task: DesignTask, tmp_path: Path
 ) -> None:
-    """Entry by entry over the whole MjModel."""
+    """All entries of the MjModel are compared."""
     path = tmp_path / "deep" / "identified.xml"
     write_identified(path, task.system, VALUES)
     found = changes(load(path), task.system.model)
@@ -612,14 +606,14 @@ def test_identified_model_differs_in_the_identified_values_only(
 
 
 def test_identified_model_is_the_model_that_was_fitted(task: DesignTask, tmp_path: Path) -> None:
-    """Derived constants too: the recompiled file agrees with what was simulated."""
+    """The compiled file agrees with the simulated model, also in derived constants."""
     path = tmp_path / "identified.xml"
     write_identified(path, task.system, VALUES)
     assert changes(load(path), task.system.model_at(VALUES)) == {}
 
 
 def test_original_model_is_untouched(task: DesignTask, tmp_path: Path) -> None:
-    """Writing works on copies, in memory and on disk."""
+    """The original model does not change, neither in memory nor on disk."""
     source = (MODELS / "cart_pendulum.xml").read_bytes()
     write_identified(tmp_path / "identified.xml", task.system, VALUES)
     assert changes(task.system.model, load(MODELS / "cart_pendulum.xml")) == {}
@@ -663,7 +657,7 @@ def test_meshes_are_found_from_another_folder(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """identified.xml lies elsewhere, the experiment was named by a relative path."""
+    """identified.xml is in another folder, and the path of the experiment is relative."""
     for name in ("model", place):
         (tmp_path / name).mkdir(exist_ok=True, parents=True)
     (tmp_path / place / "tetra.obj").write_text(MESH, encoding="utf-8")
@@ -692,7 +686,7 @@ def test_meshes_are_found_from_another_folder(
 
 
 def test_failing_model_keeps_the_old_file(task: DesignTask, tmp_path: Path) -> None:
-    """A negative mass is named, and no broken model is left behind."""
+    """A negative mass is named, and no invalid model is written."""
     path = tmp_path / "identified.xml"
     write_identified(path, task.system, VALUES)
     before = path.read_bytes()
@@ -706,7 +700,7 @@ def test_failing_model_keeps_the_old_file(task: DesignTask, tmp_path: Path) -> N
 
 
 def test_estimate_summary(task: DesignTask, recording: Recording) -> None:
-    """Keys of estimate.json, in standard JSON."""
+    """estimate.json has the documented keys and is standard JSON."""
     estimate = identify_system(task.system, [recording])
     data = strict_json(as_json(estimate.summary()))
     assert {"theta", "std", "covariance", "chi2", "dof", "status", "residual_rms", "misfit"} <= set(
@@ -722,7 +716,7 @@ def test_estimate_summary(task: DesignTask, recording: Recording) -> None:
 
 
 def test_study_summary(task: DesignTask, design: Design) -> None:
-    """Keys of montecarlo.json, for each trajectory."""
+    """montecarlo.json has the documented keys for each trajectory."""
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     data = strict_json(as_json(monte_carlo_system(task.system, curves, trials=4).summary()))
     for name in curves:

@@ -1,6 +1,4 @@
-"""The user's MJCF with identified values: only these change, with all digits, however the file is
-written.
-"""
+"""The user's MJCF with identified values: all digits are written and nothing else changes."""
 
 from __future__ import annotations
 
@@ -61,14 +59,19 @@ RICH = """<?xml version="1.0"?>
     </body>
   </worldbody>
   <tendon>
-    <spatial name="band" stiffness="50" springlength="0.20 0.90" damping="1"><site site="t"/><site site="u"/></spatial>
-    <fixed name="link" springlength="0.1"><joint joint="j" coef="1"/><joint joint="k" coef="-1"/></fixed>
+    <spatial name="band" stiffness="50" springlength="0.20 0.90" damping="1">
+      <site site="t"/><site site="u"/>
+    </spatial>
+    <fixed name="link" springlength="0.1">
+      <joint joint="j" coef="1"/><joint joint="k" coef="-1"/>
+    </fixed>
   </tendon>
   <actuator>
     <motor name="m" joint="j" gear="2.0"/>
     <position name="p" joint="k" class="servo"/>
     <velocity name="v" joint="l" kv="3.0"/>
-    <general name="g" joint="l" dyntype="filter" dynprm="0.050" gainprm="2.0" biastype="affine" biasprm="0 -2.0 -0.10"/>
+    <general name="g" joint="l" dyntype="filter" dynprm="0.050" gainprm="2.0"
+      biastype="affine" biasprm="0 -2.0 -0.10"/>
   </actuator>
   <sensor><framepos objtype="site" objname="s" name="seen" noise=".01"/></sensor>
 </mujoco>
@@ -185,7 +188,7 @@ def lines(old: Path, new: Path) -> tuple[list[str], list[str]]:
 
 
 def assert_is_identified_model(path: Path, task: DesignTask, theta: Any) -> None:
-    """Assert that the file loads as the identified model, to 1e-12 of each array's largest number."""
+    """Assert that the file is the identified model, to 1e-12 of each array's largest number."""
     found, wanted = (
         mujoco.MjModel.from_xml_path(str(path)),
         task.system.model_at(np.asarray(theta, float), at_keyframe=False),
@@ -278,9 +281,7 @@ def test_without_a_change_the_file_keeps_every_byte(more: tuple[str, ...], tmp_p
 
 
 def test_an_identified_file_reproduces_itself(tmp_path: Path) -> None:
-    """A written file has the identified values, and as the model of the next experiment it does not
-    change any more.
-    """
+    """A written file has the identified values; identified again, it does not change."""
     paths = [p for p in UNCHANGED if p != 'body/b "2":mass'] + [
         "body/a:firstmoment[0]",
         "body/c:fullinertia[3]",
@@ -380,7 +381,8 @@ INEXPRESSIBLE = {
     "replicate": (
         (
             "</worldbody>",
-            '<replicate count="2" offset="1 0 0"><body name="r" pos="2 2 0"><joint name="rj"/><geom size=".1"/></body>'
+            '<replicate count="2" offset="1 0 0">'
+            '<body name="r" pos="2 2 0"><joint name="rj"/><geom size=".1"/></body>'
             "</replicate></worldbody>",
         ),
         "joint/rj1:damping",
@@ -430,9 +432,10 @@ def test_functions_of_the_spec_are_printed_by_mujoco(tmp_path: Path) -> None:
 
 
 def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
-    """Elements of the file itself are changed there; those of an included file cannot be."""
+    """Elements of the file are changed in it; elements of an included file are not changed."""
     (tmp_path / "parts").mkdir()
-    part = '<mujocoinclude><body name="d" pos="3 0 0"><joint name="dj"/><geom size=".1"/></body></mujocoinclude>'
+    body = '<body name="d" pos="3 0 0"><joint name="dj"/><geom size=".1"/></body>'
+    part = f"<mujocoinclude>{body}</mujocoinclude>"
     (tmp_path / "parts" / "d.xml").write_text(part, encoding="utf-8")
     source = tmp_path / "model.xml"
     source.write_text(
@@ -453,10 +456,9 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
 
 
 def test_attached_models_are_printed_by_mujoco(tmp_path: Path) -> None:
-    """The elements of an attached model are in another file, which the text would not find from
-    another folder.
-    """
-    part = '<mujoco model="leg"><worldbody><body name="d"><joint name="dj"/><geom size=".1"/></body></worldbody></mujoco>'
+    """An attached model is in another file, which the text would not find from another folder."""
+    body = '<body name="d"><joint name="dj"/><geom size=".1"/></body>'
+    part = f'<mujoco model="leg"><worldbody>{body}</worldbody></mujoco>'
     (tmp_path / "leg.xml").write_text(part, encoding="utf-8")
     xml = RICH.replace(
         "  <worldbody>", '  <asset><model name="leg" file="leg.xml"/></asset>\n  <worldbody>'
@@ -527,7 +529,7 @@ DERIVED = {
         2.0,
         "actuator 'p'",
     ),
-    "own damping ratio": (
+    "damping ratio of the element": (
         ('class="servo"/>', 'dampratio="1.0" kp="7"/>'),
         "actuator/p:kp",
         9.0,
@@ -549,9 +551,9 @@ def test_numbers_that_the_compiler_would_derive_are_stated(case: str, tmp_path: 
     assert old in RICH
     task = task_of(RICH.replace(old, new), tmp_path, path)
     said = write_identified(tmp_path / "identified.xml", task.system, np.array([value]))
-    assert (
-        said
-        == f"identified.xml: it also states numbers that MuJoCo would otherwise derive from the identified values: {stated}"
+    assert said == (
+        "identified.xml: it also states numbers that MuJoCo would otherwise derive from the "
+        f"identified values: {stated}"
     )
     assert "größer als ASCII" in (tmp_path / "identified.xml").read_text(encoding="utf-8")
     assert_is_identified_model(tmp_path / "identified.xml", task, [value])
@@ -569,9 +571,7 @@ def test_an_option_is_made_where_there_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("turned", ["", ' euler="10 20 30"', ' quat="0.6 0.8 0 0"'])
 def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: Path) -> None:
-    """`objtype="body"` is the frame of the principal axes: the matrix alone would leave their order
-    open.
-    """
+    """`objtype="body"` reads the principal axes, whose order the matrix does not determine."""
     watch = '<framequat objtype="body" objname="a" name="axes" noise=".01"/></sensor>'
     xml = RICH.replace("</sensor>", watch).replace('mass="1.50"', f'mass="1.50"{turned}')
     task = task_of(xml, tmp_path, "body/a:fullinertia[3]")
@@ -622,7 +622,8 @@ def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
     gone, came = lines(task.system.model_path, tmp_path / "identified.xml")
     assert 0 < len(gone) == len(came) <= sum(len(p.targets) for p in task.parameters.parameters)
     numbers = re.compile(
-        r'"[-+\d. e]*"| (damping|stiffness|armature|quat|euler|timeconst|fullinertia|diaginertia|gravcomp)='
+        r'"[-+\d. e]*"| (damping|stiffness|armature|quat|euler|timeconst|fullinertia|diaginertia'
+        r"|gravcomp)="
     )
     assert [numbers.sub("", text) for text in gone] == [numbers.sub("", text) for text in came]
 

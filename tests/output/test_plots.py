@@ -1,4 +1,4 @@
-"""Figures from hand-made records: units, legends, both trajectories, odd sizes, failed trials,
+"""Figures of hand-made records: units, legends, trajectories, unusual sizes, failed trials,
 singular information.
 """
 

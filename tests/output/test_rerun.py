@@ -42,7 +42,8 @@ ZOO = """
 <mujoco model="zoo">
   <asset>
     <mesh name="tetrahedron" vertex="0 0 0  .4 0 0  0 .4 0  0 0 .4"/>
-    <hfield name="hills" nrow="3" ncol="4" size=".6 .4 .3 .05" elevation="0 0 0 0  0 1 0 0  0 0 0 .5"/>
+    <hfield name="hills" nrow="3" ncol="4" size=".6 .4 .3 .05"
+      elevation="0 0 0 0  0 1 0 0  0 0 0 .5"/>
   </asset>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 .1" pos="0 0 -1"/>
@@ -54,7 +55,9 @@ ZOO = """
       <geom name="egg" type="ellipsoid" size=".1 .2 .05"/>
       <body pos=".3 0 .4"><joint axis="0 1 0"/><geom type="cylinder" size=".1 .2"/></body>
     </body>
-    <body name="rock" pos="2 0 0"><joint type="slide"/><geom name="rock" type="mesh" mesh="tetrahedron"/></body>
+    <body name="rock" pos="2 0 0">
+      <joint type="slide"/><geom name="rock" type="mesh" mesh="tetrahedron"/>
+    </body>
     <body name="bare" pos="3 0 0">
       <joint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
       <body name="tip" pos="0 .3 .5"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>
@@ -91,7 +94,7 @@ def simulated(model: mujoco.MjModel, amplitude: float, samples: int = 40) -> Tra
 
 
 def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Evaluation:
-    """Make an evaluation of two parameters: smooth sensitivities, information that grows with time."""
+    """Make an evaluation of two parameters with smooth sensitivities and growing information."""
     nx, t = 2 * model.nv + model.na, trajectory.t
     psi = gain * np.sin(t)[:, None, None] * np.arange(1.0, 2 * nx + 1).reshape(1, nx, 2)
     return Evaluation(
@@ -303,7 +306,7 @@ class TestDesign:
         assert len(column(file, path, None, "Transform3D:translation")[1]) == 0
         assert list(column(file, path, "iteration", "Transform3D:translation")[0]) == [0]
 
-    def test_history_is_on_its_own_timeline_and_as_bars(self, file: Path, design: Design) -> None:
+    def test_history_has_a_separate_timeline_and_bars(self, file: Path, design: Design) -> None:
         iterations, cost = column(file, ("history", "log10 cost"), "iteration", "Scalars:scalars")
         assert list(iterations) == [0, 1, 2]
         np.testing.assert_allclose(
@@ -473,7 +476,7 @@ class TestEstimate:
             ("outputs", "recording 2", "hinge_angle [rad]", "predicted")
         ) in entities(path)
 
-    def test_measured_robot_is_see_through(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
+    def test_measured_robot_is_transparent(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
         log_estimate(
             path, cart, estimated(cart, trajectory), trajectory, trajectory, Labels.of_model(cart)

@@ -1,4 +1,4 @@
-"""Summaries say the same in the terminal, in Markdown and in figures."""
+"""Summaries in the terminal, in Markdown and in figures agree."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def task() -> DesignTask:
 
 @pytest.fixture(scope="module")
 def design(task: DesignTask) -> Design:
-    """One iteration."""
+    """A design after one iteration."""
     return mjfim.design(task.experiment)
 
 
 @pytest.fixture(scope="module")
 def estimate(task: DesignTask, design: Design) -> Estimate:
-    """From one recording."""
+    """An estimate from one recording."""
     return mjfim.identify(
         task.experiment, [mjfim.simulate(task.experiment, design.trajectory, seed=0)]
     )
@@ -60,7 +60,7 @@ def printed(summary: Summary) -> str:
 def test_every_table_has_a_cell_for_every_column(
     task: DesignTask, design: Design, estimate: Estimate
 ) -> None:
-    """A renderer may rely on it."""
+    """Renderers rely on tables without missing cells."""
     study = mjfim.monte_carlo(task.experiment, {"final": design.trajectory}, trials=3)
     summaries = (
         describe_design(design, task.system.units),
@@ -76,7 +76,7 @@ def test_every_table_has_a_cell_for_every_column(
 
 
 def test_the_terminal_and_markdown_show_the_same_numbers(task: DesignTask, design: Design) -> None:
-    """The Markdown has the details besides."""
+    """The Markdown also has the details."""
     summary = describe_design(design, task.system.units)
     terminal, markdown = printed(summary), design_text(design, task.system.units)
     for row in summary.table("accuracy").rows:
@@ -88,7 +88,7 @@ def test_the_terminal_and_markdown_show_the_same_numbers(task: DesignTask, desig
 
 
 def test_an_estimate_names_units_bounds_and_warnings(estimate: Estimate) -> None:
-    """In the terminal and in Markdown."""
+    """Units, bounds and warnings are in the terminal and in the Markdown."""
     odd = replace(estimate, at_bound=("l",), misfit=True, warnings=("residuals are [odd]",))
     for text in (printed(describe_estimate(odd)), estimate_text(odd, "see the report")):
         assert "c (N m s/rad)" in text
@@ -98,8 +98,8 @@ def test_an_estimate_names_units_bounds_and_warnings(estimate: Estimate) -> None
     assert "at bound" not in printed(describe_estimate(estimate))
 
 
-def test_what_is_not_identifiable_alone_is_said_so(task: DesignTask, design: Design) -> None:
-    """Its combination has a row of its own, and nothing is divided by zero."""
+def test_inseparable_parameters_are_marked(task: DesignTask, design: Design) -> None:
+    """The combination has a row, and nothing is divided by zero."""
     std = np.array([np.inf, 0.1, 0.1])
     combined = CombinationAccuracy(expression="m + 2 l", value=0.0, std_initial=0.4, std_final=0.1)
     blind = replace(
@@ -114,14 +114,14 @@ def test_what_is_not_identifiable_alone_is_said_so(task: DesignTask, design: Des
 
 
 def test_improvements_in_words() -> None:
-    """Smaller, larger, or neither."""
+    """A standard deviation may become smaller, larger, or be undefined."""
     assert improvement(2.0, 0.5) == "4.0 ×"
     assert improvement(0.5, 2.0) == "4.0 × larger"
     assert improvement(np.inf, 2.0) == improvement(1.0, 0.0) == "-"
 
 
 def test_cells_in_words() -> None:
-    """Units in brackets; words for numbers that are none."""
+    """Units are in brackets; NaN and infinity have words."""
     assert str(Name(name="m", unit="kg")) == "m (kg)" and str(Name(name="ratio")) == "ratio"
     assert str(Quantity(value=0.12345, digits=2, suffix=" %")) == "0.12 %"
     assert str(Quantity(value=np.nan)) == "-"
@@ -129,12 +129,12 @@ def test_cells_in_words() -> None:
 
 
 def test_bars_do_not_break_a_markdown_table(design: Design, task: DesignTask) -> None:
-    """A name may hold one."""
+    """A vertical bar in a name is escaped."""
     odd = replace(design, parameters=("a|b", *design.parameters[1:]))
     assert r"a\|b (kg)" in render_markdown(describe_design(odd, task.system.units))
 
 
 def test_long_paths_keep_their_end() -> None:
-    """The end tells files apart."""
+    """The end of a path distinguishes files."""
     assert shortened("logs/monday/run_1.csv", 20) == "run_1.csv"
     assert shortened("x" * 30 + "_7.csv", 10) == "…xxx_7.csv"
