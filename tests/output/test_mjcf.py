@@ -70,8 +70,8 @@ RICH = """<?xml version="1.0"?>
     <motor name="m" joint="j" gear="2.0"/>
     <position name="p" joint="k" class="servo"/>
     <velocity name="v" joint="l" kv="3.0"/>
-    <general name="g" joint="l" dyntype="filter" dynprm="0.050" gainprm="2.0"
-      biastype="affine" biasprm="0 -2.0 -0.10"/>
+    <general name="g" joint="l" dyntype="filter"
+      dynprm="0.050" gainprm="2.0" biastype="affine" biasprm="0 -2.0 -0.10"/>
   </actuator>
   <sensor><framepos objtype="site" objname="s" name="seen" noise=".01"/></sensor>
 </mujoco>
