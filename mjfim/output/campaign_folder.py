@@ -85,7 +85,7 @@ class CampaignFolder:
         return number
 
     def _has_design(self, number: int) -> bool:
-        """Whether both files of a round's design are there."""
+        """Return whether both files of a round's design exist."""
         return all((self.round(number) / name).is_file() for name in ("design.json", "design.npz"))
 
     def recorded_rounds(self) -> Iterator[EarlierRound]:

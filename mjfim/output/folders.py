@@ -205,9 +205,11 @@ def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> l
 def _write_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None:
     """Write figures of parameters, residuals and predictions, and of the fit of each recording."""
     sigma = list(estimate.sigma.values())
-    for i in range(len(estimate.recordings)):
-        name = "fit.png" if len(estimate.recordings) == 1 else f"fit_{i + 1}.png"
-        plots.save(plots.fit(estimate, i, labels, sigma), folder / name)
+    count = len(estimate.recordings)
+    for i in range(count):
+        name = "fit.png" if count == 1 else f"fit_{i + 1}.png"
+        figure = plots.fit(estimate, i, labels, sigma)
+        plots.save(figure, folder / name)
 
     plots.save(plots.parameter_intervals(estimate, labels), folder / "parameters.png")
     plots.save(plots.residual_spectra(estimate, labels), folder / "spectra.png")

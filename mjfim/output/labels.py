@@ -54,7 +54,7 @@ class Labels:
 
     @classmethod
     def of_model(cls, model: mujoco.MjModel) -> Labels:
-        """Labels of the joints and actuators of a model."""
+        """Make labels of the joints and actuators of a model."""
         state = state_components(model)[: model.nq]
         tangent = tangent_components(model)[: model.nv]
         names = dof_names(model)
@@ -71,7 +71,7 @@ class Labels:
 
     @classmethod
     def of_system(cls, system: System) -> Labels:
-        """Labels of a system: of its model, its parameters and its outputs."""
+        """Make labels of a system's model, parameters and outputs."""
         base = cls.of_model(system.model)
         outputs = {name: output_label(system.model, name) for name in system.outputs.names}
         return replace(
@@ -82,11 +82,11 @@ class Labels:
         )
 
     def parameter(self, j: int) -> str:
-        """Label of parameter j."""
+        """Return the label of parameter j."""
         return f"{self.parameters[j]} [{self.parameter_units[j] or 'model unit'}]"
 
     def output(self, column: str) -> str:
-        """Label of a measured column."""
+        """Return the label of a measured column."""
         return self.outputs.get(column, f"{column} [model unit]")
 
     def check(self, **sizes: int) -> None:

@@ -66,7 +66,7 @@ class AttributeChange:
         attribute: Name of the attribute.
         old: (n,) numbers of the compiled text.
         new: (n,) wanted numbers.
-        min_count: Smallest number of numbers that MuJoCo accepts for this attribute.
+        min_count: Fewest numbers that MuJoCo accepts for this attribute.
     """
 
     attribute: str
@@ -76,12 +76,12 @@ class AttributeChange:
 
 
 def attribute_changes(element: str, old: Any, wanted: Any, actuator: int) -> list[AttributeChange]:
-    """Express the difference of an actuator between two models by attributes of its element.
+    """Express how an actuator differs between two models by attributes of its element.
 
     Args:
         element: Name of the MJCF element, such as `position`.
         old: Model that the text compiles to.
-        wanted: Model that it shall compile to.
+        wanted: Model that the changed text has to compile to.
         actuator: Index of the actuator.
 
     Returns:
@@ -127,7 +127,7 @@ def attribute_changes(element: str, old: Any, wanted: Any, actuator: int) -> lis
 
 
 def _is_consistent(numbers: tuple[tuple[Entry, ...], ...], arrays: Mapping[str, Array]) -> bool:
-    """Whether all entries that one number sets agree on its value."""
+    """Return whether all entries that one number sets agree on its value."""
     for number in numbers:
         values = {factor * arrays[name][column] for name, column, factor in number}
         if len(values) > 1:
@@ -136,7 +136,7 @@ def _is_consistent(numbers: tuple[tuple[Entry, ...], ...], arrays: Mapping[str, 
 
 
 def _values(numbers: tuple[tuple[Entry, ...], ...], arrays: Mapping[str, Array]) -> Array:
-    """(n,) numbers of an attribute, each read from its first entry."""
+    """Return the (n,) numbers of an attribute, each read from its first entry."""
     values = []
     for number in numbers:
         name, column, factor = number[0]

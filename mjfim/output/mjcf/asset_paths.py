@@ -16,13 +16,13 @@ TYPED_FOLDERS = ("meshdir", "texturedir")
 def relocate_assets(document: MjcfDocument, spec: Any, source: Path, target: Path) -> None:
     """Change asset folders and `<include>`s so that a text of one folder loads from another one.
 
-    Folders from which the model reads no file stay as they are.
+    Folders from which the model reads no file are not changed.
 
     Args:
         document: The text.
         spec: MjSpec of the text.
         source: Folder from which the text loads now.
-        target: Folder from which it shall load.
+        target: Folder from which it has to load.
     """
     if source == target:
         return
@@ -53,7 +53,7 @@ def relocate_assets(document: MjcfDocument, spec: Any, source: Path, target: Pat
 
 
 def _used_folders(document: MjcfDocument, spec: Any) -> list[str]:
-    """Attributes of <compiler> that name a folder from which the model reads files."""
+    """Return the attributes of <compiler> that name a folder from which the model reads files."""
     parts = [element.file for element in (*spec.meshes, *spec.hfields, *spec.skins)]
     parts += [tag.attributes.get("file", "") for tag in document.tags if tag.name == "flexcomp"]
 
@@ -67,7 +67,7 @@ def _used_folders(document: MjcfDocument, spec: Any) -> list[str]:
 
 
 def _any_relative(files: Iterable[str]) -> bool:
-    """Whether some file is named relative to a folder."""
+    """Return whether some file is named relative to a folder."""
     return any(file and not Path(file).is_absolute() for file in files)
 
 

@@ -51,8 +51,8 @@ class MjcfDocument(XmlText):
             text: The MJCF in UTF-8.
 
         Raises:
-            ModelError: The text is not well-formed XML or no MJCF. The message is a clause that
-                completes a sentence.
+            ModelError: The text is no well-formed XML or no MJCF. The message is a clause, without
+                the name of the file.
         """
         super().__init__(text)
         if self.tags[0].name != "mujoco":
@@ -91,7 +91,7 @@ class MjcfDocument(XmlText):
         return [i for i, tag in enumerate(self.tags) if tag.name == name and tag.parent == 0]
 
     def written_numbers(self, tag: int, attribute: str) -> list[str]:
-        """Return the numbers of an attribute as they are written.
+        """Return the numbers of an attribute in the spelling of the text.
 
         Args:
             tag: Index of the tag.
@@ -143,7 +143,7 @@ class MjcfDocument(XmlText):
             attribute: Name of the attribute.
             old: (n,) numbers of the compiled text.
             new: (n,) wanted numbers.
-            min_count: Smallest number of numbers that MuJoCo accepts for this attribute.
+            min_count: Fewest numbers that MuJoCo accepts for this attribute.
             magnitude: Typical size, relative to which a difference counts as rounding.
         """
         before, after = np.atleast_1d(old), np.atleast_1d(new)
@@ -177,7 +177,7 @@ def nearly_equal(a: Array, b: Array, magnitude: float = 0.0) -> np.ndarray:
 
 
 def all_digits(*values: float) -> str:
-    """Write numbers with the digits that give them back exactly.
+    """Write numbers with all digits, so that reading them returns exactly these numbers.
 
     Args:
         values: The numbers.

@@ -21,7 +21,7 @@ from mjfim.output.mjcf.actuators import ARRAYS, attribute_changes
 from mjfim.output.mjcf.document import MjcfDocument, all_digits, nearly_equal
 from mjfim.output.mjcf.inertials import write_inertial
 
-# Number of numbers of the attributes that MuJoCo reads only with all of them.
+# Count of numbers in attributes that MuJoCo accepts only if all of them are stated.
 COMPLETE_COUNTS = {"pos": 3, "gravity": 3, "wind": 3}
 
 # Fields of a body that its <inertial> states.
@@ -50,10 +50,10 @@ DERIVED_TOLERANCE = 1e-12
 
 
 class ParameterEdits:
-    """Edits of an MJCF text that turn the model it compiles to into a wanted one.
+    """Edits of an MJCF text, after which it compiles to a wanted model.
 
-    The methods raise ModelError, with a clause that gives the reason, where the text cannot express
-    a change.
+    The methods raise ModelError if the text cannot express a change; the message is a clause that
+    gives the reason.
 
     Attributes:
         document: The text.
@@ -66,7 +66,7 @@ class ParameterEdits:
             document: The text.
             spec: MjSpec of the text.
             old: Model that the text compiles to.
-            wanted: Model that it shall compile to.
+            wanted: Model that the edited text has to compile to.
         """
         self.document = document
         self._spec = spec
@@ -110,7 +110,7 @@ class ParameterEdits:
             self.document.insert_child(0, "option", self._new_option)
 
     def write_derived(self, compiled: Any) -> list[str]:
-        """State the numbers that the compiler would derive differently from the changed ones.
+        """State numbers that the compiler would derive from the changed ones with another result.
 
         Args:
             compiled: Model that the edited text compiles to.
@@ -185,7 +185,7 @@ class ParameterEdits:
         self.document.set_numbers(tag, field, old, new, min_count=min_count)
 
     def _is_in_degrees(self, joint: str) -> bool:
-        """Whether the text states the coordinate of a joint in degrees."""
+        """Return whether the text states the coordinate of a joint in degrees."""
         is_hinge = self._spec.joint(joint).type == mujoco.mjtJoint.mjJNT_HINGE
         return bool(self._spec.compiler.degree and is_hinge)
 
@@ -240,7 +240,7 @@ class ParameterEdits:
         self.document.set_exclusively(tag, "quat", all_digits(*new))
 
     def _write_geom(self, name: str) -> None:
-        """Write position and size of a geom, or the end points that state both."""
+        """Write position and size of a geom, or its end points if the text states these."""
         old, new = self._old.geom(name), self._wanted.geom(name)
         radius = float(self._old.geom_rbound[old.id])
 
@@ -266,7 +266,7 @@ class ParameterEdits:
         self.document.set_numbers(tag, "pos", before, after, min_count=3, magnitude=radius)
 
     def _write_end_points(self, tag: int, old: Any, new: Any, stated: Any) -> None:
-        """Write the radius and the end points of a geom that is stated by them."""
+        """Write the radius and the end points of a geom whose pose is stated by end points."""
         radius = float(self._old.geom_rbound[old.id])
         column = LENGTH_COLUMNS.get(int(stated.type), DEFAULT_LENGTH_COLUMN)
 
@@ -290,7 +290,7 @@ class ParameterEdits:
 
 
 def _numbers(model: Any, target_field: ModelField) -> Array:
-    """(n,) all numbers of the array row in which a field is."""
+    """Return the (n,) numbers of the array row that contains a field."""
     if target_field.in_options:
         return np.atleast_1d(getattr(model.opt, target_field.array))
     return np.atleast_1d(getattr(model, target_field.array)[target_field.rows[0]])
@@ -309,6 +309,6 @@ def _derived_rows(model: Any) -> Iterator[tuple[str, str, str, int, int]]:
 
 
 def _parts(target: Target) -> tuple[str, str, str]:
-    """Kind, name and field of a parameter's path."""
+    """Return kind, name and field of a parameter's path."""
     path = ParameterPath.parse(target.path)
     return path.kind, path.name, path.field

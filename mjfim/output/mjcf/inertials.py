@@ -46,7 +46,7 @@ def write_inertial(
         document: The text.
         name: Name of the body.
         old: Model that the text compiles to.
-        wanted: Model that it shall compile to.
+        wanted: Model that the edited text has to compile to.
         as_matrix: Whether the parameters vary the matrix as a whole, so that its principal axes may
             turn.
 
@@ -81,7 +81,7 @@ def write_inertial(
 
 
 def _child(document: MjcfDocument, parent: int, name: str) -> int | None:
-    """Tag of the first child of a name, None if there is none."""
+    """Return the tag of the first child of a name, None if there is none."""
     return next(
         (i for i, tag in enumerate(document.tags) if tag.name == name and tag.parent == parent),
         None,
@@ -132,12 +132,12 @@ def _write_principal(document: MjcfDocument, tag: int, wanted: Any, body: int) -
 
 
 def _full_inertia(inertia: Array) -> dict[str, str]:
-    """Attributes that state a (3, 3) matrix in the axes of the body."""
+    """Return the attributes that state a (3, 3) matrix in the axes of the body."""
     return {"fullinertia": all_digits(*_rounded(inertia))}
 
 
 def _principal_inertia(model: Any, body: int) -> dict[str, str]:
-    """Attributes that state the principal moments and axes of a model's body."""
+    """Return the attributes that state the principal moments and axes of a body."""
     quat = model.body_iquat[body]
     moments = {"diaginertia": all_digits(*model.body_inertia[body])}
     if nearly_equal(quat, IDENTITY, 1.0).all():

@@ -202,7 +202,7 @@ def same_dynamics(a: Any, b: Any) -> bool:
 
 
 def _differences(a: Any, b: Any) -> list[str]:
-    """Names of the arrays that determine the motion and differ between two models."""
+    """Return the arrays that determine the motion and differ between two models."""
     names = [n for n in dir(a) if n.startswith(COMPARED) and not n.startswith(NOT_DYNAMICS)]
     found = [name for name in names if not _equal(getattr(a, name), getattr(b, name))]
     found += [n for n in MODEL_ARRAYS["option"] if not _equal(getattr(a.opt, n), getattr(b.opt, n))]
@@ -222,7 +222,7 @@ def _differences(a: Any, b: Any) -> list[str]:
 
 
 def _equal(x: Any, y: Any) -> bool:
-    """Whether two arrays have the same shape and nearly the same numbers."""
+    """Return whether two arrays have the same shape and nearly the same numbers."""
     x, y = np.asarray(x), np.asarray(y)
     return x.shape == y.shape and np.allclose(
         x, y, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE
@@ -230,11 +230,11 @@ def _equal(x: Any, y: Any) -> bool:
 
 
 def _reweighted_bodies(a: Any, b: Any, same_class: bool) -> list[str]:
-    """Names of the bodies whose constraint weight differs between two models.
+    """Return the bodies whose constraint weight differs between two models.
 
-    In a fit the bodies that a parameter moves are never 'simple', and MuJoCo averages the weight of
-    a simple body differently. same_class: whether bodies are meant that are 'simple' in both models
-    or in neither, else in one of them.
+    In a fit the bodies that a parameter changes are never 'simple', and MuJoCo averages the weight
+    of a simple body differently. With `same_class`, only bodies count that are 'simple' in both
+    models or in neither; without it, only bodies that are 'simple' in one of them.
     """
     close = np.isclose(
         a.body_invweight0, b.body_invweight0, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE
@@ -247,7 +247,7 @@ def _reweighted_bodies(a: Any, b: Any, same_class: bool) -> list[str]:
 
 
 def _inertia_matrices(model: Any) -> Array:
-    """(nbody, 3, 3) inertias in the axes of their bodies [kg m²]."""
+    """Return the (nbody, 3, 3) inertias in the axes of their bodies [kg m²]."""
     R = Rotation.from_quat(model.body_iquat, scalar_first=True).as_matrix()
     return np.asarray(np.einsum("bij,bj,bkj->bik", R, model.body_inertia, R))
 

@@ -32,7 +32,7 @@ TextChange = tuple[int, int, bytes]
 
 @dataclass(frozen=True, kw_only=True)
 class Tag:
-    """Start tag of an element, as it was read.
+    """Start tag of an element in the original text.
 
     Attributes:
         name: Name of the element.
@@ -186,7 +186,7 @@ class XmlText:
         return text
 
     def _changes_of_tag(self, tag: int) -> list[TextChange]:
-        """All changes to one element."""
+        """Return all changes to one element."""
         name_start = self.tags[tag].start + 1
         name_stop = self._name_stop(name_start)
 
@@ -205,7 +205,7 @@ class XmlText:
         return [*attributes, *renamed, (stop, stop, added), *self._child_changes(tag, stop)]
 
     def _attribute_changes(self, tag: int, position: int) -> tuple[list[TextChange], int, bytes]:
-        """Changes to the attributes that begin at a position.
+        """Return the changes to the attributes that begin at a position.
 
         Returns:
             Changes to existing attributes, the position after the last attribute, and the text of
@@ -238,12 +238,12 @@ class XmlText:
         return changes, position, b"".join(added)
 
     def _name_stop(self, start: int) -> int:
-        """Position after the name that begins at a position."""
+        """Return the position after the name that begins at a position."""
         found = NAME.match(self._text, start)
         return start if found is None else found.end()
 
     def _child_changes(self, tag: int, stop: int) -> list[TextChange]:
-        """Insertion of new children into an element whose last attribute ends at a position."""
+        """Return the insertion of new children; `stop` is the end of the last attribute."""
         if tag not in self._children:
             return []
         if EMPTY_END.match(self._text, stop):
@@ -255,7 +255,7 @@ class XmlText:
         return [(content, content, inserted)]
 
     def _last_line_break(self, position: int) -> bytes:
-        """Line break and indentation before the text that follows the white space at a position."""
+        """Return the line break and the indentation in the white space at a position."""
         found = SPACE.match(self._text, position)
         space = b"" if found is None else found[0]
 
@@ -266,10 +266,10 @@ class XmlText:
 
 
 def _escaped(value: str) -> bytes:
-    """Value of an attribute as it is written between quotes."""
+    """Return the bytes of an attribute's value between its quotes."""
     return escape(value, QUOTES).encode("utf-8", "surrogateescape")
 
 
 def _attribute_text(name: str, value: str | None) -> bytes:
-    """Attribute as it is written in a start tag."""
+    """Return the bytes of an attribute in a start tag."""
     return b'%s="%s"' % (name.encode(), _escaped(value or ""))

@@ -169,8 +169,7 @@ def export(system: System, recordings: Sequence[Recording]) -> Exported:
 def _initial_state(system: System) -> Any:
     """Return the stated initial state, at the guess, in the form of sysid."""
     state = system.plant.initial_state(system.parameters.guess)
-    nq, nv = system.model.nq, system.model.nv
-    qpos, qvel, act = state[:nq], state[nq : nq + nv], state[nq + nv :]
+    qpos, qvel, act = system.space.split(state)
     return sysid.create_initial_state(system.model, qpos, qvel, act)
 
 
