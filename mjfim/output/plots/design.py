@@ -46,7 +46,7 @@ PARAMETER_NAME_WIDTH = 18
 # enlarged.
 ENLARGING_RATIO = 4.0
 
-# Height that a panel gains for the enlarged loop, as a share of its own height.
+# Height that a panel gains for the enlarged loop, as a share of the height without it.
 ENLARGED_LOOP_HEIGHT = 0.62
 
 

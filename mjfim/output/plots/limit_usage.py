@@ -57,7 +57,10 @@ def limits(design: Design) -> Figure:
         lowest = i + columns >= len(kinds)
         _draw_kind(axes, design, kind, "time [s]" if lowest else "")
 
-    note = "All engine steps of the stated model are shown; beyond the bounds it is grey."
+    note = (
+        "All engine steps of the stated model, relative to the bounds at ±1; grey: beyond a bound. "
+        "Percentages: largest share of a limit that is used. Margins: in the unit of the limit."
+    )
     end_limits = [
         _margin_in_words(kind, margin)
         for kind, margin in design.limits.items()
@@ -83,7 +86,7 @@ def _draw_kind(axes: Axes, design: Design, kind: str, xlabel: str) -> None:
         frameon=False,
     )
 
-    ylabel = "required / actual distance [–]" if is_clearance else "value / half range [–]"
+    ylabel = "required / actual distance [–]" if is_clearance else "position in range [–]"
     format_axes(axes, xlabel, ylabel)
     margin = design.limits.get(kind, np.nan)
     axes.set_title(
@@ -97,8 +100,10 @@ def _draw_kind(axes: Axes, design: Design, kind: str, xlabel: str) -> None:
 
 def _margin_in_words(kind: str, margin: float) -> str:
     """Say whether a limit holds, and by which margin."""
-    verdict = "kept by" if margin >= 0.0 else "VIOLATED by"
-    return f"{kind.replace('_', ' ')}: {verdict} {format_number(abs(margin))}"
+    words = kind.replace("_", " ")
+    if margin < 0.0:
+        return f"{words}: VIOLATED by {format_number(-margin)}"
+    return f"{words}: smallest margin {format_number(margin)}"
 
 
 def _largest_share(usage: LimitUsage) -> float:

@@ -16,8 +16,14 @@ from mjfim.records.robustness import (
     Robustness,
 )
 
-# Largest error that is drawn [standard deviations]; larger ones are drawn there.
+# Largest error on the axis [standard deviations]; larger errors are drawn at this value.
 LARGEST_DRAWN_ERROR = 5.0
+
+# Smallest margin on the axis, over half of the range; smaller margins are drawn at this value.
+LEAST_DRAWN_MARGIN = -1.0
+
+# Characters to which the names of limits and of parameters are shortened.
+LIMIT_NAME_WIDTH, PARAMETER_NAME_WIDTH = 26, 24
 
 
 def robustness_figure(result: Robustness) -> Figure:
@@ -48,47 +54,35 @@ def robustness_figure(result: Robustness) -> Figure:
 
 def _draw_limits(axes: Axes, result: Robustness) -> None:
     """Draw a row per limit: margin of the design, and of every robot."""
-    style.format_axes(axes, "margin over half of the range [%]")
-    rng = np.random.default_rng(0)
     limits = result.limits
-    place = np.arange(len(limits))[::-1]
-    shown = 100.0 * np.maximum(result.margins, -1.0)
-    low = min(-5.0, float(shown.min(initial=0.0)) - 5.0)
+    rows = np.arange(len(limits))[::-1]
+    percent = 100.0 * np.maximum(result.margins, LEAST_DRAWN_MARGIN)
+    low = min(-5.0, float(percent.min(initial=0.0)) - 5.0)
+    high = max(100.0, 100.0 * float(result.planned.max(initial=0.0)) + 5.0)
+
+    # The robots of a row are spread at random over its height, so that all dots are visible.
+    rng = np.random.default_rng(0)
+    style.format_axes(axes, "margin over half of the range [%]")
     axes.axvspan(low, 0.0, color=style.OPTIMIZED_COLOUR, alpha=0.10, linewidth=0.0)
-    for i, y in enumerate(place):
+    for i, row in enumerate(rows):
         colour = style.INITIAL_COLOUR if result.kept[:, i].all() else style.OPTIMIZED_COLOUR
-        spread = y + rng.uniform(-0.22, 0.22, result.runs)
+        heights = row + rng.uniform(-0.22, 0.22, result.runs)
         axes.plot(
-            shown[:, i], spread, ".", color=colour, markersize=4.5, alpha=0.4, markeredgewidth=0.0
+            percent[:, i], heights, ".", color=colour, markersize=4.5, alpha=0.4, markeredgewidth=0
         )
-        axes.plot(
-            [100.0 * result.planned[i]] * 2,
-            [y - 0.32, y + 0.32],
-            color=style.TEXT_COLOUR,
-            linewidth=1.6,
-        )
-    axes.set_yticks(
-        place,
-        [style.shorten(f"{limit.kind.replace('_', ' ')} {limit.name}", 26) for limit in limits],
-    )
-    axes.set_xlim(low, max(100.0, 100.0 * float(result.planned.max(initial=0.0)) + 5.0))
+
+        planned = 100.0 * result.planned[i]
+        ends = (row - 0.32, row + 0.32)
+        axes.plot((planned, planned), ends, color=style.TEXT_COLOUR, linewidth=1.6)
+
+    names = [f"{limit.kind.replace('_', ' ')} {limit.name}" for limit in limits]
+    axes.set_yticks(rows, [style.shorten(name, LIMIT_NAME_WIDTH) for name in names])
+    axes.set_xlim(low, high)
     axes.set_ylim(-0.7, len(limits) - 0.3)
     title = f"Limits at every engine step: {result.all_kept} of {result.runs} robots keep all"
     axes.set_title(title, fontsize=style.NORMAL_FONT, loc="left", color=style.TEXT_COLOUR)
-    handles = [
-        Line2D([], [], color=style.TEXT_COLOUR, linewidth=1.6, label="plan"),
-        Line2D([], [], color=style.INITIAL_COLOUR, marker=".", linestyle="", label="robots"),
-        Line2D(
-            [],
-            [],
-            color=style.OPTIMIZED_COLOUR,
-            marker=".",
-            linestyle="",
-            label="robots; some exceed the limit",
-        ),
-    ]
     axes.legend(
-        handles=handles,
+        handles=_limit_handles(),
         fontsize=style.SMALL_FONT,
         frameon=False,
         loc="upper left",
@@ -97,10 +91,31 @@ def _draw_limits(axes: Axes, result: Robustness) -> None:
     )
 
 
+def _limit_handles() -> list[Line2D]:
+    """Return the entries of the legend of the limits."""
+    keeping = Line2D(
+        [],
+        [],
+        color=style.INITIAL_COLOUR,
+        marker=".",
+        linestyle="",
+        label="robots, all keep the limit",
+    )
+    exceeding = Line2D(
+        [],
+        [],
+        color=style.OPTIMIZED_COLOUR,
+        marker=".",
+        linestyle="",
+        label="robots, some exceed the limit",
+    )
+    planned = Line2D([], [], color=style.TEXT_COLOUR, linewidth=1.6, label="planned")
+    return [planned, keeping, exceeding]
+
+
 def _draw_errors(axes: Axes, result: Robustness) -> None:
     """Draw the errors of all estimates in standard deviations."""
     style.format_axes(axes, "", "(estimate − truth) / σ")
-    rng = np.random.default_rng(0)
     axes.axhspan(
         -INTERVAL_HALF_WIDTH,
         INTERVAL_HALF_WIDTH,
@@ -109,15 +124,28 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
         linewidth=0.0,
     )
     axes.axhline(0.0, color=style.MUTED_COLOUR, linewidth=0.8)
+
+    # The robots of a parameter are spread at random, so that all dots are visible.
+    rng = np.random.default_rng(0)
     for j in range(len(result.names)):
         z = np.clip(result.z[:, j], -LARGEST_DRAWN_ERROR, LARGEST_DRAWN_ERROR)
-        hit = np.abs(z) <= INTERVAL_HALF_WIDTH
         x = j + rng.uniform(-0.28, 0.28, len(z))
-        for some, colour in ((hit, style.MEASURED_COLOUR), (~hit, style.OPTIMIZED_COLOUR)):
+        inside = np.abs(z) <= INTERVAL_HALF_WIDTH
+        for chosen, colour in (
+            (inside, style.MEASURED_COLOUR),
+            (~inside, style.OPTIMIZED_COLOUR),
+        ):
             axes.plot(
-                x[some], z[some], ".", color=colour, markersize=4.0, alpha=0.7, markeredgewidth=0.0
+                x[chosen],
+                z[chosen],
+                ".",
+                color=colour,
+                markersize=4.0,
+                alpha=0.7,
+                markeredgewidth=0.0,
             )
-    axes.set_ylim(-5.2, 5.2)
+
+    axes.set_ylim(-LARGEST_DRAWN_ERROR - 0.2, LARGEST_DRAWN_ERROR + 0.2)
     axes.set_title(
         "Errors of the estimates; shaded: range of 95 %",
         fontsize=style.NORMAL_FONT,
@@ -154,34 +182,45 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
 
 def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
     """Draw the errors of the guess, the predicted and the observed errors of each unknown."""
-    x = np.arange(len(result.names))
     style.format_axes(axes, "", "error [% of the guess's]")
-    before = np.where(result.wrong > 0.0, result.wrong, np.nan)
-    for y, marker, colour, label in (
-        (np.full(len(x), 100.0), "o", style.MUTED_COLOUR, "guess"),
-        (100.0 * result.predicted / before, "_", style.TEXT_COLOUR, "σ predicted by the design"),
-        (
-            100.0 * result.observed / before,
-            ".",
-            style.OPTIMIZED_COLOUR,
-            "rms error of the estimates",
-        ),
-    ):
-        size = {"o": 4.0, "_": 20.0, ".": 9.0}[marker]
-        axes.plot(
-            x,
-            y,
-            marker,
-            color=colour,
-            markersize=size,
-            markeredgewidth=1.8 if marker == "_" else 0.0,
-            label=label,
-        )
+    x = np.arange(len(result.names))
+    guess = np.where(result.wrong > 0.0, result.wrong, np.nan)
+    predicted, observed = result.predicted / guess, result.observed / guess
+
+    axes.plot(
+        x,
+        np.full(len(x), 100.0),
+        "o",
+        color=style.MUTED_COLOUR,
+        markersize=4.0,
+        markeredgewidth=0.0,
+        label="guess",
+    )
+    axes.plot(
+        x,
+        100.0 * predicted,
+        "_",
+        color=style.TEXT_COLOUR,
+        markersize=20.0,
+        markeredgewidth=1.8,
+        label="σ predicted by the design",
+    )
+    axes.plot(
+        x,
+        100.0 * observed,
+        ".",
+        color=style.OPTIMIZED_COLOUR,
+        markersize=9.0,
+        markeredgewidth=0.0,
+        label="rms error of the estimates",
+    )
+
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    low = float(np.nanmin([result.predicted / before, result.observed / before], initial=1.0))
+    low = float(np.nanmin([predicted, observed], initial=1.0))
     axes.set_ylim(60.0 * low, 400.0)
-    axes.set_xticks(x, [style.shorten(name, 24) for name in result.names], rotation=30, ha="right")
+    names = [style.shorten(name, PARAMETER_NAME_WIDTH) for name in result.names]
+    axes.set_xticks(x, names, rotation=30, ha="right")
     axes.legend(
         fontsize=style.SMALL_FONT,
         frameon=False,

@@ -275,9 +275,10 @@ def add_title(figure: Figure, title: str, handles: Sequence[Artist] = (), note: 
     """
     left = 0.12 / figure.get_figwidth()
 
-    # The second, empty line of the title keeps room for the legend.
+    # A second, empty line of the title keeps room for the legend.
+    lines = f"{title}\n " if handles else title
     figure.suptitle(
-        f"{title}\n ", x=left, ha="left", fontsize=LARGE_FONT, color=TEXT_COLOUR, linespacing=1.3
+        lines, x=left, ha="left", fontsize=LARGE_FONT, color=TEXT_COLOUR, linespacing=1.3
     )
     if handles:
         figure.legend(

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.output.rerun.scene import BodyPoses, moving_geoms
 
-# Vertical field of view that has to hold the scene [rad]; a little less than the viewer's, which
+# Vertical field of view that holds the scene [rad]; a little less than that of the viewer, which
 # leaves a margin.
 FIELD_OF_VIEW = np.radians(50.0)
 
-# Half the height of the frame at a distance of 1, with a margin.
+# Half of the height that is in view, as a multiple of the height of the scene, with a margin.
 HALF_FRAME = 0.56
 
 # Samples of a motion from which the camera is placed.
