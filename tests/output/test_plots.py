@@ -424,9 +424,9 @@ def test_intervals_flag_bounds_and_misfit() -> None:
     text = all_text(
         plots.parameter_intervals(make_estimate(misfit=True), make_labels(2, 3))
     ).replace("\n", " ")
-    assert text.count("N m s/rad   at its bound") == 1
-    assert "kg   at its bound" not in text
-    assert "no interval covers what a wrong model does" in text
+    assert text.count("N m s/rad   (at its bound)") == 1
+    assert "kg   (at its bound)" not in text
+    assert "no interval covers the bias of a wrong model" in text
 
 
 def test_intervals_with_infinite_std(tmp_path: Path) -> None:
