@@ -63,6 +63,9 @@ BEST_CASE = (
     "σ is the Cramér-Rao bound: the best case, reached if the model and the stated noise are right."
 )
 
+# Names of the trajectories of a study in titles, where they differ from those in the record.
+TRAJECTORY_NAMES = {"final": "optimized"}
+
 # Digits as subscripts.
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
@@ -556,9 +559,8 @@ def _efficiency_table(
         )
         rows.append(Row(cells=cells, trajectory=trajectory))
 
-    title = (
-        f"{trajectory}: {trials.trials} trials, {trials.failed} failed, {study.measure_rate:g} Hz"
-    )
+    shown = TRAJECTORY_NAMES.get(trajectory, trajectory)
+    title = f"{shown}: {trials.trials} trials, {trials.failed} failed, {study.measure_rate:g} Hz"
     return SummaryTable(
         key=f"efficiency {trajectory}",
         title=title,

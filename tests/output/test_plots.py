@@ -299,6 +299,19 @@ def test_phase_plots_are_limited_in_number_and_say_so() -> None:
     assert "4 of 14" in all_text(figure) and "6 of 30" in all_text(figure)
 
 
+def test_phase_plots_do_not_draw_rounding_errors() -> None:
+    """A sensitivity far below that of the other degrees of freedom is replaced by a message."""
+    design = make_design(2, 3)
+    evaluations = {}
+    for key in ("initial", "final"):
+        psi = getattr(design, key).sensitivity.copy()
+        psi[:, [0, 2], 1] *= 1e-9
+        evaluations[key] = dataclasses.replace(getattr(design, key), sensitivity=psi)
+
+    figure = plots.sensitivity_phase(dataclasses.replace(design, **evaluations), make_labels(2, 3))
+    assert all_text(figure).count("no sensitivity") == 1 + 1  # a panel and the note
+
+
 def test_histogram_reports_failed_trials_and_efficiency() -> None:
     text = all_text(plots.histogram(make_study(3, failed=7), 0, make_labels(2, 3)))
     assert "200 trials, 7 failed" in text

@@ -15,8 +15,8 @@ from mjfim.records.campaign import Campaign
 # Largest number of parameters that are drawn; those with a target accuracy come first.
 MAX_PARAMETERS = 8
 
-# Characters to which the names of parameters and the title are shortened.
-PARAMETER_NAME_WIDTH, TITLE_WIDTH = 18, 100
+# Characters to which the names of parameters are shortened.
+PARAMETER_NAME_WIDTH = 18
 
 # Digits of the tick values of a logarithmic axis, from few to many ticks per decade.
 TICK_DIGITS = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8))
@@ -50,14 +50,12 @@ def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: 
         panels[-1, column].set_xlabel("round")
         figure.align_ylabels(panels[:, column])
 
-    outcome = campaign.status.value.split(":")[0]
-    title = f"{len(campaign.rounds)} rounds of design, recording and estimate: {outcome}"
+    title = f"{len(campaign.rounds)} rounds of design, recording and estimate"
     note = (
-        "Bars, and the band of the last round: ± 1 and ± 2 formal σ, which are the true accuracy "
-        "only if the model and the noise are right."
+        f"{campaign.status.value}. Bars, and the band of the last round: ± 1 and ± 2 formal σ, "
+        "which are the true accuracy only if the model and the noise are right."
     )
-    handles = _handles(simulated=simulated)
-    style.add_title(figure, style.shorten(title, TITLE_WIDTH), handles, note)
+    style.add_title(figure, title, _handles(simulated=simulated), note[0].upper() + note[1:])
     return figure
 
 

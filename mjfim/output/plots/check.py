@@ -95,7 +95,7 @@ def _draw_standard_deviations(axes: Axes, rows: list[ParameterCheck]) -> None:
     low = float(shown.min()) / 3.0
     high = max(float(shown.max()) * 4.0, 0.2)
 
-    format_axes(axes, "predicted standard deviation, relative to the parameter's size")
+    format_axes(axes, "predicted standard deviation, relative to the parameter's size [–]")
     axes.set_xscale("log")
     axes.set_xlim(low, high)
     axes.set_ylim(len(rows) - 0.4, -0.6)

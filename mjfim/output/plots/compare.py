@@ -146,10 +146,10 @@ def _ratios(comparison: Comparison) -> _Ratios | None:
     against_design = design is not None and bool(np.isfinite(design.std[wanted]).any())
 
     reference = comparison.scale[wanted]
-    title = "σ of each parameter, divided by its scale"
+    title = "σ of each parameter / its scale"
     if design is not None and against_design:
         reference = design.std[wanted]
-        title = "σ of each parameter, divided by that of the design"
+        title = "σ of each parameter / σ of the design"
 
     std = np.array([row.std[wanted] for row in comparison.rows])
     values = std.reshape(len(comparison.rows), len(wanted)) / reference

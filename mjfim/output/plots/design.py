@@ -39,8 +39,14 @@ MAX_PANELS_IN_TWO_COLUMNS = 9
 # Largest number of parameters and of degrees of freedom in the phase plots of the sensitivities.
 MAX_PHASE_PARAMETERS, MAX_PHASE_DOFS = 6, 4
 
+# Largest number of intervals between the ticks of the horizontal axis of a phase plot.
+MAX_PHASE_TICKS = 5
+
 # Characters to which the names of parameters are shortened in the phase plots.
 PARAMETER_NAME_WIDTH = 18
+
+# Share of the largest sensitivity to a parameter below which a sensitivity is a rounding error.
+NEGLIGIBLE_SENSITIVITY = 1e-7
 
 # Ratio of the optimized to the initial loop of sensitivities above which the initial one is drawn
 # enlarged.
@@ -112,8 +118,8 @@ def trajectories(design: Design, labels: Labels) -> Figure:
     )
 
     note = (
-        "λ_min: smallest eigenvalue of the Fisher information per measurement rate, "
-        "accumulated up to time t."
+        "λ_min: smallest eigenvalue of the Fisher information up to time t, divided by the "
+        "measurement rate."
     )
     add_title(
         figure, "Trajectories and the information that they gather", trajectory_handles(), note
@@ -207,10 +213,15 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
     for row, dof in enumerate(dofs):
         for column, j in enumerate(parameters):
             axes = figure.add_subplot(grid[row, column])
+            _label_phase_axes(axes, labels, int(dof), int(j))
+            if _is_insensitive(design, int(dof), int(j)):
+                write_message(axes, "no sensitivity")
+                axes.set(xticks=[], yticks=[])
+                continue
+
             loops = _loops(design, int(dof), int(j))
             _draw_loops(axes, loops)
             _enlarge_initial_loop(axes, loops)
-            _label_phase_axes(axes, labels, int(dof), int(j))
 
     note = (
         "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative. "
@@ -274,12 +285,23 @@ def _loops(design: Design, dof: int, j: int) -> tuple[Array, Array]:
     return design.initial.sensitivity[:, columns, j], design.final.sensitivity[:, columns, j]
 
 
+def _is_insensitive(design: Design, dof: int, j: int) -> bool:
+    """Return whether a degree of freedom reacts to parameter j by rounding errors only."""
+    largest = max(
+        np.abs(evaluation.sensitivity[..., j]).max()
+        for evaluation in (design.initial, design.final)
+    )
+    of_dof = max(np.abs(loop).max() for loop in _loops(design, dof, j))
+    return bool(of_dof <= NEGLIGIBLE_SENSITIVITY * largest)
+
+
 def _draw_loops(axes: Axes, loops: tuple[Array, Array]) -> None:
     """Draw both loops; the initial one lies on top, because it is the smaller one."""
     initial, optimized = loops
     axes.plot(*initial.T, color=INITIAL_COLOUR, linewidth=1.5, zorder=3)
     axes.plot(*optimized.T, color=OPTIMIZED_COLOUR, linewidth=1.7, zorder=2)
     axes.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=3.5, zorder=4)
+    axes.locator_params(axis="x", nbins=MAX_PHASE_TICKS)
 
 
 def _enlarge_initial_loop(axes: Axes, loops: tuple[Array, Array]) -> None:
@@ -364,6 +386,7 @@ def convergence(design: Design) -> Figure:
     if relative_slope is not None:
         handles.append(Line2D([], [], color=MUTED_COLOUR, linestyle=":", label="slope / J"))
     note = f"{design.status.value}."
+    note = note[0].upper() + note[1:]
     if has_barrier:
         note += (
             " Dashed lines: a new barrier stage begins; with limits, the slope is that of log J "

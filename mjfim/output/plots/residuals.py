@@ -75,7 +75,7 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
         axes.set_visible(False)
     for axes, column in zip(grid.ravel(), columns, strict=False):
         name, _ = split_unit(labels.output(outputs[column]))
-        format_axes(axes, ylabel=f"{break_before_unit(name)}\nover white noise [–]")
+        format_axes(axes, ylabel=f"{break_before_unit(name)}\npower / white noise [–]")
         _draw_spectrum(axes, estimate, int(column), float(sigma[column]))
     for axes in grid[-1]:
         axes.set_xlabel("frequency [Hz]")
@@ -87,7 +87,7 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
     ]
     note = (
         "Power above the band at low frequencies: the model lacks a slow effect. "
-        "Samples count as evenly spaced."
+        "p(white): p-value of a test for white noise. Samples count as evenly spaced."
     )
     add_title(figure, "Spectra of the residuals", handles, note)
     return figure
@@ -168,7 +168,7 @@ def _draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) ->
     if column < len(estimate.whiteness):
         test = estimate.whiteness[column]
         p = "below 10⁻⁶" if test.p < SMALLEST_WRITTEN_P else format_number(test.p, 2)
-        text = f"lag-1 correlation {test.correlation:+.2f},  p(white) {p}"
+        text = f"lag-1 correlation {test.correlation:+.2f},  p(white) {p}".replace("-0", "−0")
         axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=3)
 
 
@@ -207,7 +207,8 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
     ]
     note = (
         "The identified parameters were fitted to all other recordings; "
-        "of the predicted recording only the initial state is estimated."
+        "of the predicted recording only the initial state is estimated. On the right: error of "
+        "the identified model, and its ratio to that of the nominal model."
     )
     if not all(prediction.held_out for prediction in found):
         note += " *: also part of the final fit; predicted here by a fit to the other recordings."

@@ -68,7 +68,7 @@ def _draw_limits(axes: Axes, result: Robustness) -> None:
         colour = style.INITIAL_COLOUR if result.kept[:, i].all() else style.OPTIMIZED_COLOUR
         heights = row + rng.uniform(-0.22, 0.22, result.runs)
         axes.plot(
-            percent[:, i], heights, ".", color=colour, markersize=4.5, alpha=0.4, markeredgewidth=0
+            percent[:, i], heights, "o", color=colour, markersize=3.5, alpha=0.5, markeredgewidth=0
         )
 
         planned = 100.0 * result.planned[i]
@@ -138,10 +138,10 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
             axes.plot(
                 x[chosen],
                 z[chosen],
-                ".",
+                "o",
                 color=colour,
-                markersize=4.0,
-                alpha=0.7,
+                markersize=3.5,
+                alpha=0.6,
                 markeredgewidth=0.0,
             )
 
@@ -182,7 +182,7 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
 
 def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
     """Draw the errors of the guess, the predicted and the observed errors of each unknown."""
-    style.format_axes(axes, "", "error [% of the guess's]")
+    style.format_axes(axes, "", "error / error of guess [%]")
     x = np.arange(len(result.names))
     guess = np.where(result.wrong > 0.0, result.wrong, np.nan)
     predicted, observed = result.predicted / guess, result.observed / guess

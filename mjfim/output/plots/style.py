@@ -240,6 +240,11 @@ def format_axes(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
     axes.grid(True, color=GRID_COLOUR, linewidth=0.6)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=SMALL_FONT, color=MUTED_COLOUR, labelcolor=TEXT_COLOUR)
+
+    # A common power of ten of the ticks stands beside the axis, where no label is.
+    axes.xaxis.get_offset_text().set(x=1.02, ha="left", fontsize=SMALL_FONT)
+    axes.yaxis.get_offset_text().set(fontsize=SMALL_FONT)
+
     axes.set_xlabel(xlabel, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
     axes.set_ylabel(ylabel, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
     return axes
