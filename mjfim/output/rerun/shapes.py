@@ -200,7 +200,7 @@ def _checkerboard(half_sizes: tuple[float, float], rgba: list[int]) -> rr.Mesh3D
     `half_sizes` are along x and y [m].
     """
     # (squares, 2) column and row of every square.
-    squares = np.stack(np.indices((BOARD_SQUARES, BOARD_SQUARES)), axis=-1).reshape(-1, 2)
+    squares = np.indices((BOARD_SQUARES, BOARD_SQUARES)).reshape(2, -1).T
 
     # (squares, 4, 2) corners of every square, counter-clockwise.
     shifts = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
