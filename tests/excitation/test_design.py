@@ -95,7 +95,7 @@ def test_violated_limits_are_reported_and_are_no_success(experiment: Experiment)
 def test_a_given_initial_control_is_checked(experiment: Experiment) -> None:
     with pytest.raises(ExperimentError, match=r"\(400, 1\)"):
         mjfim.design(experiment, initial_control=np.zeros(400))
-    with pytest.raises(UnidentifiableError, match="excites nothing"):
+    with pytest.raises(UnidentifiableError, match="does not excite"):
         mjfim.design(experiment, initial_control=np.zeros((400, 1)))
     t = np.arange(400) * 0.01
     design = mjfim.design(experiment, initial_control=np.sin(5 * t)[:, None])
