@@ -515,7 +515,8 @@ def test_a_start_on_the_move_takes_no_latency(tmp_path: Path) -> None:
 
 BALL = """<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody><body name="bob">
 <joint name="ball" type="ball" stiffness="20" damping="1"/>
-<geom type="sphere" size=".05" pos=".1 0 -.3" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+<geom type="sphere" size=".05" pos=".1 0 -.3" mass="1" contype="0" conaffinity="0"/></body>
+</worldbody>
 <actuator><motor name="x" joint="ball" gear="1 0 0"/><motor name="y" joint="ball" gear="0 1 0"/>
 <motor name="z" joint="ball" gear="0 0 1"/></actuator></mujoco>"""
 
