@@ -714,7 +714,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "criterion": (
         edited("[cost]", '[cost]\ncriterion = "F"'),
         E,
-        [HOME, "cost.criterion", "'E', 'A', 'D' or 'c'", "'F'"],
+        [HOME, "cost.criterion", "'E', 'A', 'D'", "or 'c'", "'F'"],
     ),
     "criterion c alone": (
         edited("[cost]", '[cost]\ncriterion = "c"'),
