@@ -220,7 +220,11 @@ def _masks_for_initial_states(
     """(M, ny) for every recording, True for the values from which initial states are estimated."""
     masks = [np.zeros_like(mask) for mask in problem.masks]
     for segment in problem.segments:
-        counted = problem.masks[segment.recording][segment.rows]
-        others = counted & ~predicted[segment.recording][segment.rows]
-        masks[segment.recording][segment.rows] = others if others.any() else counted
+        i = segment.recording
+        rows = segment.rows
+        counted = problem.masks[i][rows]
+
+        # The predicted values are used only where a segment has no others.
+        others = counted & ~predicted[i][rows]
+        masks[i][rows] = others if others.any() else counted
     return masks

@@ -164,8 +164,9 @@ def _at_bounds(parameters: ParameterSet, theta: Array) -> tuple[tuple[str, ...],
     below = theta < parameters.lower - tolerance
     above = theta > parameters.upper + tolerance
 
-    distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
-    at_bound = np.flatnonzero(distance < tolerance)
+    distance_below = theta - parameters.lower
+    distance_above = parameters.upper - theta
+    at_bound = np.flatnonzero(np.minimum(distance_below, distance_above) < tolerance)
     names = tuple(parameters.names[j] for j in at_bound)
     return names, bool((below | above).any())
 

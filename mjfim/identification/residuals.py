@@ -6,6 +6,7 @@ linearised rows are condensed block by block.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -140,7 +141,7 @@ class FitProblem:
 
         masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
         if not any(mask.any() for mask in masks):
-            raise RecordingError("the recordings hold no measured value after t = 0")
+            raise RecordingError("the recordings contain no measured value after t = 0")
 
         layout = UnknownLayout.of(
             parameters, len(aligned), free_starts=free_starts, bounded=not data_only
@@ -278,17 +279,20 @@ class FitProblem:
     @cached_property
     def _block_offsets(self) -> np.ndarray:
         """(P+1,) first block of every segment, and the number of all blocks."""
-        block_rows = max(MIN_BLOCK_ROWS, -(-self.row_count // MAX_BLOCKS))
-        counts = np.maximum(np.rint(self._rows_per_segment / block_rows).astype(int), 1)
+        block_rows = max(MIN_BLOCK_ROWS, math.ceil(self.row_count / MAX_BLOCKS))
+        counts = np.rint(self._rows_per_segment / block_rows).astype(int)
+        counts = np.maximum(counts, 1)
         return np.concatenate([[0], np.cumsum(counts)])
 
     @property
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:
         """(B,) index of the recording, and (B,) mean number of rows, of every block."""
         counts = np.diff(self._block_offsets)
-        recordings = [segment.recording for segment in self.segments]
-        rows = self._rows_per_segment / counts
-        return np.repeat(recordings, counts), np.repeat(rows, counts)
+        recording_of_segment = [segment.recording for segment in self.segments]
+        recording_of_block = np.repeat(recording_of_segment, counts)
+
+        mean_rows = self._rows_per_segment / counts
+        return recording_of_block, np.repeat(mean_rows, counts)
 
     # ---- unknowns
 
@@ -524,8 +528,11 @@ class FitProblem:
     def _whitened_residual(self, rows: SegmentRows) -> Array:
         """(n,) whitened residuals of the values of some rows that count, row by row."""
         mask = self._mask_of(rows)
-        recording = self.recordings[self.segments[rows.segment].recording]
-        residual = np.where(mask, rows.y - recording.y[rows.rows], 0.0)
+        segment = self.segments[rows.segment]
+        measured = self.recordings[segment.recording].y[rows.rows]
+
+        # Values that do not count may be NaN.
+        residual = np.where(mask, rows.y - measured, 0.0)
         return self.noise.whiten_present(residual, mask)
 
     def _linearised(self, rows: SegmentRows) -> tuple[np.ndarray, Array, Array]:
@@ -539,14 +546,18 @@ class FitProblem:
         columns = self.layout.to_columns(common, segment.recording)
         G = np.concatenate([private, columns], axis=2)
 
-        # The rows of a segment are divided evenly among its blocks.
-        first = int(self._block_offsets[rows.segment])
-        count = int(self._block_offsets[rows.segment + 1]) - first
-        row_in_segment = rows.rows - segment.rows.start
-        block_of_row = first + row_in_segment * count // self._rows_per_segment[rows.segment]
+        # Every value belongs to the block of its row.
+        block_of_row = self._block_of_rows(rows)
         block = np.broadcast_to(block_of_row[:, None], mask.shape)[mask]
-
         return block, self._whitened_residual(rows), self.noise.whiten_present(G, mask)
+
+    def _block_of_rows(self, rows: SegmentRows) -> np.ndarray:
+        """(k,) index of the block of k rows; a segment is divided evenly into its blocks."""
+        index = rows.segment
+        first = self._block_offsets[index]
+        count = self._block_offsets[index + 1] - first
+        row_in_segment = rows.rows - self.segments[index].rows.start
+        return np.asarray(first + row_in_segment * count // self._rows_per_segment[index])
 
     def _common_rows(self, at: UnknownValues) -> Array:
         """(l, c+1) rows `[J, r]` of priors and pins on the common unknowns."""

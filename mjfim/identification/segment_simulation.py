@@ -144,7 +144,7 @@ class SegmentSimulation:
             missing = np.isnan(part[:, 0])
             part[missing] = simulated.states[0][missing]
 
-        # Samples without a segment show the first known state.
+        # Samples without a segment get the first known state.
         gap = np.isnan(states[:, 0])
         if gap.all():
             states[:] = plant.nominal_initial_state
@@ -268,9 +268,10 @@ class SegmentSimulation:
         return np.concatenate([ctrl, held])
 
     def _row_times(self, theta: Array, segment: Segment) -> Array:
-        """(M,) times at which the rows of a segment show its simulation [samples since its begin].
+        """(M,) times in the simulation of a segment that its rows measure.
 
-        Outputs that are delayed show an earlier time. theta: (p,) parameters of the recording.
+        They are counted in samples since the begin of the segment. Delayed outputs measure an
+        earlier time than that of their row. theta: (p,) parameters of the recording.
         """
         recording = self.recordings[segment.recording]
         delay_samples = float(self.system.parameters.delay_derivative @ theta) / recording.dt

@@ -190,17 +190,19 @@ def _local_fit(
 ) -> tuple[float, float]:
     """Value and slope of an output at time t0 [s], from a polynomial fit to nearby values."""
     measured = recording.measured_rows[column]
-    middle = int(np.searchsorted(measured, np.searchsorted(recording.t, t0)))
-    rows = measured[max(middle - ROWS_PER_SIDE, 0) : middle + ROWS_PER_SIDE]
+    row_after = np.searchsorted(recording.t, t0)
+    middle = int(np.searchsorted(measured, row_after))
+    first = max(middle - ROWS_PER_SIDE, 0)
+    rows = measured[first : middle + ROWS_PER_SIDE]
 
-    since = recording.t[rows] - t0
+    times = recording.t[rows] - t0
     y = recording.y[rows, column]
     if len(rows) <= degree:
         return float(y.mean()), 0.0
 
     # Times are scaled to [-1, 1], so that the fit is well conditioned.
-    unit = max(float(np.abs(since).max()), SMALLEST_TIME)
-    coefficients = np.polynomial.polynomial.polyfit(since / unit, y, degree)
+    unit = max(float(np.abs(times).max()), SMALLEST_TIME)
+    coefficients = np.polynomial.polynomial.polyfit(times / unit, y, degree)
     return float(coefficients[0]), float(coefficients[1] / unit)
 
 
@@ -253,7 +255,7 @@ def batches(segments: Sequence[Segment], max_samples: int) -> Iterator[list[int]
 
     Args:
         segments: The segments.
-        max_samples: Largest number of samples of a batch; a longer segment makes a batch by itself.
+        max_samples: Largest number of samples of a batch; a longer segment is a batch of one.
 
     Yields:
         Indices of the segments of a batch.

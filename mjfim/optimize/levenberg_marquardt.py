@@ -280,7 +280,8 @@ class _Search:
         if isinstance(trial, Solution):
             return trial
 
-        # The search ends where the cost no longer falls, whatever the linearisation predicts.
+        # The search ends where the cost no longer falls, even if the linearisation predicts a
+        # decrease.
         predicted = self._predicted_step()
         if self._stagnates(trial, predicted):
             self.unknowns = trial.unknowns
