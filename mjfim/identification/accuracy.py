@@ -21,7 +21,7 @@ from mjfim.records.estimate import NORMAL_95, Uncertainty
 # Half width of an interval over the value, above which a parameter is poorly known.
 POORLY_KNOWN_SHARE = 0.25
 
-# Half width of an interval over the value, from which the interval says nearly nothing.
+# Half width of an interval over the value, above which the parameter is practically unknown.
 UNKNOWN_SHARE = 10.0
 
 # Correlation above which another parameter is named as confounded.
@@ -31,7 +31,7 @@ CONFOUNDED_CORRELATION = 0.5
 # parameter's magnitude where the value is smaller.
 SMALLEST_RELATIVE_SIZE = 1e-3
 
-# Smallest variance whose square root is divided by.
+# Smallest variance in a denominator.
 SMALLEST_VARIANCE = 1e-300
 
 
@@ -277,7 +277,7 @@ def _poorly_known(
         if half_width < UNKNOWN_SHARE * size:
             remark = f"is known to ±{100 * half_width / size:.0f} % only"
 
-        # The most correlated parameter says which experiment would help.
+        # The name of the most correlated parameter helps to choose the next experiment.
         correlation = np.where(is_known, covariance[j], 0.0) / (std * std[j])
         correlation[j] = 0.0
         other = int(np.argmax(np.abs(correlation)))

@@ -32,7 +32,7 @@ MIN_ROWS = 3
 # Number of samples that are simulated to find the sign of a quaternion at the first row.
 SAMPLES_FOR_SIGN = 4
 
-# Smallest norm by which an interpolated quaternion is divided.
+# Smallest norm of an interpolated quaternion in a denominator.
 SMALLEST_NORM = 1e-12
 
 
@@ -174,7 +174,7 @@ def _outputs(system: System, recording: Recording) -> Array:
 def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     """Mean of a held control over each sample period.
 
-    The integral of the control, and so the impulse on the robot, is that of the log.
+    The integral of the control is that of the recording, and so is the impulse on the robot.
 
     Args:
         t: (M,) times of the rows, from 0 [s].

@@ -76,7 +76,7 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
     whitened = _whitened_residuals(problem, predicted)
     by_output = [[z[:, j] for z in whitened] for j in range(len(names))]
 
-    # Outliers say nothing about the noise.
+    # Outliers do not count, because they do not have the distribution of the noise.
     inliers = _without_outliers(problem, whitened)
     chi2 = float(np.nansum(inliers**2)) / problem.loss.inlier_mean_square
     dof = max(int(np.isfinite(inliers).sum()) - solution.condensed.rank, 1)

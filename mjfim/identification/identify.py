@@ -134,7 +134,25 @@ def identify_system(
     callback: Callback | None = None,
     stop: StopToken | None = None,
 ) -> Estimate:
-    """Estimate the parameters of a resolved system. See `identify`."""
+    """Estimate the parameters of a resolved system.
+
+    Args:
+        system: Model, parameters, outputs and noise.
+        recordings: Recordings to which the parameters are fitted.
+        method: Method of the search.
+        start: (p,) parameters at which the search starts; default: the guess.
+        held_out: Recordings that are predicted, not fitted.
+        callback: Called with every iterate.
+        stop: Token that ends the search with the best result so far.
+
+    Returns:
+        The estimate with its accuracy and warnings.
+
+    Raises:
+        ExperimentError: Something is wrong in the arguments.
+        RecordingError: A recording cannot be used.
+        SimulationDivergedError: The model diverges at the start.
+    """
     task = FitTask.of(system, recordings, method=method, start=start, held_out=held_out)
     return identify_task(task, callback=callback, stop=stop)
 
@@ -202,7 +220,7 @@ def least_squares(
     settings: SearchSettings | None = None,
     budget: Budget | None = None,
 ) -> Solution:
-    """Levenberg-Marquardt inside the bounds.
+    """Minimise the cost of a problem by Levenberg-Marquardt inside the bounds.
 
     Args:
         problem: Residuals as functions of the unknowns.

@@ -49,7 +49,7 @@ MIN_REMAINING_SHARE = 1e-8
 # as zero.
 INVERSE_TOLERANCE = 1e-12
 
-# Smallest column norm by which a column is divided.
+# Smallest column norm in a denominator.
 SMALLEST_NORM = 1e-300
 
 # Fields of a joint that are candidates, with their names in words.
@@ -130,7 +130,7 @@ def find_missing_terms(
     squares = 2.0 * problem.cost(at)
     found = []
     for candidate, column in zip(candidates, linearisation.columns, strict=True):
-        term = _tested(candidate, column, linearisation, squares, len(candidates))
+        term = _score_test(candidate, column, linearisation, squares, len(candidates))
         if term is not None:
             found.append(term)
 
@@ -218,7 +218,7 @@ def _normal_equations(
     return _Linearisation(H=H, g=g, norms=norms, columns=columns, others=others, inverse=inverse)
 
 
-def _tested(
+def _score_test(
     candidate: Candidate, column: int, linearisation: _Linearisation, squares: float, count: int
 ) -> MissingTerm | None:
     """Score test of one candidate; None where it is not significant.

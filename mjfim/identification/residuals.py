@@ -78,7 +78,14 @@ class Pins:
     theta: Array
 
     def residual(self, theta: Array) -> Array:
-        """(k,) differences of the combinations at theta: (p,) from their held values."""
+        """Differences of the combinations from their held values.
+
+        Args:
+            theta: (p,) parameters.
+
+        Returns:
+            (k,) differences.
+        """
         return np.asarray(self.rows @ (theta - self.theta))
 
 
@@ -176,11 +183,25 @@ class FitProblem:
         )
 
     def with_noise(self, noise: Noise) -> FitProblem:
-        """This problem with other noise."""
+        """This problem with other noise.
+
+        Args:
+            noise: Noise of the outputs.
+
+        Returns:
+            The problem.
+        """
         return replace(self, noise=noise)
 
     def of_segments(self, indices: np.ndarray) -> FitProblem:
-        """The problem of some segments only; only their rows count."""
+        """The problem of some segments only; only their rows count.
+
+        Args:
+            indices: Indices of the segments.
+
+        Returns:
+            The problem.
+        """
         simulation = self.simulation.of_segments(indices)
 
         masks = tuple(np.zeros_like(mask) for mask in self.masks)
@@ -307,29 +328,74 @@ class FitProblem:
         return self.layout.upper
 
     def begin(self, theta: Array) -> UnknownValues:
-        """Unknowns at theta: (p,), with every initial state as stated or measured."""
+        """Unknowns at given parameters, with every initial state as stated or measured.
+
+        Args:
+            theta: (p,) parameters.
+
+        Returns:
+            The unknowns.
+        """
         return self.layout.begin(theta, len(self.segments), self.simulation.private_count)
 
     def common_values(self, at: UnknownValues) -> Array:
-        """(c,) values of the common unknowns."""
+        """Values of the common unknowns.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (c,) values.
+        """
         return self.layout.common_values(at)
 
     def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
-        """The unknowns after a fraction of a step, clipped to the bounds."""
+        """The unknowns after a fraction of a step, clipped to the bounds.
+
+        Args:
+            at: The unknowns.
+            step: Step of all unknowns.
+            fraction: Fraction of the step.
+
+        Returns:
+            The moved unknowns.
+        """
         return self.layout.moved(at, step, fraction)
 
     def theta(self, at: UnknownValues) -> Array:
-        """(p,) parameters, with the values of the first recording."""
+        """Parameters, with the values of the first recording.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (p,) parameters [theta-unit].
+        """
         return self.layout.theta(at)
 
     # ---- residuals
 
     def predict(self, at: UnknownValues) -> list[Array] | None:
-        """(M, ny) predicted outputs of every recording; None where a simulation diverges."""
+        """Predicted outputs of every recording at its times.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (M, ny) outputs of every recording [y-unit]; None where a simulation diverges.
+        """
         return self.simulation.predict(at)
 
     def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
-        """The fitted motion of one recording; None where it diverges."""
+        """The fitted motion of one recording.
+
+        Args:
+            at: The unknowns.
+            recording: Index of the recording.
+
+        Returns:
+            The motion; None where it diverges.
+        """
         return self.simulation.motion(at, recording)
 
     def errors(self, predicted: Sequence[Array]) -> list[Array]:
@@ -353,7 +419,11 @@ class FitProblem:
     def cost(self, at: UnknownValues) -> float:
         """Half of the sum of the residuals' loss and of the squared priors and pins.
 
-        It is infinite where a simulation diverges.
+        Args:
+            at: The unknowns.
+
+        Returns:
+            The cost; infinite where a simulation diverges.
         """
         total = 0.0
         for rows in self.simulation.rows(at, derivatives=False):
@@ -366,9 +436,13 @@ class FitProblem:
         return 0.5 * (total + float(common @ common) + float(np.sum(private**2)))
 
     def condense(self, at: UnknownValues) -> Condensed | None:
-        """Linearisation about the unknowns, condensed block by block.
+        """Linearise about the unknowns and condense block by block.
 
-        None where a perturbed simulation diverges.
+        Args:
+            at: The unknowns.
+
+        Returns:
+            The linearisation; None where a perturbed simulation diverges.
         """
         m = self.simulation.private_count + self.layout.column_count + 1
         blocks = np.zeros((int(self._block_offsets[-1]), m, m))
@@ -564,7 +638,7 @@ class FitProblem:
         rows = np.zeros((0, self.layout.column_count + 1))
         if self.with_priors:
             rows = self.layout.prior_rows(at)
-        if self._pins_touch_private:
+        if self._pins_involve_private:
             return rows
 
         residual = self.pins.residual(self.theta(at))
@@ -572,7 +646,7 @@ class FitProblem:
         return np.concatenate([rows, np.column_stack([columns, residual])])
 
     @cached_property
-    def _pins_touch_private(self) -> bool:
+    def _pins_involve_private(self) -> bool:
         """True where pins involve private unknowns."""
         return bool(self.pins.rows[:, self.layout.private].any())
 
@@ -596,7 +670,7 @@ class FitProblem:
         parameters = self.system.parameters
         private = self.layout.private
         weight = np.sqrt(np.diag(parameters.prior_information))[private] * self.with_priors
-        pin_count = len(self.pins.rows) if self._pins_touch_private else 0
+        pin_count = len(self.pins.rows) if self._pins_involve_private else 0
         rows = np.zeros((count, n + pin_count, m))
         rows[:, diagonal, diagonal] = weight
         rows[:, :n, -1] = weight * (at.private - parameters.guess[private])

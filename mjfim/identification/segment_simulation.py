@@ -76,11 +76,25 @@ class SegmentSimulation:
     start_directions: Array
 
     def with_layout(self, layout: UnknownLayout) -> SegmentSimulation:
-        """This simulation with another layout of the unknowns."""
+        """This simulation with another layout of the unknowns.
+
+        Args:
+            layout: The other layout.
+
+        Returns:
+            The simulation.
+        """
         return replace(self, layout=layout)
 
     def of_segments(self, indices: np.ndarray) -> SegmentSimulation:
-        """The simulation of some segments only."""
+        """The simulation of some segments only.
+
+        Args:
+            indices: Indices of the segments.
+
+        Returns:
+            The simulation.
+        """
         return replace(self, segments=tuple(self.segments[i] for i in indices))
 
     @cached_property
@@ -94,7 +108,14 @@ class SegmentSimulation:
         return int(self.start_directions.shape[1])
 
     def segments_of(self, recording: int) -> list[int]:
-        """Indices of the segments of one recording."""
+        """Segments of one recording.
+
+        Args:
+            recording: Index of the recording.
+
+        Returns:
+            Indices of the segments.
+        """
         return [i for i, segment in enumerate(self.segments) if segment.recording == recording]
 
     def predict(self, at: UnknownValues) -> list[Array] | None:

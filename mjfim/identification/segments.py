@@ -164,7 +164,7 @@ def measured_initial_states(
     for k, begin in enumerate(begins):
         t0 = begin * recording.dt
 
-        # Positions, and velocities as their slopes.
+        # Measured positions, and velocities as their slopes.
         for q in range(space.nq):
             if q in output_of and q not in quaternion_components:
                 value, slope = _local_fit(recording, output_of[q], t0, degree=2)

@@ -86,7 +86,21 @@ class FitTask:
         start: Array | None = None,
         held_out: Sequence[Recording] = (),
     ) -> FitTask:
-        """The task of a resolved system. See `resolve`."""
+        """The task of fitting the parameters of a resolved system.
+
+        Args:
+            system: Model, parameters, outputs and noise.
+            recordings: Recordings to which the parameters are fitted.
+            method: Method of the search.
+            start: (p,) parameters at which the search starts; default: the guess.
+            held_out: Recordings that are predicted, not fitted.
+
+        Returns:
+            The task.
+
+        Raises:
+            ExperimentError: Something is wrong in the arguments; the message names it.
+        """
         if method not in get_args(Method):
             raise ExperimentError(unknown("method", method, get_args(Method)))
 

@@ -128,7 +128,14 @@ class UnknownLayout:
         )
 
     def common_values(self, at: UnknownValues) -> Array:
-        """(c,) values of the common unknowns."""
+        """Values of the common unknowns.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (c,) values.
+        """
         return np.concatenate([at.theta[self.shared], at.per_recording.ravel()])
 
     def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
@@ -157,13 +164,30 @@ class UnknownLayout:
         )
 
     def theta_of_recording(self, at: UnknownValues, recording: int) -> Array:
-        """(p,) parameters of one recording; deviations of the initial state are not filled in."""
+        """Parameters of one recording.
+
+        Deviations of the initial state are not filled in.
+
+        Args:
+            at: The unknowns.
+            recording: Index of the recording.
+
+        Returns:
+            (p,) parameters [theta-unit].
+        """
         theta = np.array(at.theta)
         theta[self.per_recording] = at.per_recording[recording]
         return theta
 
     def theta(self, at: UnknownValues) -> Array:
-        """(p,) parameters, with the values of the first recording and of its first segment."""
+        """Parameters, with the values of the first recording and of its first segment.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (p,) parameters [theta-unit].
+        """
         theta = self.theta_of_recording(at, 0)
         if not self.free_starts and len(self.private):
             theta[self.private] = at.private[0]
@@ -189,9 +213,13 @@ class UnknownLayout:
         return columns
 
     def prior_rows(self, at: UnknownValues) -> Array:
-        """(l, c+1) rows `[J, r]` of the stated priors on the common unknowns.
+        """Rows of the stated priors on the common unknowns.
 
-        Residuals are in standard deviations of the prior.
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (l, c+1) rows `[J, r]`, with residuals in standard deviations of the prior.
         """
         index = self.parameter_of_column
         information = np.diag(self.parameters.prior_information)[index]

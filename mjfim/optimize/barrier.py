@@ -186,13 +186,24 @@ class BarrierExpansion:
     control_step_scale: Array
 
     def scaled(self, mu: float) -> BarrierExpansion:
-        """Expansion of mu times the barrier, with unchanged scales of the limits."""
+        """Expansion of a multiple of the barrier, with unchanged scales of the limits.
+
+        Args:
+            mu: Factor of the barrier.
+
+        Returns:
+            The expansion.
+        """
         return replace(self, a=mu * self.a, b=mu * self.b, weights=self.weights.scaled(mu))
 
     def largest_relative_move(self, zeta: TangentCurve) -> float:
         """Largest change of any limited quantity or control along a tangent curve.
 
-        Changes are relative to half of the range of each quantity.
+        Args:
+            zeta: The tangent curve.
+
+        Returns:
+            The change, over half of the range of the quantity.
         """
         state_and_control = np.concatenate([zeta.z[:-1], zeta.v], axis=1)
         changes = np.einsum("kswi,ki->ksw", self.observations, state_and_control)

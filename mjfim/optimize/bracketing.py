@@ -50,7 +50,14 @@ class SampleGrid:
     minimum: int = 2
 
     def round_down(self, samples: float) -> int:
-        """The largest allowed number that is not above `samples`, or the minimum."""
+        """Round to the next allowed number below.
+
+        Args:
+            samples: Number of samples.
+
+        Returns:
+            The largest allowed number that is not above it, or the minimum.
+        """
         n = int(np.floor(samples + ROUNDING_TOLERANCE))
         if n >= self.first_multiple:
             n -= n % self.unit
@@ -58,7 +65,14 @@ class SampleGrid:
         return max(n, self.minimum)
 
     def round_up(self, samples: float) -> int:
-        """The smallest allowed number that is not below `samples`."""
+        """Round to the next allowed number above.
+
+        Args:
+            samples: Number of samples.
+
+        Returns:
+            The smallest allowed number that is not below it.
+        """
         n = int(np.ceil(samples - ROUNDING_TOLERANCE))
         if n >= self.first_multiple:
             n += -n % self.unit

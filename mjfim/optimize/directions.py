@@ -46,7 +46,13 @@ class MetricDescent:
         )
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Ignore an accepted step; this direction has no memory."""
+        """Ignore an accepted step; this direction has no memory.
+
+        Args:
+            expansion: Expansion at the new point.
+            K: (N, nu, nx) gain of the projection operator.
+            moved: Difference between the new and the old point.
+        """
 
     def reset(self) -> bool:
         """Return False: there is no memory to clear."""
@@ -93,7 +99,13 @@ class ExtendedMetricDescent:
         return TangentCurve(z=zeta.z[:, :nx], v=zeta.v)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Ignore an accepted step; this direction has no memory."""
+        """Ignore an accepted step; this direction has no memory.
+
+        Args:
+            expansion: Expansion at the new point.
+            K: (N, nu, nx) gain of the projection operator.
+            moved: Difference between the new and the old point.
+        """
 
     def reset(self) -> bool:
         """Return False: there is no memory to clear."""

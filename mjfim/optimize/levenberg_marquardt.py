@@ -102,16 +102,46 @@ class Problem(Protocol):
         """(c,) upper bounds of the common unknowns, inf without a bound."""
 
     def cost(self, at: UnknownValues) -> float:
-        """Half of the sum of squares; infinite where a simulation diverges."""
+        """Half of the sum of squares.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            The cost; infinite where a simulation diverges.
+        """
 
     def condense(self, at: UnknownValues) -> Condensed | None:
-        """Linearisation about the unknowns; None where a perturbed simulation diverges."""
+        """Linearise about the unknowns.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            The condensed linearisation; None where a perturbed simulation diverges.
+        """
 
     def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
-        """The unknowns after a fraction of a step, inside the bounds."""
+        """The unknowns after a fraction of a step, inside the bounds.
+
+        Args:
+            at: The unknowns.
+            step: Step of all unknowns.
+            fraction: Fraction of the step.
+
+        Returns:
+            The moved unknowns.
+        """
 
     def common_values(self, at: UnknownValues) -> Array:
-        """(c,) values of the common unknowns."""
+        """Values of the common unknowns.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (c,) values.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -221,7 +221,14 @@ class Weights:
         )
 
     def scaled(self, factor: float) -> Weights:
-        """This form multiplied by a number."""
+        """This form multiplied by a number.
+
+        Args:
+            factor: The number.
+
+        Returns:
+            The scaled form.
+        """
         return Weights(Q=factor * self.Q, S=factor * self.S, R=factor * self.R, W=factor * self.W)
 
     def half_gradient(self, zeta: TangentCurve) -> tuple[Array, Array]:
@@ -459,5 +466,12 @@ class CurveCoordinates:
         return TangentCurve(z=z, v=c - feedback)
 
     def coordinate(self, zeta: TangentCurve) -> Array:
-        """(N, nu) curve coordinate `c = v + K z` of a tangent curve."""
+        """Curve coordinate `c = v + K z` of a tangent curve.
+
+        Args:
+            zeta: The tangent curve.
+
+        Returns:
+            (N, nu) curve coordinate.
+        """
         return np.asarray(zeta.v + np.einsum("kui,ki->ku", self.K, zeta.z[:-1]))

@@ -60,7 +60,14 @@ class Expansion:
     eigenvalue_model: EigenvalueModel | None = None
 
     def slope(self, zeta: TangentCurve) -> float:
-        """Directional derivative DJ.zeta of the cost."""
+        """Directional derivative DJ.zeta of the cost.
+
+        Args:
+            zeta: The tangent vector.
+
+        Returns:
+            The derivative.
+        """
         return float(np.sum(self.a * zeta.z) + np.sum(self.b * zeta.v))
 
     def gradient(self, K: Array) -> Array:
@@ -94,27 +101,73 @@ class Problem(Protocol[P]):
     """
 
     def value(self, point: P) -> float:
-        """Cost J at a point; infinite where its simulation diverged."""
+        """Cost J at a point.
+
+        Args:
+            point: The point.
+
+        Returns:
+            The cost; infinite where the simulation of the point diverged.
+        """
         ...
 
     def size(self, point: P) -> float:
-        """Positive scale with which changes of J are compared: J itself where J is positive."""
+        """Scale with which changes of J are compared.
+
+        Args:
+            point: The point.
+
+        Returns:
+            A positive number; J itself where J is positive.
+        """
         ...
 
     def expand(self, point: P) -> Expansion:
-        """First-order expansion at a point."""
+        """First-order expansion at a point.
+
+        Args:
+            point: The point.
+
+        Returns:
+            The expansion.
+        """
         ...
 
     def project(self, point: P, zeta: TangentCurve, gamma: float, K: Array) -> P:
-        """The trajectory P(xi + gamma zeta) under the regulator K: (N, nu, nx)."""
+        """The trajectory P(xi + gamma zeta).
+
+        Args:
+            point: The point xi.
+            zeta: Direction.
+            gamma: Step length.
+            K: (N, nu, nx) gain of the projection operator.
+
+        Returns:
+            The projected point.
+        """
         ...
 
     def difference(self, new: P, old: P) -> TangentCurve:
-        """Difference of two trajectories in the tangent space, (x_new - x_old, u_new - u_old)."""
+        """Difference of two trajectories in the tangent space.
+
+        Args:
+            new: One point.
+            old: Another point.
+
+        Returns:
+            The tangent vector (x_new - x_old, u_new - u_old).
+        """
         ...
 
     def refine(self, point: P) -> P | None:
-        """The point with more accurate derivatives; None where there are no more accurate ones."""
+        """Make the derivatives at a point more accurate.
+
+        Args:
+            point: The point.
+
+        Returns:
+            The point with more accurate derivatives; None where there are no more accurate ones.
+        """
         ...
 
 
