@@ -136,7 +136,7 @@ def test_the_default_longest_horizon_is_that_of_the_table(tmp_path: Path) -> Non
         mjfim.shortest_experiment(hard)
 
 
-def test_faulty_requests_say_what_is_right() -> None:
+def test_messages_about_faulty_requests_name_valid_values() -> None:
     with pytest.raises(ExperimentError, match=r"parameters\.m\.wanted"):
         mjfim.shortest_experiment(STUDY)
     with pytest.raises(ExperimentError, match="tolerance"):

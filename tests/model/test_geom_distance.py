@@ -271,7 +271,7 @@ def test_no_pairs_are_refused() -> None:
 
 
 @pytest.mark.parametrize("reach", [0.02, 0.1, 0.5, 5.0])
-def test_nothing_within_reach_is_lost(reach: float) -> None:
+def test_all_distances_within_reach_are_found(reach: float) -> None:
     """They agree with `mj_geomDistance` within reach; all others are the reach."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, reach), scattered(model, 200, 0.4)

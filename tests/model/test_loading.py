@@ -39,7 +39,7 @@ def test_every_model_has_an_experiment() -> None:
 
 
 @pytest.mark.parametrize("name", slow_except("four_bar", "sliding_block"))
-def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None:
+def test_check_names_the_subject_of_the_example(name: str, tmp_path: Path) -> None:
     result = run("check", design_file(name, tmp_path), "-o", tmp_path / "out")
     assert result.exit_code in (0, 1), result.output
     told = read(tmp_path / "out" / "check.json")
@@ -55,7 +55,7 @@ def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", slow_except("four_bar"))
-def test_a_short_design_improves_and_leaves_everything(name: str, tmp_path: Path) -> None:
+def test_a_short_design_improves_and_writes_all_files(name: str, tmp_path: Path) -> None:
     task = DesignTask.resolve(
         mjfim.Experiment.from_file(design_file(name, tmp_path)).replace(
             descent={"max_iterations": 3}

@@ -890,7 +890,7 @@ def test_bodies_whose_inertial_frame_moves_are_found() -> None:
     assert moved_bodies([one(p) for p in paths]) == {"a", "b", "c", "d"}
 
 
-def test_setup_gives_a_model_at_theta_with_the_right_dynamics_for_simple_bodies(tmp_path) -> None:
+def test_the_model_at_theta_has_the_right_dynamics_for_simple_bodies(tmp_path) -> None:
     target = {"com": {"target": "body/flyer:ipos[0]", "guess": 0.1}}
     task = make_task(SIMPLE, tmp_path, rate=500.0, parameters=target, noise={"state": 0.1})
     _, _, again = both_ways(SIMPLE, "body/flyer:ipos[0]", 0.1)
@@ -1051,7 +1051,7 @@ def test_names_may_hold_slashes_and_spaces() -> None:
         ("", ["not of the form kind/name:field[index]"]),
     ],
 )
-def test_a_wrong_path_says_what_would_have_been_valid(path: str, said: list[str]) -> None:
+def test_the_message_about_a_wrong_path_names_valid_values(path: str, said: list[str]) -> None:
     _, base = compiled(ARM, [])
     with pytest.raises(ExperimentError) as caught:
         ParameterSet.build([one(path)], base)

@@ -61,7 +61,7 @@ def arm(folder: Path, friction: float = 0.1, **tables: Any) -> DesignTask:
     return make_task(ARM.format(friction=friction), folder, **{**stated, **tables})
 
 
-def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: Path) -> None:
+def test_only_plants_with_dry_friction_have_smoothing_speeds(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     smooth = arm(tmp_path, 0.0, parameters={name: DRY[name] for name in ("mass", "drag")}).relaxed()
     assert smooth.system.variant == RELAXED
@@ -81,7 +81,7 @@ def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: P
     assert task.smoothed().plant.source.smoothing_speeds
 
 
-def test_a_plant_with_dry_friction_moves_as_the_model_does_and_its_softened_level_nearly(
+def test_a_plant_with_dry_friction_moves_as_the_model_and_its_smoothed_variant_nearly(
     tmp_path: Path,
 ) -> None:
     task = arm(tmp_path)
@@ -98,7 +98,7 @@ def test_a_plant_with_dry_friction_moves_as_the_model_does_and_its_softened_leve
     assert 1e-5 < np.abs(softened - own).max() < 0.02
 
 
-def test_a_longer_timestep_keeps_the_samples_and_stays_near(tmp_path: Path) -> None:
+def test_a_longer_timestep_keeps_the_samples_and_gives_nearly_equal_states(tmp_path: Path) -> None:
     task = arm(tmp_path, 0.0, parameters={"mass": DRY["mass"]})
     long = task.stretched(5)
     assert (long.samples, long.dt, long.system.grid.substeps) == (task.samples, task.dt, 1)
@@ -114,7 +114,7 @@ def test_a_longer_timestep_keeps_the_samples_and_stays_near(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_design_with_dry_joints_gains_and_keeps_its_limits(tmp_path: Path) -> None:
+def test_a_design_with_dry_friction_improves_and_keeps_its_limits(tmp_path: Path) -> None:
     limits = {
         "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
         "control_rate": 20.0,
@@ -128,7 +128,7 @@ def test_a_design_with_dry_joints_gains_and_keeps_its_limits(tmp_path: Path) -> 
     assert design.parameters == ("mass", "drag", "dry")
 
 
-def test_steps_on_the_softened_copy_are_counted(tmp_path: Path) -> None:
+def test_steps_of_the_smoothed_plant_are_counted(tmp_path: Path) -> None:
     task = arm(tmp_path).relaxed()
     plant, psi = task.plant, np.zeros((task.samples + 1, task.space.nx, 3))
     begun, own = plant.engine_steps, plant.simulator.steps
@@ -142,7 +142,7 @@ def test_steps_on_the_softened_copy_are_counted(tmp_path: Path) -> None:
     assert plant.engine_steps - begun == 4 * batch  # and on the copy the origin and two directions
 
 
-def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(
+def test_with_sensors_only_mixed_differences_are_taken_on_the_smoothed_plant(
     tmp_path: Path,
 ) -> None:
     task = arm(tmp_path).relaxed()
@@ -169,10 +169,10 @@ def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(
     assert np.abs(found.A - own.A).max() > 1e-3
 
 
-# ---- derivatives where joints turn round
+# ---- derivatives where joints reverse
 
 
-def test_the_gradient_of_the_softened_level_is_that_of_its_cost(tmp_path: Path) -> None:
+def test_the_gradient_of_the_smoothed_variant_is_that_of_its_cost(tmp_path: Path) -> None:
     """Long moves shift the reversals of joints by several engine steps; short moves do not."""
     task = arm(tmp_path).relaxed().smoothed()
     wave = np.sin(np.pi * task.t)[:, None] ** 2 * np.array([1.0, -0.5])
@@ -182,7 +182,7 @@ def test_the_gradient_of_the_softened_level_is_that_of_its_cost(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("amplitudes", [(1.0, -0.5), (0.5, 1.0), (1.0, 1.0)])
-def test_and_of_the_stated_one_it_points_where_long_moves_lead(
+def test_the_gradient_of_the_stated_plant_agrees_with_long_moves(
     tmp_path: Path, amplitudes: tuple[float, float]
 ) -> None:
     """Its cost jumps with every engine step that a joint sticks for: no size is right, and short

@@ -296,7 +296,7 @@ def test_mixed_derivatives_are_derivatives_of_the_directional_derivative(make, t
             assert relative_error(found.h_mixed[0, k][:, rows], np.array(H)) < 1e-4
 
 
-def test_outputs_belong_to_the_state_and_control_of_their_own_sample(tmp_path) -> None:
+def test_outputs_belong_to_the_state_and_control_of_their_sample(tmp_path) -> None:
     noise = {"state": 0.1, **SENSED}
     task = cart_task(tmp_path, noise=noise)
     y, _ = task.plant.measure(task.theta[None], task.initial.ctrl)
@@ -674,7 +674,7 @@ def test_the_solver_stays_on_where_friction_is_to_be_identified(tmp_path) -> Non
     assert np.abs(task.plant.derivatives.sensitivity(task.theta, task.initial).psi).max() > 1e-3
 
 
-def test_private_copies_leave_the_users_spec_and_model_alone(tmp_path) -> None:
+def test_private_copies_do_not_change_the_users_spec_and_model(tmp_path) -> None:
     task = body_task(tmp_path)
     before = task.system.source.spec.to_xml()
     task.plant.derivatives.linearize(1.5 * task.theta, task.initial)

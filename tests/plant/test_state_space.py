@@ -143,7 +143,7 @@ def test_states_and_steps_broadcast(model) -> None:
     )
 
 
-def test_inputs_are_left_alone(model) -> None:
+def test_inputs_are_not_changed(model) -> None:
     space, rng = state_space(model), np.random.default_rng(8)
     states, dx = random_states(space, rng, 4), random_steps(space, 1.0, rng, 4)
     kept, step = states.copy(), dx.copy()

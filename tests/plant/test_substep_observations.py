@@ -68,7 +68,7 @@ def observations_of(task: DesignTask) -> SubstepObservations:
     ("substeps", "expected"),
     [(1, (1,)), (2, (1, 2)), (5, (1, 2, 3, 5)), (20, (1, 2, 4, 9, 20)), (100, (1, 3, 10, 32, 100))],
 )
-def test_derivatives_are_taken_at_the_first_the_last_and_some_engine_steps_between(
+def test_derivatives_are_taken_at_the_first_the_last_and_some_inner_engine_steps(
     substeps: int, expected: tuple[int, ...]
 ) -> None:
     assert derivative_substeps_of(substeps) == expected

@@ -112,7 +112,7 @@ def test_schroeder_phases_of_equal_powers_are_the_known_ones() -> None:
 
 
 @pytest.mark.parametrize("kind", [Chirp, Multisine, RandomSteps])
-def test_waves_are_of_size_one_whatever_the_numbers(kind: Any) -> None:
+def test_waves_are_of_size_one_for_any_numbers(kind: Any) -> None:
     rng, made = np.random.default_rng(0), kind(FRAME)
     for z in (
         np.zeros(made.parameter_count),
@@ -224,7 +224,7 @@ def test_workers_share_the_steps() -> None:
     "method",
     ["steps", *(pytest.param(name, marks=pytest.mark.slow) for name in ("chirp", "fourier5"))],
 )
-def test_from_rest_to_rest_without_jolts(method: str) -> None:
+def test_excitations_lead_from_rest_to_rest_without_jumps(method: str) -> None:
     experiment = arm(bandwidth=6.0)
     task = DesignTask.resolve(experiment)
     result = run_baseline(order(experiment, method, steps=400_000))
@@ -313,7 +313,9 @@ def test_slopes_for_scipy_are_the_derivatives() -> None:
         )
 
 
-def test_many_runs_end_with_the_budget_and_the_best_one_gets_the_sharpest_barrier() -> None:
+def test_many_runs_end_with_the_budget_and_the_best_one_reaches_the_smallest_barrier_weight() -> (
+    None
+):
     evaluator = evaluator_of(order(pendulum(), "fourier5", steps=200_000))
     seen: list[tuple[str, float]] = []
 
@@ -333,7 +335,7 @@ def test_many_runs_end_with_the_budget_and_the_best_one_gets_the_sharpest_barrie
     assert evaluator.best.found_by in {name for name, _ in seen}
 
 
-def test_the_best_of_a_search_only_gets_better() -> None:
+def test_the_best_control_of_a_search_never_becomes_worse() -> None:
     costs: list[float] = []
     evaluator = ControlEvaluator(
         search=order(pendulum(), "steps", steps=60_000),

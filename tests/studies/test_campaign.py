@@ -72,7 +72,7 @@ def truth() -> DesignTask:
     return DesignTask.resolve(STUDY.replace(cost={"linearize_at": "true"}))
 
 
-def test_a_campaign_ends_at_the_targets_and_at_the_truth(
+def test_a_campaign_ends_at_the_targets_and_at_the_true_values(
     campaign: Campaign, truth: DesignTask
 ) -> None:
     assert campaign.reached and campaign.status is CampaignStatus.REACHED
@@ -145,7 +145,7 @@ def test_a_redesign_is_at_the_estimate_on_the_same_scales(tmp_path: Path) -> Non
     )
 
 
-def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> None:
+def test_the_guess_of_an_inertia_moves_where_the_recordings_determine_it(tmp_path: Path) -> None:
     """Coordinate by coordinate, by the same names in the same order; what does not show stays where
     it was stated.
     """
@@ -300,7 +300,7 @@ def test_a_design_that_violates_limits_is_not_played(
     )
 
 
-def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_serve(
+def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_are_used(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, asked = campaign.rounds[0], []
@@ -329,7 +329,7 @@ def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_serv
 
 
 @pytest.mark.slow
-def test_each_recording_has_its_own_start() -> None:
+def test_each_recording_has_a_separate_initial_state() -> None:
     """Deviations of the start are private: what one round learned about its own says nothing about
     the next's.
     """
@@ -372,7 +372,7 @@ def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: DesignTask
     assert gained([r.control for r in found.rounds], truth) > 1.2
 
 
-def test_faulty_requests_say_what_is_right(tmp_path: Path) -> None:
+def test_messages_about_faulty_requests_name_valid_values(tmp_path: Path) -> None:
     plain = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     with pytest.raises(ExperimentError, match=r"parameters\.m\.wanted"):
         mjfim.run_campaign(plain, never)

@@ -267,7 +267,7 @@ def test_the_summary_is_strict_json(tmp_path) -> None:
         for file in sorted(MODELS.glob("*.toml"))
     ],
 )
-def test_every_example_can_be_checked_whatever_its_weights(file: Path, tmp_path: Path) -> None:
+def test_every_example_can_be_checked_with_any_weights(file: Path, tmp_path: Path) -> None:
     """A cost without control weights has no metric of its own; the slope is tested along a
     unit-weight direction.
     """

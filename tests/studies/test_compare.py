@@ -124,7 +124,7 @@ def test_rows_hold_the_numbers_of_their_controls() -> None:
         assert np.abs(ctrl).max() <= 5.0
 
 
-def test_a_control_that_violates_limits_is_shrunk_until_it_does_not() -> None:
+def test_a_control_that_violates_limits_is_shrunk_until_it_is_feasible() -> None:
     task, found = DesignTask.resolve(pendulum()), small().rows[0]
     assert found.control is not None
     leaking = task.centre + 1.15 * (found.control - task.centre)
@@ -190,7 +190,7 @@ def test_logarithms_are_compared_by_their_difference() -> None:
     assert c.gain(c.rows[1], c.rows[0]) == pytest.approx(1.0 - np.exp(-1.0))
 
 
-def test_only_methods_that_make_sense() -> None:
+def test_only_applicable_methods_are_run() -> None:
     hard, soft = (
         DesignTask.resolve(pendulum()),
         DesignTask.resolve(pendulum(limits={}, cost={"control": 1e-3})),
@@ -368,7 +368,7 @@ def worse(design: Callable[..., Design]) -> Callable[..., Design]:
     return rigged
 
 
-def test_a_design_that_is_worse_is_said_to_be_beaten(
+def test_a_design_that_is_worse_is_reported_as_beaten(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compare_module, "design_task", worse(design_task))

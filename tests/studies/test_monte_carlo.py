@@ -47,7 +47,7 @@ def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Desig
 
 
 @pytest.mark.slow
-def test_each_trial_is_its_own_least_squares_estimate(
+def test_each_trial_is_a_least_squares_estimate(
     experiment: Experiment, design: mjfim.Design
 ) -> None:
     study = monte_carlo(
@@ -90,7 +90,7 @@ def test_statistics_distinguish_an_efficient_from_an_inefficient_estimator() -> 
     assert np.all(wasteful.efficiency_interval[:, 1] < 1.0)
 
 
-def test_interval_of_the_efficiency_covers_as_promised() -> None:
+def test_interval_of_the_efficiency_has_the_stated_coverage() -> None:
     rng, bound = np.random.default_rng(1), np.eye(1)
     hits = 0
     for _ in range(400):

@@ -178,7 +178,7 @@ def test_gains_of_the_samples_serve_a_faster_controller(tmp_path: Path) -> None:
     assert abs(states[-1, 0] - plan[-1, 0]) < 0.1
 
 
-def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
+def test_gain_columns_name_the_components_on_which_they_act(tmp_path: Path) -> None:
     """Free and ball joints by tangent components, rotations as vectors; activations too."""
     body = BUILD["body"](tmp_path)
     parts = ["x", "y", "z", "rx", "ry", "rz"]
@@ -197,7 +197,7 @@ def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", BUILD)
-def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
+def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
     """Accelerations and joint forces are those of mj_forward at each row, not differences; no field
     is empty.
     """
@@ -367,7 +367,7 @@ def bench_of(cart: tuple[mjfim.Experiment, Path], **conditions: Any) -> Any:
 
 
 @pytest.mark.parametrize("feedback", [False, True])
-def test_a_robot_is_what_a_bare_loop_says(
+def test_a_robot_agrees_with_a_plain_simulation_loop(
     cart: tuple[mjfim.Experiment, Path], feedback: bool
 ) -> None:
     """Wrong parameters written by hand, commands three steps late, limits at every engine step,
@@ -419,7 +419,7 @@ def test_a_robot_is_what_a_bare_loop_says(
 
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("latency", [0.0, 0.005, pytest.param(0.02, marks=pytest.mark.slow)])
-def test_without_noise_the_truth_is_found(
+def test_without_noise_the_true_values_are_found(
     cart: tuple[mjfim.Experiment, Path], feedback: bool, latency: float
 ) -> None:
     """A late control is exactly equivalent to a late measurement, also with feedback."""
@@ -447,7 +447,9 @@ def judged(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("feedback", [False, True])
-def test_intervals_hold_the_truth(cart: tuple[mjfim.Experiment, Path], feedback: bool) -> None:
+def test_intervals_hold_the_true_values(
+    cart: tuple[mjfim.Experiment, Path], feedback: bool
+) -> None:
     """Intervals and joint regions hold the true values in 95 % of runs; errors are as predicted."""
     found = judged(cart, feedback=feedback)
     least = binom.ppf(1e-3, RUNS, 0.95)
@@ -477,7 +479,9 @@ def test_the_check_can_fail(cart: tuple[mjfim.Experiment, Path], fault: str) -> 
 
 
 @pytest.mark.slow
-def test_limits_that_the_plan_uses_up_are_missed(cart: tuple[mjfim.Experiment, Path]) -> None:
+def test_limits_without_margin_in_the_plan_are_violated(
+    cart: tuple[mjfim.Experiment, Path],
+) -> None:
     """The conclusions name the violation, and the margin that would have been sufficient."""
     experiment, path = cart
     plenty = bench_of(cart)
@@ -500,7 +504,7 @@ def test_limits_that_the_plan_uses_up_are_missed(cart: tuple[mjfim.Experiment, P
     assert judged(roomy).all_kept == RUNS
 
 
-def test_a_start_on_the_move_takes_no_latency(tmp_path: Path) -> None:
+def test_an_experiment_that_begins_in_motion_allows_no_latency(tmp_path: Path) -> None:
     """Such a design can be played without a latency only, which the message says."""
     task = BUILD["cart"](tmp_path, playback_rate=50.0)
     path, _ = written(task, tmp_path)
