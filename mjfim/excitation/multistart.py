@@ -183,7 +183,7 @@ class Multistart:
         return replace(variant, timestep_factor=1) == self.fine.task.system.variant
 
     def _needs_one_round(self, starts: Sequence[InitialControl]) -> bool:
-        """Check whether there is nothing to compare: one start, whose control is free, on one level."""
+        """Check whether there is one start only, whose control is free, and one level."""
         if len(starts) > 1 or self.coarse is not None:
             return False
 

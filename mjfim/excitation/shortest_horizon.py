@@ -222,7 +222,8 @@ class _HorizonSearch:
         rate = self.experiment.rate
         if longest * rate < self.grid.minimum:
             raise ExperimentError(
-                f"shortest_experiment: longest {longest:g} s is less than {self.grid.minimum} samples"
+                f"shortest_experiment: longest {longest:g} s is less than {self.grid.minimum} "
+                "samples"
             )
 
         largest = self.grid.round_down(longest * rate)

@@ -444,7 +444,7 @@ def _worst_margin_sign(task: DesignTask, constraints: ConstraintSet, control: Ar
 
 
 def _eigenvalues_meet(stage: DescentLevel, eigenvalues: Array) -> bool:
-    """Check whether the smallest eigenvalues nearly meet while the exact E-criterion is minimised."""
+    """Check whether the smallest eigenvalues nearly meet with the exact E-criterion."""
     is_exact = stage.task.experiment.cost.criterion == "E" and np.isinf(stage.power)
     if not is_exact or len(eigenvalues) < 2:
         return False
