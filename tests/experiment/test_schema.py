@@ -739,7 +739,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "subset of nothing": (
         edited("[cost]", '[cost]\ncriterion = "c"\nsubset = []'),
         E,
-        [HOME, "cost.subset", "empty", "valid: m"],
+        [HOME, "cost.subset", "names no parameter", "valid: m"],
     ),
     "metric weight without the metric": (
         SHORT + "[descent]\npsi_weight = 1\n",
