@@ -34,7 +34,24 @@ def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
     assert found["self_test"]["passed"] is True
 
 
-def test_combinations_of_parameters_are_named_and_the_exit_code_is_1() -> None:
+def test_combinations_of_parameters_are_named_and_the_exit_code_is_1(
+    study: Path, tmp_path: Path
+) -> None:
+    """Of the mass of the cart and the armature of its joint, any motion shows the sum alone."""
+    text = study.read_text(encoding="utf-8")
+    text = text.replace('"cart_pendulum.', f'"{study.parent}/cart_pendulum.')
+    text += '[parameters.M]\ntarget = "body/cart:mass"\n'
+    text += '[parameters.a]\ntarget = "joint/slide:armature"\nguess = 0.1\n'
+    path = tmp_path / "study.toml"
+    path.write_text(text, encoding="utf-8")
+
+    result = run("check", path)
+    assert result.exit_code == 1
+    assert "M + a" in result.stdout
+
+
+@pytest.mark.slow
+def test_combinations_of_a_double_pendulum_are_named_and_the_exit_code_is_1() -> None:
     result = run("check", MODELS / "double_pendulum.toml")
     assert result.exit_code == 1
     assert "m1r1 + 0.3 m2" in result.stdout

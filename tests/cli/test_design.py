@@ -1,4 +1,4 @@
-"""`mjfim design`: its files and exit codes, experiments that it refuses, folders it cannot write."""
+"""`mjfim design`: its files and exit codes, and experiments and folders that it refuses."""
 
 from __future__ import annotations
 

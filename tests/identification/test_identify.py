@@ -44,6 +44,12 @@ def recording(task: DesignTask, design: mjfim.Design) -> Recording:
     return simulate_system(task.system, design.trajectory, seed=3)
 
 
+@pytest.fixture(scope="module")
+def estimate(task: DesignTask, recording: Recording) -> mjfim.Estimate:
+    """The estimate from the recording."""
+    return identify_system(task.system, [recording])
+
+
 def noiseless(task: DesignTask, recording: Recording) -> Recording:
     y, _ = task.plant.measure(task.parameters.true[None], recording.ctrl)
     return Recording(t=recording.t, ctrl=recording.ctrl, y=y[0], outputs=recording.outputs)
@@ -97,18 +103,18 @@ def test_jacobian_agrees_with_independent_differences(
 
 
 def test_covariance_is_the_cramer_rao_bound_at_the_estimate(
-    task: DesignTask, design: mjfim.Design, recording: Recording
+    design: mjfim.Design, estimate: mjfim.Estimate
 ) -> None:
-    estimate = identify_system(task.system, [recording])
     np.testing.assert_allclose(estimate.std, design.final.std, rtol=0.05)
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
 
 
-def test_chi_square_and_misfit(task: DesignTask, recording: Recording) -> None:
-    right = identify_system(task.system, [recording])
-    assert right.dof == 400 * 4 - 3
-    assert 0.001 < chi2.sf(right.chi2, right.dof) < 0.999
-    assert not right.misfit
+def test_chi_square_and_misfit(
+    task: DesignTask, recording: Recording, estimate: mjfim.Estimate
+) -> None:
+    assert estimate.dof == 400 * 4 - 3
+    assert 0.001 < chi2.sf(estimate.chi2, estimate.dof) < 0.999
+    assert not estimate.misfit
     drag = np.array(recording.y)
     drag[:, 0] += 0.1 * np.sin(3 * recording.t)  # a structured error that no parameter explains
     wrong = identify_system(
@@ -125,14 +131,11 @@ def test_overstated_noise_is_a_warning(task: DesignTask, recording: Recording) -
 
 
 def test_two_recordings_carry_twice_the_information(
-    task: DesignTask, design: mjfim.Design, recording: Recording
+    task: DesignTask, design: mjfim.Design, recording: Recording, estimate: mjfim.Estimate
 ) -> None:
     again = simulate_system(task.system, design.trajectory, seed=4)
-    one, two = (
-        identify_system(task.system, [recording]),
-        identify_system(task.system, [recording, again]),
-    )
-    np.testing.assert_allclose(two.std, one.std / np.sqrt(2), rtol=0.03)
+    two = identify_system(task.system, [recording, again])
+    np.testing.assert_allclose(two.std, estimate.std / np.sqrt(2), rtol=0.03)
     assert len(two.predicted) == 2
 
 
@@ -308,7 +311,7 @@ def test_an_interrupted_round_of_a_campaign_is_not_kept(
 
 
 def test_an_interruption_between_starts_keeps_the_earlier_ones(
-    task: DesignTask, recording: Recording
+    task: DesignTask, recording: Recording, estimate: mjfim.Estimate
 ) -> None:
     """Results of earlier starts count; there is no search from a later start."""
     several = DesignTask.resolve(task.experiment.replace(fit={"starts": 6}))
@@ -322,9 +325,7 @@ def test_an_interruption_between_starts_keeps_the_earlier_ones(
     found = identify_system(several.system, [recording], callback=show)
     assert found.interrupted
     assert not any(phase.startswith("start 4") or phase == "all data" for phase in seen)
-    np.testing.assert_allclose(
-        found.theta, identify_system(task.system, [recording]).theta, rtol=1e-3
-    )
+    np.testing.assert_allclose(found.theta, estimate.theta, rtol=1e-3)
 
 
 def test_an_interruption_before_the_last_search_ends_all_searches(

@@ -74,11 +74,12 @@ def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]
     return identify_system(system, fitted, held_out=kept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fitted", "held_out"),
     [
         pytest.param("dircol", "energy_shaping", id="dircol"),
-        pytest.param("energy_shaping", "dircol", id="energy", marks=pytest.mark.slow),
+        pytest.param("energy_shaping", "dircol", id="energy"),
     ],
 )
 def test_pendulum_predicts_the_other_file_far_better_than_published(

@@ -38,7 +38,7 @@ def test_every_model_has_an_experiment() -> None:
     assert {path.stem for path in MODELS.glob("*.xml")} == {*EXAMPLES, "cart_pendulum"}
 
 
-@pytest.mark.parametrize("name", slow_except("four_bar", "sliding_block"))
+@pytest.mark.parametrize("name", slow_except("four_bar"))
 def test_check_names_the_subject_of_the_example(name: str, tmp_path: Path) -> None:
     result = run("check", design_file(name, tmp_path), "-o", tmp_path / "out")
     assert result.exit_code in (0, 1), result.output
@@ -54,7 +54,8 @@ def test_check_names_the_subject_of_the_example(name: str, tmp_path: Path) -> No
     assert told["not_excited"] == []
 
 
-@pytest.mark.parametrize("name", slow_except("four_bar"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXAMPLES)
 def test_a_short_design_improves_and_writes_all_files(name: str, tmp_path: Path) -> None:
     task = DesignTask.resolve(
         mjfim.Experiment.from_file(design_file(name, tmp_path)).replace(

@@ -152,18 +152,39 @@ def run(problem: Any, direction: Direction, **changes: Any) -> list[Iterate[Curv
     return list(optimize(problem, start(problem), direction, **settings))
 
 
+def costs(controls: Array) -> Array:
+    """Costs (M,) of many controls (N, M), simulated together."""
+    x = np.repeat(START[:, None], controls.shape[1], axis=1)
+    total = np.zeros(controls.shape[1])
+
+    for u in controls:
+        d = x - GOAL[:, None]
+        total += 0.5 * DT * (np.sum(d * (Q @ d), axis=0) + R[0, 0] * u**2)
+        x = step(x, u[None])
+
+    d = x - GOAL[:, None]
+    return total + 0.5 * np.sum(d * (TERMINAL @ d), axis=0)
+
+
 @pytest.fixture(scope="module")
 def optimum() -> float:
     """The smallest cost over controls, by SciPy with finite differences."""
     problem = Pendulum()
+    moves = 1e-6 * np.eye(N)
 
     def cost(u: Array) -> float:
-        return problem.value(problem.rollout(u[:, None]))
+        return float(costs(u[:, None])[0])
+
+    def slope(u: Array) -> Array:
+        forward = costs(u[:, None] + moves)
+        backward = costs(u[:, None] - moves)
+        return (forward - backward) / 2e-6
 
     u = start(problem).u[:, 0]
+    options = {"gtol": 1e-7, "maxiter": 400}
     for _ in range(2):
-        u = minimize(cost, u, method="BFGS", options={"gtol": 1e-7, "maxiter": 400}).x
-    return cost(u)
+        u = minimize(cost, u, jac=slope, method="BFGS", options=options).x
+    return problem.value(problem.rollout(u[:, None]))
 
 
 DIRECTIONS: dict[str, Callable[[], Direction]] = {
