@@ -52,10 +52,10 @@ def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: 
 
     title = f"{len(campaign.rounds)} rounds of design, recording and estimate"
     note = (
-        f"{campaign.status.value}. Bars, and the band of the last round: ± 1 and ± 2 formal σ, "
-        "which are the true accuracy only if the model and the noise are right."
+        f"{style.as_sentence(campaign.status.value)} Bars, and the band of the last round: ± 1 "
+        "and ± 2 formal σ, which are the true accuracy only if the model and the noise are right."
     )
-    style.add_title(figure, title, _handles(simulated=simulated), note[0].upper() + note[1:])
+    style.add_title(figure, title, _handles(simulated=simulated), note)
     return figure
 
 

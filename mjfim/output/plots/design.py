@@ -22,6 +22,7 @@ from mjfim.output.plots.style import (
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
+    as_sentence,
     break_before_unit,
     format_axes,
     format_number,
@@ -385,8 +386,7 @@ def convergence(design: Design) -> Figure:
     ]
     if relative_slope is not None:
         handles.append(Line2D([], [], color=MUTED_COLOUR, linestyle=":", label="slope / J"))
-    note = f"{design.status.value}."
-    note = note[0].upper() + note[1:]
+    note = as_sentence(design.status.value)
     if has_barrier:
         note += (
             " Dashed lines: a new barrier stage begins; with limits, the slope is that of log J "

@@ -25,6 +25,9 @@ LEAST_DRAWN_MARGIN = -1.0
 # Characters to which the names of limits and of parameters are shortened.
 LIMIT_NAME_WIDTH, PARAMETER_NAME_WIDTH = 26, 24
 
+# Sum of the characters of all names of parameters above which the names are turned.
+MAX_LEVEL_CHARACTERS = 60
+
 
 def robustness_figure(result: Robustness) -> Figure:
     """Draw the margins of every limit, the errors, the coverage, and the errors of the guess.
@@ -220,7 +223,10 @@ def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
     low = float(np.nanmin([predicted, observed], initial=1.0))
     axes.set_ylim(60.0 * low, 400.0)
     names = [style.shorten(name, PARAMETER_NAME_WIDTH) for name in result.names]
-    axes.set_xticks(x, names, rotation=30, ha="right")
+    if sum(len(name) for name in names) <= MAX_LEVEL_CHARACTERS:
+        axes.set_xticks(x, names)
+    else:
+        axes.set_xticks(x, names, rotation=30, ha="right")
     axes.legend(
         fontsize=style.SMALL_FONT,
         frameon=False,

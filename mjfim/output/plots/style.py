@@ -199,6 +199,15 @@ def break_before_unit(label: str, width: int = 18) -> str:
     return f"{shorten(name, width)}\n[{unit}]"
 
 
+def as_sentence(text: str) -> str:
+    """Return a text with a capital first letter and a full stop.
+
+    Args:
+        text: The text, without a full stop.
+    """
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 def trajectory_style(trajectory: str) -> tuple[str, str]:
     """Return the name of a trajectory in figures, and its colour.
 

@@ -133,7 +133,7 @@ def _design_panels(design: Design, labels: Labels, plots: Sequence[PhasePlot]) -
     The history has a tab for itself, because the viewer draws one timeline at a time.
     """
     states = state_parts(labels)
-    title = "√λ_min of the information so far [√s / θ-unit]"
+    title = "√λ_min of the information up to each time [√s / θ-unit]"
     information = series_view(("information",), title)
     sensitivities = grid_parts("sensitivity ψ", [plot.view(labels) for plot in plots])
 

@@ -106,7 +106,7 @@ class PhasePlot:
         texts = []
         for name, largest in zip(names, self.scale, strict=True):
             _, unit = split_unit(name)
-            texts.append(f"{AXIS_FACTOR * largest:.2g} {unit}")
+            texts.append(f"{AXIS_FACTOR * largest:.3g} {unit}")
         marks = rr.Points2D(
             ends * (0.8, 1.0),
             labels=texts,
