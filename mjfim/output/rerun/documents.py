@@ -57,7 +57,10 @@ FURTHER_STYLES = (
 )
 
 # Styles of trajectories with a known name.
-STYLES_BY_NAME = {"initial": INITIAL, "optimized": OPTIMIZED, "final": OPTIMIZED}
+STYLES_BY_NAME = {"initial": INITIAL, "optimized": OPTIMIZED}
+
+# Names under which trajectories are shown, where they differ from those in the file of a design.
+SHOWN_NAMES = {"final": "optimized"}
 
 # Largest number of samples of a recording, or of a motion, in a file.
 MAX_SAMPLES = 20_000
@@ -249,9 +252,10 @@ def log_trajectories(
     Args:
         path: The file.
         model: The model.
-        trajectories: The trajectories by name.
+        trajectories: The trajectories by name; `final` is shown as `optimized`.
         labels: Labels of the model's columns.
     """
+    trajectories = {SHOWN_NAMES.get(name, name): found for name, found in trajectories.items()}
     styles = _trajectory_styles(list(trajectories))
     poses = {
         name: body_poses(model, trajectory.t, trajectory.qpos)
