@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -18,3 +19,17 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     A background job of a shell inherits SIGINT as ignored, and then the tests of Ctrl-C would fail.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write empty files in place of figures, which take seconds to draw.
+
+    For tests that look at the names of the files alone.
+    """
+
+    def touch(figure: object, path: Path, dpi: float = 0.0) -> Path:
+        path.touch()
+        return path
+
+    monkeypatch.setattr("mjfim.output.plots.save", touch)

@@ -30,6 +30,7 @@ def test_identify_leaves_its_files(home: Path, identified: Result) -> None:
     assert model.body("bob").mass[0] == pytest.approx(data["theta"][0], rel=1e-5)
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_identify_several_recordings(
     home: Path, study: Path, recorded: Path, identified: Result, tmp_path: Path
 ) -> None:
@@ -46,6 +47,7 @@ def test_identify_several_recordings(
     assert both["recordings"] == [str(recorded), str(second)]
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_misfit(study: Path, recorded: Path, tmp_path: Path) -> None:
     """The model cannot explain the recording: the exit code and the text say so."""
     header, *rows = recorded.read_text(encoding="utf-8").splitlines()

@@ -17,6 +17,7 @@ from tests.support.cli import (
 )
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_montecarlo_leaves_its_files(study: Path, archived: Path, tmp_path: Path) -> None:
     """Trials of the initial and the designed trajectory, at a lower measurement rate."""
     out = tmp_path / "mc"
