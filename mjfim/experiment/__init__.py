@@ -1,7 +1,8 @@
 """The experiment file as a checked record (schema), and the system that it resolves to."""
 
 from mjfim.experiment.schema import Experiment, json_schema
-from mjfim.experiment.system import System, TimeGrid
+from mjfim.experiment.system import System
+from mjfim.experiment.time_grid import TimeGrid
 
 __all__ = [
     "Experiment",

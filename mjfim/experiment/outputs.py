@@ -15,19 +15,14 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Correlated, NoiseSpec
 from mjfim.model.coordinates import (
+    ModelCoordinates,
+    SensorComponent,
     StateComponent,
-    measurable_columns,
-    sensor_columns,
-    state_components,
     unknown_coordinate,
 )
-from mjfim.model.elements import names_of
 from mjfim.plant.noise import Noise
 from mjfim.plant.outputs import Output, Outputs
 from mjfim.plant.state_space import StateSpace
-
-# A ratio of two rates counts as a whole number within this relative tolerance.
-RATE_TOLERANCE = 1e-6
 
 # A covariance is not positive definite if its smallest eigenvalue is below this fraction of its
 # largest entry.
@@ -35,15 +30,21 @@ DEFINITENESS = 1e-12
 
 
 def resolve_outputs(
-    experiment: Experiment, model: Any, space: StateSpace, stride: int
+    experiment: Experiment,
+    coordinates: ModelCoordinates,
+    space: StateSpace,
+    *,
+    stride: int,
+    stride_of_key: Mapping[str, int],
 ) -> tuple[Outputs, Noise]:
     """Resolve the measured outputs and their noise.
 
     Args:
         experiment: The experiment.
-        model: Its compiled model (`mujoco.MjModel`).
+        coordinates: What can be measured on its model.
         space: The state space of the model.
         stride: Samples from one measurement to the next at `measure_rate`.
+        stride_of_key: Samples between measurements for the keys of the table `noise` that state another rate.
 
     Returns:
         The outputs, and the noise with their covariance and strides.
@@ -51,11 +52,9 @@ def resolve_outputs(
     Raises:
         ExperimentError: A key of the tables is not valid for the model; the message names it.
     """
-    components = {component.name: component for component in state_components(model)}
-    sensors = names_of(model, "sensor")
-    columns_of_key = _columns_of_keys(components, model, sensors)
+    columns_of_key = _columns_of_keys(coordinates)
     stated = dict(experiment.noise) or _noise_of_mjcf(
-        model, sensors, required=not experiment.correlated
+        coordinates, required=not experiment.correlated
     )
     for key in stated:
         if key not in columns_of_key:
@@ -63,27 +62,21 @@ def resolve_outputs(
                 f"noise: {unknown_coordinate('sensor', key, list(columns_of_key))}"
             )
 
-    table = _NoiseTable(components, list(measurable_columns(model)), stride)
+    table = _NoiseTable(coordinates, stride)
 
     # Keys that cover fewer outputs are entered last, so that they take precedence over keys that
     # cover more outputs.
     for key in sorted(stated, key=lambda k: -len(columns_of_key[k])):
-        table.set_key(key, stated[key], columns_of_key[key], experiment)
+        table.set_key(key, stated[key], columns_of_key[key], stride_of_key.get(key, stride))
     for block in experiment.correlated:
         table.correlate(block)
 
     measured = sorted(table.measured)
-    outputs = _outputs(model, sensors, components, table, measured)
+    outputs = _outputs(coordinates, table.covariance, measured)
     noise = Noise(
         covariance=table.covariance[np.ix_(measured, measured)], strides=table.strides[measured]
     )
     return Outputs(outputs=outputs, space=space), noise
-
-
-def measurement_stride(experiment: Experiment) -> int:
-    """Samples from one measurement to the next at the experiment's `measure_rate`."""
-    measure_rate = experiment.measure_rate or experiment.rate
-    return _stride("measure_rate", experiment.rate, measure_rate)
 
 
 class _NoiseTable:
@@ -96,33 +89,36 @@ class _NoiseTable:
         measured: Indices of the columns that are measured.
     """
 
-    def __init__(
-        self, components: Mapping[str, StateComponent], columns: list[str], stride: int
-    ) -> None:
+    def __init__(self, coordinates: ModelCoordinates, stride: int) -> None:
         """Begin without measured columns.
 
         stride: samples from one measurement to the next, for keys that state no rate.
         """
-        n = len(columns)
-        self.columns = columns
+        self.columns = list(coordinates.measurable)
+        n = len(self.columns)
         self.covariance = np.zeros((n, n))
         self.strides = np.full(n, stride)
         self.measured: set[int] = set()
 
-        self._default_stride = stride
-        self._sigma_factors = np.array(
-            [components[name].sigma_factor if name in components else 1.0 for name in columns]
-        )
+        self._sigma_factors = np.ones(n)
+        self._sigma_factors[: len(coordinates.state)] = [
+            component.sigma_factor for component in coordinates.state
+        ]
 
     def indices(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
         """Indices of columns by their names."""
         found = [self.columns.index(name) for name in names]
         return np.array(found, dtype=np.intp)
 
-    def set_key(
-        self, key: str, value: float | NoiseSpec, names: list[str], experiment: Experiment
-    ) -> None:
-        """Enter one key of the table `noise`, which is valid for the columns `names`."""
+    def set_key(self, key: str, value: float | NoiseSpec, names: list[str], stride: int) -> None:
+        """Enter one key of the table `noise`.
+
+        Args:
+            key: The key.
+            value: What the table states for it.
+            names: The columns for which it is valid.
+            stride: Samples from one of their measurements to the next.
+        """
         if not names:
             raise ExperimentError(
                 "noise.state: the model has no joint to measure; name sensors instead"
@@ -137,17 +133,15 @@ class _NoiseTable:
         )
         self.measured.update(rows.tolist())
 
-        self.strides[rows] = self._default_stride
-        if spec.rate is not None:
-            self.strides[rows] = _stride(f"noise.{key}.rate", experiment.rate, spec.rate)
-            _require_measurement(key, spec.rate, experiment.horizon)
+        self.strides[rows] = stride
 
     def correlate(self, block: Correlated) -> None:
         """Enter one block of the table `correlated`."""
         for name in block.outputs:
             if name not in self.columns:
-                fault = unknown_coordinate("output", name, self.columns)
-                raise ExperimentError(f"correlated.outputs: {fault}")
+                raise ExperimentError(
+                    f"correlated.outputs: {unknown_coordinate('output', name, self.columns)}"
+                )
 
         rows = self.indices(block.outputs)
         listed = ", ".join(block.outputs)
@@ -169,30 +163,30 @@ class _NoiseTable:
         self.measured.update(rows.tolist())
 
 
-def _columns_of_keys(
-    components: Mapping[str, StateComponent], model: Any, sensors: list[str]
-) -> dict[str, list[str]]:
+def _columns_of_keys(coordinates: ModelCoordinates) -> dict[str, list[str]]:
     """Columns for which each key of the table `noise` is valid."""
-    found: dict[str, list[str]] = {"state": list(components)}
-    for component in components.values():
+    found: dict[str, list[str]] = {"state": [component.name for component in coordinates.state]}
+    for component in coordinates.state:
         found[component.name] = [component.name]
         for group in component.groups:
             found.setdefault(group, []).append(component.name)
-    for sensor in sensors:
-        found.setdefault(sensor, sensor_columns(model, sensor))
-    return found
+
+    # Where a sensor has the name of a key of the state, the key means the state.
+    columns_of_sensor: dict[str, list[str]] = {}
+    for number in coordinates.sensors:
+        columns_of_sensor.setdefault(number.sensor, []).append(number.name)
+    return found | {k: columns for k, columns in columns_of_sensor.items() if k not in found}
 
 
-def _noise_of_mjcf(model: Any, sensors: list[str], required: bool) -> dict[str, Any]:
+def _noise_of_mjcf(coordinates: ModelCoordinates, *, required: bool) -> dict[str, Any]:
     """Standard deviations of the sensors whose `noise` the MJCF states.
 
     They are used if the experiment states no noise. Raises ExperimentError if `required` and the
     MJCF states none either.
     """
-    sigmas = {name: float(model.sensor(name).noise[0]) for name in sensors}
-    stated = {name: sigma for name, sigma in sigmas.items() if sigma > 0}
+    stated = {number.sensor: number.sigma for number in coordinates.sensors if number.sigma > 0}
     if required and not stated:
-        valid = ", ".join(["state", *measurable_columns(model)])
+        valid = ", ".join(["state", *coordinates.measurable])
         raise ExperimentError(
             "noise: no output is measured; state `state` or outputs by name here, or `noise` of "
             f"sensors in the MJCF; valid: {valid}"
@@ -201,30 +195,30 @@ def _noise_of_mjcf(model: Any, sensors: list[str], required: bool) -> dict[str, 
 
 
 def _outputs(
-    model: Any,
-    sensors: list[str],
-    components: Mapping[str, StateComponent],
-    table: _NoiseTable,
-    measured: list[int],
+    coordinates: ModelCoordinates, covariance: Array, measured: list[int]
 ) -> tuple[Output, ...]:
-    """The measured outputs, in the order of the columns."""
-    addresses = {
-        column: int(model.sensor(sensor).adr[0]) + i
-        for sensor in sensors
-        for i, column in enumerate(sensor_columns(model, sensor))
-    }
-    sigma = np.sqrt(np.diag(table.covariance))
+    """The measured outputs, in the order of the columns.
+
+    Args:
+        coordinates: What can be measured: n columns.
+        covariance: (n, n) covariance of the noise.
+        measured: Places of the columns that are measured.
+    """
+    components: list[StateComponent | SensorComponent] = [*coordinates.state, *coordinates.sensors]
+    sigma = np.sqrt(np.diag(covariance))
 
     outputs = []
     for i in measured:
-        name = table.columns[i]
-        component = components.get(name)
-        if component is None:
-            output = Output(name=name, sigma=float(sigma[i]), sensor=addresses[name])
-        else:
+        component = components[i]
+        if isinstance(component, StateComponent):
             output = Output(
-                name=name, sigma=float(sigma[i]), unit=component.unit, state=component.address
+                name=component.name,
+                sigma=float(sigma[i]),
+                unit=component.unit,
+                state=component.address,
             )
+        else:
+            output = Output(name=component.name, sigma=float(sigma[i]), sensor=component.address)
         outputs.append(output)
     return tuple(outputs)
 
@@ -267,35 +261,3 @@ def _checked_covariance(key: str, rows: tuple[tuple[float, ...], ...], n: int) -
             f"{key}: not positive definite; variances must exceed what the correlations imply"
         )
     return matrix
-
-
-def _require_measurement(key: str, rate: float, horizon: float | None) -> None:
-    """Raise ExperimentError if a rate [Hz] gives no measurement within the horizon [s].
-
-    horizon: None if the experiment states none; then every rate is accepted.
-    """
-    if horizon is not None and rate * horizon < 1.0 - RATE_TOLERANCE:
-        raise ExperimentError(
-            f"noise.{key}.rate: {rate:g} Hz gives no measurement within the horizon ({horizon:g} s)"
-        )
-
-
-def _stride(key: str, rate: float, measure_rate: float) -> int:
-    """Samples from one measurement to the next.
-
-    Args:
-        key: The key that states the rate of measurements, for messages.
-        rate: Rate of the samples [Hz].
-        measure_rate: Rate of the measurements [Hz].
-
-    Raises:
-        ExperimentError: The rate of the measurements does not divide that of the samples.
-    """
-    ratio = rate / measure_rate
-    stride = round(ratio)
-    if stride < 1 or abs(ratio - stride) > RATE_TOLERANCE * stride:
-        valid = ", ".join(f"{rate / k:g}" for k in (1, 2, 4, 5, 10))
-        raise ExperimentError(
-            f"{key}: {measure_rate:g} Hz does not divide rate {rate:g} Hz; valid: {valid}"
-        )
-    return stride

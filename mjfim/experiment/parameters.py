@@ -10,13 +10,13 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system_tables import ParameterSpec
-from mjfim.model.coordinates import tangent_components, unknown_coordinate
-from mjfim.model.elements import identifier, names_of, unnamed_count
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
+from mjfim.experiment.system_tables import Nuisance, ParameterSpec
+from mjfim.model.coordinates import ModelCoordinates, unknown_coordinate
+from mjfim.model.elements import identifier, names_of
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
+from mjfim.model.loading import ModelSource
 from mjfim.model.parameters import Parameter, Target
 from mjfim.model.paths import resolve, unit_of
-from mjfim.model.targets import body_inertia
 
 # Prefix of the names of parameters that are nuisance deviations of the initial state.
 INITIAL_STATE_PREFIX = "initial "
@@ -36,7 +36,7 @@ DELAY_MAGNITUDE = 0.01
 
 
 def resolve_parameters(
-    experiment: Experiment, model: Any, outputs: Sequence[str]
+    experiment: Experiment, source: ModelSource, outputs: Sequence[str]
 ) -> list[Parameter]:
     """Resolve all parameters in the order of theta.
 
@@ -44,7 +44,7 @@ def resolve_parameters(
 
     Args:
         experiment: The experiment.
-        model: Its compiled model (`mujoco.MjModel`).
+        source: Its model.
         outputs: Names of the measured columns.
 
     Returns:
@@ -53,13 +53,14 @@ def resolve_parameters(
     Raises:
         ExperimentError: A parameter cannot be resolved; the message names its key.
     """
+    model = source.model
     resolved: list[Parameter] = []
     for name, spec in experiment.parameters.items():
         if spec.inertial is None:
             resolved.append(_single_parameter(name, spec, model, outputs))
         else:
             resolved += _inertia_parameters(name, spec, model)
-    resolved += _nuisance_parameters(experiment, model, outputs)
+    resolved += _nuisance_parameters(experiment.nuisance, source.coordinates, outputs)
 
     names = [parameter.name for parameter in resolved]
     duplicate = next((name for name in names if names.count(name) > 1), None)
@@ -206,31 +207,25 @@ def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[Ar
 
 
 def _nuisance_parameters(
-    experiment: Experiment, model: Any, outputs: Sequence[str]
+    stated: Nuisance, coordinates: ModelCoordinates, outputs: Sequence[str]
 ) -> Iterator[Parameter]:
     """Parameters of the table `nuisance`.
 
     They are deviations of the initial state, biases of outputs, and the delay of all outputs.
     """
-    stated = experiment.nuisance
-
-    paths = {
-        component.name: component.path
-        for component in tangent_components(model)[: 2 * model.nv]
-        if component.path
+    deviations = {
+        component.name: component for component in coordinates.deviations if component.path
     }
-    unnamed = unnamed_count(model, "joint")
+    unnamed = coordinates.unnamed_joints
     if unnamed and stated.initial is not None and not isinstance(stated.initial, Mapping):
         raise ExperimentError(
             f"nuisance.initial: {unnamed} joints have no name; name them in the MJCF, or state "
             "deviations by coordinate"
         )
-    for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(paths)):
+    for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(deviations)):
+        deviation = deviations[name]
         yield _nuisance_parameter(
-            f"{INITIAL_STATE_PREFIX}{name}",
-            paths[name],
-            prior,
-            unit=unit_of(model, paths[name]),
+            f"{INITIAL_STATE_PREFIX}{name}", deviation.path, prior, unit=deviation.unit
         )
 
     for name, prior in _priors_by_name("nuisance.bias", stated.bias, outputs):

@@ -22,7 +22,13 @@ from typing import Any
 import mujoco
 
 from mjfim.errors import unknown
-from mjfim.model.elements import element_name, identifier, names_of, unique_names
+from mjfim.model.elements import (
+    element_name,
+    identifier,
+    names_of,
+    unique_names,
+    unnamed_count,
+)
 from mjfim.model.units import (
     PART_UNITS,
     control_unit,
@@ -119,6 +125,63 @@ class TangentComponent:
     path: str
     address: int
     unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorComponent:
+    """One number of a sensor with a name, which can be measured and recorded.
+
+    Attributes:
+        name: Column of the number: the name of the sensor, with `[i]` where it has several numbers.
+        sensor: Name of the sensor.
+        address: Its place in the sensor data.
+        sigma: Standard deviation of its noise that the MJCF states, 0 where it states none [unit of
+            the sensor].
+    """
+
+    name: str
+    sensor: str
+    address: int
+    sigma: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelCoordinates:
+    """All coordinates of a model by name, looked up once.
+
+    Attributes:
+        controls: Names of the nu controls.
+        scalar_joints: All slide and hinge joints.
+        unnamed_joints: Number of joints without a name in the MJCF.
+        state: The nq + nv numbers of the state that can be measured.
+        sensors: The numbers of all sensors with a name.
+        deviations: The 2 nv numbers of a deviation of positions and velocities.
+    """
+
+    controls: tuple[str, ...]
+    scalar_joints: tuple[ScalarJoint, ...]
+    unnamed_joints: int
+    state: tuple[StateComponent, ...]
+    sensors: tuple[SensorComponent, ...]
+    deviations: tuple[TangentComponent, ...]
+
+    @classmethod
+    def of(cls, model: Any) -> ModelCoordinates:
+        """Look up the coordinates of a compiled model (`mujoco.MjModel`)."""
+        return cls(
+            controls=control_names(model),
+            scalar_joints=scalar_joints(model),
+            unnamed_joints=unnamed_count(model, "joint"),
+            state=state_components(model),
+            sensors=sensor_components(model),
+            deviations=tangent_components(model)[: 2 * model.nv],
+        )
+
+    @property
+    def measurable(self) -> tuple[str, ...]:
+        """Columns of everything that a recording may hold: components of the state, then sensors."""
+        state = [component.name for component in self.state]
+        return (*state, *(component.name for component in self.sensors))
 
 
 def joint_names(model: Any) -> tuple[str, ...]:
@@ -326,12 +389,23 @@ def sensor_columns(model: Any, sensor: str) -> list[str]:
     return _indexed(sensor, width)
 
 
+def sensor_components(model: Any) -> tuple[SensorComponent, ...]:
+    """The numbers of all sensors that have a name, in the order of the model."""
+    found: list[SensorComponent] = []
+    for name in names_of(model, "sensor"):
+        sensor = model.sensor(name)
+        first, sigma = int(sensor.adr[0]), float(sensor.noise[0])
+        found += [
+            SensorComponent(name=column, sensor=name, address=first + i, sigma=sigma)
+            for i, column in enumerate(sensor_columns(model, name))
+        ]
+    return tuple(found)
+
+
 def measurable_columns(model: Any) -> tuple[str, ...]:
     """Columns of everything that a recording may hold: components of the state, then sensors."""
-    columns = [component.name for component in state_components(model)]
-    for sensor in names_of(model, "sensor"):
-        columns += sensor_columns(model, sensor)
-    return tuple(columns)
+    state = [component.name for component in state_components(model)]
+    return (*state, *(component.name for component in sensor_components(model)))
 
 
 def output_label(model: Any, output: str) -> str:

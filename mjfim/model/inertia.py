@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -89,6 +90,16 @@ class BodyInertia:
         """Radius of gyration about the origin of the body frame [m]."""
         central = np.trace(self.second_moments) / self.mass
         return float(np.sqrt(central + self.com @ self.com))
+
+
+def body_inertia(model: Any, body: int) -> BodyInertia:
+    """Mass, centre of mass and inertia of a body in a model, by the body's number."""
+    return BodyInertia.from_principal(
+        model.body_mass[body],
+        model.body_ipos[body],
+        model.body_inertia[body],
+        model.body_iquat[body],
+    )
 
 
 def to_central(body: BodyInertia) -> Array:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from mjfim.errors import ModelError
-from mjfim.model.smooth_friction import has_dry_friction
+from mjfim.model.coordinates import ModelCoordinates
 
 
 def load_spec(path: Path) -> Any:
@@ -79,6 +79,16 @@ class ModelSource:
         self._compiled: dict[frozenset[str] | None, Any] = {}
         self._edited: dict[tuple[frozenset[str] | None, bytes], Any] = {}
 
+    @cached_property
+    def coordinates(self) -> ModelCoordinates:
+        """The coordinates of the model by name."""
+        return ModelCoordinates.of(self.model)
+
+    @cached_property
+    def decoration(self) -> frozenset[str]:
+        """Names of geoms whose place and size can be changed without a compile."""
+        return decoration(self.spec, self.model)
+
     def compiled(self, moved_bodies: frozenset[str] | None) -> Any:
         """The compiled model in which the inertia of some bodies may be written.
 
@@ -145,19 +155,4 @@ def decoration(spec: Any, model: Any) -> frozenset[str]:
         and not geom.fluid_ellipsoid
         and (geom.mass == 0.0 or (geom.parent.explicitinertial and not forced))
         and not geom.meshname
-    )
-
-
-def unconstrained(model: Any) -> bool:
-    """Whether no constraint can ever be active, so that the solver can be switched off."""
-    no_contact = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)) or (
-        model.npair == 0 and not (np.any(model.geom_contype) and np.any(model.geom_conaffinity))
-    )
-    limited = model.jnt_limited.any() or model.tendon_limited.any()
-    return bool(
-        no_contact
-        and model.neq == 0
-        and model.nflex == 0
-        and not limited
-        and not has_dry_friction(model)
     )

@@ -134,6 +134,20 @@ class ParameterWriter:
                 found.append((tuple(dict.fromkeys(columns)), f"body {name!r} has {fault}"))
         return found
 
+    def require_physical_bodies(self, base: PlantModel) -> None:
+        """Raise ExperimentError if the guess or the true values give a body an unphysical inertia."""
+        p = self._parameters
+        for key, theta in (("guess", p.guess), ("true", p.true)):
+            for columns, fault in self.unphysical_bodies(base, theta):
+                involved = [p.parameters[j] for j in columns]
+                keys = dict.fromkeys(
+                    f"parameters.{parameter.group}"
+                    if parameter.group
+                    else f"parameters.{parameter.name}.{key}"
+                    for parameter in involved
+                )
+                raise ExperimentError(f"{', '.join(keys)}: {fault}")
+
     def _write_numbers(self, model: Any, theta: Array) -> dict[tuple[str, int], Array]:
         """Write every single number in place.
 

@@ -12,7 +12,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.parameter_writer import ParameterWriter
 from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath, resolve
 from mjfim.model.targets import (
@@ -24,7 +24,6 @@ from mjfim.model.targets import (
     RotationField,
     SpecField,
     TargetField,
-    body_inertia,
 )
 from mjfim.model.variants import MocapPlacement
 
@@ -284,6 +283,17 @@ class ParameterSet:
     def needs_compile(self) -> np.ndarray:
         """(p,) True where a change needs a compile."""
         return np.asarray(self._is_function | self._has_field(SpecField))
+
+    @cached_property
+    def moved_bodies(self) -> set[str] | None:
+        """Bodies whose inertial frame parameters move; None where a parameter may change anything."""
+        return None if self.needs_compile.any() else moved_bodies(self.parameters)
+
+    @property
+    def changes_friction(self) -> bool:
+        """True where a parameter may change dry friction, even one that is nominally zero."""
+        paths = [target.path for _, target, _ in self._targets()]
+        return bool(self._is_function.any()) or any("frictionloss" in path for path in paths)
 
     @property
     def _is_function(self) -> np.ndarray:

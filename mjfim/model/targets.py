@@ -23,7 +23,7 @@ import numpy as np
 
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, BodyInertia
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 
 # Array of MjModel -> array that says whether the frame of the element coincides with that of its
 # body. MuJoCo skips the position of such elements, so the flag is cleared when the position is
@@ -248,13 +248,3 @@ TargetField = (
     | OutputBiasField
     | OutputDelayField
 )
-
-
-def body_inertia(model: Any, body: int) -> BodyInertia:
-    """Mass, centre of mass and inertia of a body in a model, by the body's number."""
-    return BodyInertia.from_principal(
-        model.body_mass[body],
-        model.body_ipos[body],
-        model.body_inertia[body],
-        model.body_iquat[body],
-    )

@@ -12,8 +12,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError
-from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource, unconstrained
-from mjfim.model.smooth_friction import smooth_dry_friction
+from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource
+from mjfim.model.smooth_friction import has_dry_friction, smooth_dry_friction
 
 # Tolerance of the constraint solver in private copies. With a larger one, the error of the solver
 # would appear in differences between steps.
@@ -194,7 +194,9 @@ class PlantModel:
         self._mocap = mocap
         self._relaxation = relaxation
         self._edited: dict[bytes, Any] = {}
-        self.model = self._adapted(source.compiled(self._moved_bodies))
+
+        compiled = source.compiled(self._moved_bodies)
+        self.model = self._adapted(compiled)
 
     @property
     def smoothing_speeds(self) -> tuple[float, ...]:
@@ -274,3 +276,18 @@ class PlantModel:
         if self._mocap is not None:
             self._mocap.put(model, self._mocap.start)
         return self.refresh(model)
+
+
+def unconstrained(model: Any) -> bool:
+    """Whether no constraint can ever be active, so that the solver can be switched off."""
+    no_contact = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)) or (
+        model.npair == 0 and not (np.any(model.geom_contype) and np.any(model.geom_conaffinity))
+    )
+    limited = model.jnt_limited.any() or model.tendon_limited.any()
+    return bool(
+        no_contact
+        and model.neq == 0
+        and model.nflex == 0
+        and not limited
+        and not has_dry_friction(model)
+    )

@@ -15,6 +15,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.schema import Experiment
 from mjfim.model.coordinates import (
+    ModelCoordinates,
     control_names,
     joint_names,
     measurable_columns,
@@ -449,7 +450,7 @@ def test_a_model_without_joints_has_no_state_to_measure(tmp_path: Path) -> None:
         noise={"state": 0.1},
     )
     with pytest.raises(ExperimentError, match=r"noise\.state: the model has no joint to measure"):
-        resolve_outputs(experiment, model, None, 1)
+        resolve_outputs(experiment, ModelCoordinates.of(model), None, stride=1, stride_of_key={})
 
 
 def test_sensors_read_by_the_plant_are_those_of_mujoco(tmp_path: Path) -> None:

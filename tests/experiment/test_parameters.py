@@ -14,9 +14,8 @@ import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError
 from mjfim.excitation.task import DesignTask
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.parameters import Parameter
-from mjfim.model.targets import body_inertia
 from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,

@@ -12,11 +12,11 @@ import pytest
 
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.model.elements import names_of
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource, decoration
 from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
 from mjfim.model.paths import KINDS, ParameterPath, fields_of, resolve
-from mjfim.model.targets import ModelField, RotationField, SpecField, body_inertia
+from mjfim.model.targets import ModelField, RotationField, SpecField
 from mjfim.model.variants import PlantModel
 from mjfim.output.mjcf.write import write_identified, write_spec
 from tests.support.numerics import Loop, make_task

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
-from mjfim.model.inertia import INERTIA_COLUMNS, INERTIA_ROWS
-from mjfim.model.targets import body_inertia
+from mjfim.model.inertia import INERTIA_COLUMNS, INERTIA_ROWS, body_inertia
 from mjfim.output.mjcf.document import (
     ORIENTATIONS,
     MjcfDocument,

@@ -17,10 +17,11 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError
 from mjfim.experiment.system import System
-from mjfim.model.loading import compile_spec, unconstrained
+from mjfim.model.loading import compile_spec
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS
 from mjfim.model.spec_writer import state_derived_values, write_element
+from mjfim.model.variants import unconstrained
 from mjfim.output.mjcf.asset_paths import relocate_assets
 from mjfim.output.mjcf.document import MjcfDocument
 from mjfim.output.mjcf.edits import ParameterEdits
