@@ -212,21 +212,17 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
     includes_limits = every or stated.enforce
     limits = task.limits if includes_limits else ()
 
-    control = _bounds_of_controls(limits, "control", task)
+    nu = len(task.controls)
+    control = _bounds_of_controls(limits, "control", nu)
     if control is None:
-        free = np.full(len(task.controls), np.inf)
+        free = np.full(nu, np.inf)
         control = Bounds(lower=-free, upper=free, scale=_control_sizes(task))
-
-    clearance = None
-    if stated.clearance is not None and includes_limits:
-        reach = stated.clearance + CLEARANCE_REACH
-        clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
 
     # The holding controls are computed even without limits on rates, because a boundary that cannot
     # be kept is an error.
     before = task.initial_hold if boundary.start == "rest" else None
     after = task.final_hold if boundary.end == "rest" else None
-    rate_bounds = _bounds_of_controls(limits, "control_rate", task)
+    rate_bounds = _bounds_of_controls(limits, "control_rate", nu)
     rate = None
     if rate_bounds is not None:
         rate = ControlRateConstraint(
@@ -237,11 +233,19 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
             periodic=boundary.end == "periodic",
         )
 
+    substeps = _substep_constraint(task, limits)
+    end = None if boundary.end == "free" else _end_constraint(task)
+
+    clearance = None
+    if stated.clearance is not None and includes_limits:
+        reach = stated.clearance + CLEARANCE_REACH
+        clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
+
     return ConstraintSet(
-        substeps=_substep_constraint(task, limits),
+        substeps=substeps,
         control=ControlConstraint(bounds=control),
         rate=rate,
-        end=None if boundary.end == "free" else _end_constraint(task),
+        end=end,
         clearance=clearance,
     )
 
@@ -274,7 +278,7 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
     )
 
 
-def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, task: DesignTask) -> Bounds | None:
+def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, nu: int) -> Bounds | None:
     """Ranges of all nu controls for one kind of limit; None where no control has such a limit.
 
     The range of a control without such a limit is infinite.
@@ -283,8 +287,8 @@ def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, task: DesignTask) 
     if not rows:
         return None
 
-    lower = np.full(len(task.controls), -np.inf)
-    upper = np.full(len(task.controls), np.inf)
+    lower = np.full(nu, -np.inf)
+    upper = np.full(nu, np.inf)
     for limit in rows:
         lower[limit.index] = limit.lower
         upper[limit.index] = limit.upper

@@ -116,10 +116,11 @@ def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator
             f"{bandwidth:g} Hz"
         )
 
+    wanted = _multisine(task, rng) - task.centre
     starts_at_rest = experiment.boundary.start == "rest"
     ends_at_rest = experiment.boundary.end == "rest"
     basis = fourier_basis(task.t, task.horizon, frequency, harmonics, starts_at_rest, ends_at_rest)
-    coefficients = np.linalg.lstsq(basis, _multisine(task, rng) - task.centre)[0]
+    coefficients = np.linalg.lstsq(basis, wanted)[0]
     control = task.centre + basis @ coefficients
     return InitialControl(name=f"Fourier series of {frequency:g} Hz", control=control, basis=basis)
 

@@ -404,10 +404,11 @@ class DesignTask:
         peak = np.abs(self.control - mean).max(axis=0)
         peak = np.where(peak > 0.0, peak, 1.0)
 
-        wave = multisine(self.t, len(self.controls), 1.0 / self.horizon, RANDOM_HARMONICS, rng)
-        swing = peak * rng.uniform(least, most) * wave
         about = self.initial_hold if self.experiment.boundary.start == "rest" else mean
-        control = about + self.fade(self.samples) * swing
+        window = self.fade(self.samples)
+
+        wave = multisine(self.t, len(self.controls), 1.0 / self.horizon, RANDOM_HARMONICS, rng)
+        control = about + window * (peak * rng.uniform(least, most) * wave)
 
         for limit in self.limits:
             if limit.kind == "control":

@@ -54,13 +54,15 @@ def resolve_parameters(
         ExperimentError: A parameter cannot be resolved; the message names its key.
     """
     model = source.model
+    nuisance = list(_nuisance_parameters(experiment.nuisance, source.coordinates, outputs))
+
     resolved: list[Parameter] = []
     for name, spec in experiment.parameters.items():
         if spec.inertial is None:
             resolved.append(_single_parameter(name, spec, model, outputs))
         else:
             resolved += _inertia_parameters(name, spec, model)
-    resolved += _nuisance_parameters(experiment.nuisance, source.coordinates, outputs)
+    resolved += nuisance
 
     names = [parameter.name for parameter in resolved]
     duplicate = next((name for name in names if names.count(name) > 1), None)

@@ -107,9 +107,9 @@ class System:
             stride=grid.stride,
             stride_of_key=strides,
         )
-        unknowns = resolve_parameters(experiment, source, outputs.names)
         key = keyframe(model, "initial.keyframe", experiment.initial.keyframe)
         start = initial_state(experiment.initial, model, key)
+        unknowns = resolve_parameters(experiment, source, outputs.names)
 
         # The numbers of the model that the parameters set, and the plant that they act on.
         mocap = MocapPlacement.of(model, key)

@@ -75,6 +75,19 @@ def unique_names(model: Any, kind: str) -> tuple[str, ...]:
     return tuple(names)
 
 
+def geom_labels(model: Any) -> tuple[str, ...]:
+    """Labels of all geoms: the name of a geom, or `<body> geom <number>` where it has none.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    bodies = unique_names(model, "body")
+    return tuple(
+        element_name(model, "geom", geom) or f"{bodies[body]} geom {geom}"
+        for geom, body in enumerate(model.geom_bodyid.tolist())
+    )
+
+
 def identifier(model: Any, kind: str, name: str) -> int:
     """Number of the element of a kind that has a name.
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.model.elements import unique_names
 from mjfim.model.geom_pairs import GeomPair
 from mjfim.model.pair_distance import INFINITE_DISTANCE, Indices, PairDistances
 
@@ -97,11 +96,7 @@ class GeomDistances:
         self._first_of_column = np.searchsorted(self._column, np.arange(len(number)))
 
         leaders = [self.pairs[i] for i in self._first_of_column]
-        bodies = unique_names(model, "body")
-        self.columns = tuple(
-            f"{bodies[body[p.first]]} - {bodies[body[p.second]]}" if grouped else p.name
-            for p in leaders
-        )
+        self.columns = tuple(p.bodies if grouped else p.name for p in leaders)
 
         # (m, nv): +1 where a degree of freedom moves the second body only, -1 where the first only,
         # else 0.

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.model.elements import element_name, unique_names
+from mjfim.model.elements import geom_labels, unique_names
 
 # Types of geoms for which MuJoCo has no reliable distance, in words.
 REFUSED_TYPES = {
@@ -30,11 +30,13 @@ class GeomPair:
         first: Number of a geom that can move.
         second: Number of the other geom; a geom that cannot move is always the second one.
         name: Name of the pair, `<geom> - <geom>`.
+        bodies: Name of the pair of their bodies, `<body> - <body>`.
     """
 
     first: int
     second: int
     name: str
+    bodies: str
 
 
 def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[GeomPair, ...]:
@@ -53,24 +55,28 @@ def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Ge
         ExperimentError: A body is unknown, or a height field or signed distance field remains.
     """
     bodies = unique_names(model, "body")
+    labels = geom_labels(model)
     _check_ignored(ignored, bodies)
 
     selection = _Selection(model)
-    body_of = model.geom_bodyid.tolist()
+    body_of = [bodies[body] for body in model.geom_bodyid.tolist()]
     found = []
     for one, other in combinations(range(model.ngeom), 2):
         first, second = (one, other) if selection.can_move(one) else (other, one)
-        names = frozenset((bodies[body_of[first]], bodies[body_of[second]]))
-        if names in ignored or not selection.can_come_near(first, second):
+        pair = (body_of[first], body_of[second])
+        if frozenset(pair) in ignored or not selection.can_come_near(first, second):
             continue
 
-        labels = []
         for geom in (first, second):
-            body = bodies[body_of[geom]]
-            label = element_name(model, "geom", geom) or f"{body} geom {geom}"
-            _check_type(model, geom, label, bodies[body_of[first]], bodies[body_of[second]])
-            labels.append(label)
-        found.append(GeomPair(first=first, second=second, name=" - ".join(labels)))
+            _check_type(model, geom, labels[geom], *pair)
+        found.append(
+            GeomPair(
+                first=first,
+                second=second,
+                name=f"{labels[first]} - {labels[second]}",
+                bodies=" - ".join(pair),
+            )
+        )
     return tuple(found)
 
 
