@@ -1,4 +1,4 @@
-"""`mjfim campaign`: design, record, identify and design again until every target accuracy is reached."""
+"""`mjfim campaign`: rounds of design, recording and estimate until all targets are reached."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def campaign(
         float | None,
         typer.Option(
             metavar="SHARE",
-            help="Target accuracy of parameters that state none, as a share of the guess.",
+            help="Target accuracy of parameters that state none, as a fraction of the guess.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise.")] = 0,
@@ -58,16 +58,16 @@ def campaign(
         list[Path] | None,
         typer.Option(
             metavar="FILE",
-            help="Recording of the round that waits; may be given several times; implies --real.",
+            help="Recording of the last design; may be given several times; implies --real.",
         ),
     ] = None,
     threads: Threads = None,
 ) -> None:
     """Repeat design, recording and estimate until every target accuracy is reached.
 
-    Without --real the robot is simulated at the `true` values. With --real each call identifies
-    from all recordings so far, designs the next round into DIR/round_K/ and ends: play its
-    design.csv and repeat the call with --recordings.
+    Without --real, the robot is simulated at the `true` values. With --real, each call estimates
+    the parameters from all recordings so far and writes the design of the next round into
+    DIR/round_K/. Then play its design.csv on the robot, and call again with --recordings.
     """
     stated = with_target_accuracies(mjfim.Experiment.from_file(experiment), wanted)
     check_folder(output)
@@ -84,7 +84,8 @@ def campaign(
     if found.status is CampaignStatus.WAITING:
         waiting = run.folder.round(run.folder.designed)
         out.print(
-            f"play {waiting}/design.csv, record, then repeat this call with --recordings FILE.csv",
+            f"next: play {waiting}/design.csv on the robot and record it, then repeat this call "
+            "with --recordings FILE.csv",
             markup=False,
             soft_wrap=True,
         )
@@ -129,13 +130,13 @@ class CampaignRun:
         experiment = self.task.experiment
         if all(spec.true is None for spec in experiment.parameters.values()):
             raise ExperimentError(
-                f"{experiment.source}: no parameter states a `true` value, at which a robot could "
-                "be simulated; state some, or use --real"
+                f"{experiment.source}: no parameter states a `true` value, which the simulated "
+                "robot needs; state one, or use --real"
             )
         if self.folder.has_rounds:
             raise RecordingError(
-                f"{self.folder.path}: holds a campaign already; take another folder, or continue "
-                "it with --real"
+                f"{self.folder.path}: this folder holds a campaign already; choose another folder, "
+                "or continue the campaign with --real"
             )
 
         def measure(design: Design, number: int) -> Recording:
@@ -159,7 +160,7 @@ class CampaignRun:
 
         Args:
             rounds: Largest number of rounds.
-            files: Recordings of the round that waits; those that are known already are left out.
+            files: Recordings of the last design; files that are known already are left out.
 
         Raises:
             RecordingError: A file cannot be read, or no round waits for it.
@@ -168,7 +169,7 @@ class CampaignRun:
         done = list(self.folder.recorded_rounds())
         is_waiting = self.folder.designed > self.folder.recorded
 
-        # The first design waits for its recording: there is nothing to identify.
+        # While the first design is not recorded, there is no data to identify from.
         if is_waiting and not done:
             return Campaign(
                 parameters=self.task.parameters.names,
@@ -181,7 +182,7 @@ class CampaignRun:
             """Write the design of a round, which ends this call."""
             self._write_design(design, number)
 
-        # While a design waits for its recording, no further one is made.
+        # While a design is not recorded, no further design is made.
         limit = len(done) if is_waiting else rounds
         found = mjfim.run_campaign(
             self.task.experiment,
@@ -196,9 +197,10 @@ class CampaignRun:
         return found
 
     def _write_design(self, design: Design, number: int) -> None:
-        """Write the design of a round, beside the experiment by which it was made."""
+        """Write the design of a round, and the experiment with which it was made."""
         experiment = restate_experiment(self.task, design.theta, self._estimate)
-        self.folder.write_design(design, number, self.task.restated(experiment).system)
+        system = self.task.restated(experiment).system
+        self.folder.write_design(design, number, system)
 
     def _finish_round(self, event: Event) -> None:
         """Write the estimate of a complete round, and print it."""
@@ -219,7 +221,7 @@ def with_target_accuracies(experiment: mjfim.Experiment, share: float | None) ->
 
     Args:
         experiment: The experiment.
-        share: Target accuracy as a share of the guess; None leaves the experiment unchanged.
+        share: Target accuracy as a fraction of the guess; None leaves the experiment unchanged.
     """
     if share is None:
         return experiment

@@ -1,4 +1,4 @@
-"""`mjfim check`: what can be identified, and how well."""
+"""`mjfim check`: which parameters can be identified, and how accurately."""
 
 from __future__ import annotations
 
@@ -58,12 +58,14 @@ def check(
         archive.check_fits(design_file, trajectory, system)
     if output is not None:
         check_folder(output)
+
     with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
+
     if output is not None:
         with writing(output) as results:
             results.write_check_folder(output, result)
     print_result(as_json, result.summary(), render(describe_check(result)))
     if output is not None:
-        errors.print(f"wrote {output}/")
+        errors.print(f"wrote {output}/", markup=False)
     raise typer.Exit(0 if result.ok else 1)

@@ -1,4 +1,4 @@
-"""What the verbs share: the app, argument types, progress on stderr, exit codes."""
+"""Common parts of all verbs: the app, types of arguments, progress on stderr, exit codes."""
 
 from __future__ import annotations
 
@@ -32,11 +32,14 @@ app = typer.Typer(
 # Console for messages and progress.
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
-# Console for results; files get lines that are wide enough for the tables.
-out = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+# Width of the lines of results that do not go to a terminal [characters]; tables fit into it.
+FILE_WIDTH = 110
 
-# Iterations of a design and of an estimation between two lines of progress, where stderr is no
-# terminal.
+# Console for results.
+out = Console(highlight=False, width=None if sys.stdout.isatty() else FILE_WIDTH)
+
+# Number of iterations from one line of progress to the next, for a design and for an estimation,
+# if stderr is not a terminal.
 DESIGN_LINES = 10
 FIT_LINES = 5
 
@@ -45,26 +48,28 @@ ExperimentFile = Annotated[
     Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")
 ]
 DesignFile = Annotated[
-    Path, typer.Argument(metavar="DESIGN.npz", help="design.npz that `mjfim design` left.")
+    Path, typer.Argument(metavar="DESIGN.npz", help="File design.npz of `mjfim design`.")
 ]
 Folder = Annotated[
     Path,
-    typer.Option("--output", "-o", metavar="DIR", help="Folder for the results, made if absent."),
+    typer.Option(
+        "--output", "-o", metavar="DIR", help="Folder for the results; created if it is missing."
+    ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the summary to stdout as JSON.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads for MuJoCo; default: all cores.")]
 
 
 class UnfinishedError(Exception):
-    """Ctrl-C while results were being written; the message is their folder."""
+    """The user pressed Ctrl-C while results were written; the message is their folder."""
 
 
 @contextmanager
 def raise_on_interrupt(error: Exception) -> Iterator[None]:
-    """Raise an error when the user presses Ctrl-C, as long as the context lasts.
+    """Raise an error if the user presses Ctrl-C inside the context.
 
-    Long work inside replaces this by a stop token (`mjfim.budget.stop_on_interrupt`) and returns
-    its best result so far.
+    Long computations inside the context replace this by a stop token, see
+    `mjfim.budget.stop_on_interrupt`, and return their best result so far.
 
     Args:
         error: The error.
@@ -72,8 +77,8 @@ def raise_on_interrupt(error: Exception) -> Iterator[None]:
     previous = signal.getsignal(signal.SIGINT)
     in_main_thread = threading.current_thread() is threading.main_thread()
 
-    # Python delivers signals to the main thread only; a process that ignores Ctrl-C keeps ignoring
-    # it.
+    # Python delivers signals to the main thread only. A process that ignores Ctrl-C continues to
+    # ignore it.
     if not in_main_thread or not callable(previous):
         yield
         return
@@ -91,7 +96,9 @@ def raise_on_interrupt(error: Exception) -> Iterator[None]:
 
 @contextmanager
 def writing(folder: Path) -> Iterator[ModuleType]:
-    """Make a folder for results and import what writes them; Ctrl-C in here leaves some of the results.
+    """Create a folder for results, and import the module that writes them.
+
+    After Ctrl-C inside the context, the folder holds only a part of the results.
 
     Args:
         folder: The folder.
@@ -110,7 +117,7 @@ def writing(folder: Path) -> Iterator[ModuleType]:
 
 
 def _version(wanted: bool) -> None:
-    """Print the version and exit, where the option is given."""
+    """Print the version and exit if the option is given."""
     if wanted:
         typer.echo(mjfim.__version__)
         raise typer.Exit
@@ -126,10 +133,10 @@ def root(
 
 
 def verb(function: Callable[..., None]) -> Callable[..., None]:
-    """Register a function as a verb. This is the one place where errors become exit codes.
+    """Register a function as a verb, and turn its errors into messages and exit codes.
 
-    Misuse gives one message and exit code 2; Ctrl-C before any result, or a disk that is full, one
-    message and exit code 1.
+    Misuse gives exit code 2. Ctrl-C before there is a result, and a file that cannot be written,
+    give exit code 1.
 
     Args:
         function: The function; underscores in its name become hyphens.
@@ -140,6 +147,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(function)
     def wrapped(*args: Any, **kwargs: Any) -> None:
+        """Call the verb; print one message and exit for each error."""
         try:
             with raise_on_interrupt(NoResultError()):
                 function(*args, **kwargs)
@@ -150,12 +158,14 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
             errors.print(f"mjfim: {error}", markup=False)
             raise typer.Exit(2) from None
         except OSError as error:
-            place, fault = error.filename or "cannot write", error.strerror or error
+            place = error.filename or "cannot write"
+            fault = error.strerror or error
             errors.print(f"mjfim: {place}: {fault}", markup=False)
             raise typer.Exit(1) from None
         except UnfinishedError as unfinished:
             errors.print(
-                f"mjfim: interrupted; {unfinished}/ holds some of the results, each file complete",
+                f"mjfim: interrupted; {unfinished}/ holds only a part of the results, but each "
+                "file in it is complete",
                 markup=False,
             )
             raise typer.Exit(1) from None
@@ -165,7 +175,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
 
 
 class ProgressDisplay:
-    """Shows the events of long work on stderr: as a bar on a terminal, else as a line now and then."""
+    """Display of progress on stderr: a bar on a terminal, otherwise a line from time to time."""
 
     def __init__(self, bar: Progress, description: str) -> None:
         """Add a row to a progress display.
@@ -203,20 +213,22 @@ class ProgressDisplay:
     def _show_fit(self, event: FitEvent) -> None:
         """Show an iterate of an estimation."""
         text = (
-            f"{event.phase}: iteration {event.iteration}, half of the squares {event.cost:.6g}, "
-            f"step {event.step:.2g} σ"
+            f"{event.phase}: iteration {event.iteration}, half the sum of squares "
+            f"{event.cost:.6g}, step {event.step:.2g} σ"
         )
         self._show_iterate(text, event.iteration, FIT_LINES)
 
     def _show_iterate(self, text: str, iteration: int, period: int) -> None:
         """Show an iterate on the bar; without a terminal, print every `period`-th iterate."""
         self._bar.update(self._task, description=text)
-        if not errors.is_terminal and iteration % period == 0:
+
+        is_due = iteration % period == 0
+        if is_due and not errors.is_terminal:
             errors.print(text, markup=False)
 
     def _show_study(self, event: StudyEvent) -> None:
         """Show the progress of a study."""
-        # Without a known number of parts there is no bar: each part is a line.
+        # Without a known number of parts there is no bar, and each part is a line.
         if event.count is None:
             errors.print(event.message, markup=False)
             return
@@ -231,7 +243,7 @@ class ProgressDisplay:
         if errors.is_terminal:
             return
 
-        # Without a terminal: a line per part, or the share where the study reports nothing else.
+        # Without a terminal, each part is a line. A study without messages reports its percentage.
         if not event.message:
             errors.print(f"{event.part}: {100 * event.share:.0f} %", markup=False)
         elif part != self._announced_part:
@@ -241,7 +253,7 @@ class ProgressDisplay:
 
 @contextmanager
 def progress(description: str) -> Iterator[ProgressDisplay]:
-    """Show the progress of long work on stderr.
+    """Show the progress of a long computation on stderr.
 
     Args:
         description: Text until the first event.

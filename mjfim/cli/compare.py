@@ -1,4 +1,4 @@
-"""`mjfim compare`: the design beside parametric excitations with the same budget."""
+"""`mjfim compare`: the design compared with parametric excitations of equal budget."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ from mjfim.studies.compare import compare_task
 def compare(
     experiment: ExperimentFile,
     output: Folder,
-    seconds: Annotated[float, typer.Option(min=0.0, help="Budget of each method [s].")] = 60.0,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Time of each method in seconds.")] = 60.0,
     steps: Annotated[
-        float | None, typer.Option(min=1.0, help="Budget of MuJoCo steps; default: time alone.")
+        float | None,
+        typer.Option(min=1.0, help="MuJoCo steps of each method; default: not limited."),
     ] = None,
     methods: Annotated[
         str | None,
@@ -45,7 +46,10 @@ def compare(
     as_json: AsJson = False,
     threads: Threads = None,
 ) -> None:
-    """Compare the design with chirps, multisines, Fourier series and splines of the same budget; exit code 1 if one is better."""
+    """Compare the design with chirps, multisines, Fourier series and splines of equal budget.
+
+    The exit code is 1 if one of them is better than the design.
+    """
     task = DesignTask.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     chosen = (
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]

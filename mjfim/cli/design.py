@@ -1,4 +1,4 @@
-"""`mjfim design`: the most informative experiment within the limits."""
+"""`mjfim design`: the experiment with the most information within the limits."""
 
 from __future__ import annotations
 
@@ -34,12 +34,19 @@ from mjfim.records.events import Callback
 
 @contextmanager
 def several(task: DesignTask) -> Iterator[Executor | None]:
-    """Processes for the starts of a design under hard limits; None if one start has all threads to itself."""
-    d = task.experiment.descent
-    count = d.starts + len(d.previous) + len(d.fourier) + len(d.repeats)
+    """Yield processes for the initial controls of a design under hard limits.
+
+    Yields:
+        A pool; None without hard limits, and for a single initial control, which uses all threads.
+    """
+    descent = task.experiment.descent
+    further = len(descent.previous) + len(descent.fourier) + len(descent.repeats)
+    count = descent.starts + further
+
     if count == 1 or not task.is_limited:
         yield None
         return
+
     with Pool(min(count, task.plant.simulator.threads)) as pool:
         yield pool
 
@@ -51,7 +58,7 @@ def design(
     as_json: AsJson = False,
     starts: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of initial controls; overrides [descent] starts."),
+        typer.Option(min=1, help="Number of initial controls; overrides descent.starts."),
     ] = None,
     shortest: Annotated[
         bool,
@@ -67,6 +74,7 @@ def design(
         stated = stated.replace(descent={"starts": starts})
     task = DesignTask.resolve(stated, threads=threads)
     check_folder(output)
+
     with (
         several(task) as executor,
         progress("designing") as show,
@@ -78,12 +86,15 @@ def design(
         else:
             budget = design_budget(task, stop)
             result = design_task(task, callback=show, executor=executor, budget=budget)
+
+    # The files of the shortest experiment describe its horizon, not the stated one.
     if found is not None:
         task = DesignTask.resolve(found.experiment, threads=threads)
     with writing(output) as results:
         results.write_design_folder(output, result, task.system)
         if found is not None:
             found.save(output)
+
     summary = result.summary()
     if found is not None:
         summary["shortest"] = found.summary()
@@ -94,10 +105,11 @@ def design(
     )
     if found is not None:
         errors.print(
-            f"{found}\nto continue with it, state horizon = {found.horizon:g} in {experiment}",
+            f"{found}\nto use this horizon further, state horizon = {found.horizon:g} in "
+            f"{experiment}",
             markup=False,
         )
-    errors.print(f"wrote {output}/ (see it move: mjfim replay {output})")
+    errors.print(f"wrote {output}/ (to see the motion: mjfim replay {output})", markup=False)
     if not result.success:
         errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
     raise typer.Exit(0 if result.success and (found is None or found.closed) else 1)
@@ -106,7 +118,7 @@ def design(
 def _shortest(
     task: DesignTask, callback: Callback, executor: Executor | None, stop: StopToken
 ) -> ShortestExperiment:
-    """The shortest experiment; exit code 1 where even the longest one does not reach the targets."""
+    """Find the shortest experiment; exit with code 1 if the longest one misses a target."""
     try:
         return mjfim.shortest_experiment(
             task.experiment,

@@ -1,4 +1,4 @@
-"""`mjfim export-sysid`: the same recordings for `mujoco.sysid`, and both estimators beside each other."""
+"""`mjfim export-sysid`: recordings for `mujoco.sysid`, and a comparison of both estimators."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def export_sysid(
     ],
     output: Folder,
 ) -> None:
-    """Give recordings and parameters to mujoco.sysid, and compare its fits with that of mjfim."""
+    """Pass recordings and parameters to mujoco.sysid, and compare its estimates with mjfim's."""
     # MuJoCo's sysid takes a while to import; no other verb needs it.
     from mjfim.output.sysid import comparison as sysid_comparison
     from mjfim.output.sysid.sequences import require_extra

@@ -1,4 +1,4 @@
-"""`mjfim identify`: the parameters from recordings."""
+"""`mjfim identify`: estimates of the parameters from recordings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ from mjfim.recordings.read import read_log
 def identify(
     experiment: ExperimentFile,
     recordings: Annotated[
-        list[Path], typer.Argument(metavar="RECORDING", help="Logs of any format that is read.")
+        list[Path],
+        typer.Argument(metavar="RECORDING", help="Logs: CSV, Parquet, npz, JSON, or a ROS 2 bag."),
     ],
     output: Folder,
     held_out: Annotated[
@@ -41,11 +42,12 @@ def identify(
         typer.Option(
             "--held-out",
             metavar="FILE",
-            help="Log that is predicted, not fitted; may be given several times.",
+            help="Log that is predicted instead of fitted; may be given several times.",
         ),
     ] = None,
     method: Annotated[
-        str, typer.Option(help="least_squares (with bounds) or newton (the paper's).")
+        str,
+        typer.Option(help="least_squares, which keeps bounds, or newton, the paper's method."),
     ] = "least_squares",
     as_json: AsJson = False,
     threads: Threads = None,
@@ -55,6 +57,7 @@ def identify(
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     check_folder(output)
+
     with progress("reading") as show:
         fitted = [read_log(path, system.channels) for path in recordings]
         predicted = [read_log(path, system.channels) for path in held_out or []]
@@ -69,6 +72,7 @@ def identify(
             held_out=[log.recording for log in predicted],
             callback=show,
         )
+
     with writing(output) as results:
         for sentence in results.write_estimate_folder(output, result, system):
             errors.print(f"warning: {sentence}", markup=False)

@@ -21,7 +21,7 @@ from mjfim.cli import (  # noqa: F401 - each registers its verbs
 )
 from mjfim.cli.common import app
 
-# Verbs in the order of an experiment, in which the help lists them; further ones come last.
+# Verbs in the order in which the help lists them, which is the order of an experiment.
 ORDER = (
     "check",
     "design",
@@ -37,7 +37,7 @@ ORDER = (
 
 
 def _place(name: str | None) -> int:
-    """Return the place of a verb in the help."""
+    """Return the position of a verb in the help; verbs that ORDER does not name come last."""
     return ORDER.index(name) if name in ORDER else len(ORDER)
 
 
@@ -45,6 +45,6 @@ app.registered_commands.sort(key=lambda command: _place(command.name))
 
 
 def main() -> NoReturn:
-    """Entry point."""
+    """Run the command line, the entry point of `mjfim`."""
     app(prog_name="mjfim")
     sys.exit(0)

@@ -1,4 +1,4 @@
-"""`mjfim replay`: results in the Rerun viewer."""
+"""`mjfim replay`: display of results in the Rerun viewer."""
 
 from __future__ import annotations
 

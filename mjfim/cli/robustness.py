@@ -20,14 +20,14 @@ from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_robustness
 from mjfim.output.text import render
 from mjfim.parallel import Pool, cores
-from mjfim.records.robustness import RobotConditions
+from mjfim.records.robustness import RobotConditions, Robustness
 from mjfim.studies.robustness import assess_robustness, default_latency
 
 # Kinds of limits from which a design can keep a reserve.
 KINDS = ("position", "velocity", "acceleration", "control", "control_rate", "force", "clearance")
 
-# Reserve of a design where none is stated, in shares of half ranges: what 20 % wrong parameters
-# need on the servo arm.
+# Default reserve of a design, as fractions of half ranges. The servo arm needs these for parameters
+# that are wrong by 20 %.
 DEFAULT_RESERVE = ("position=0.05", "velocity=0.3", "force=0.25")
 
 
@@ -37,7 +37,7 @@ def robustness(
     design_folder: Annotated[
         Path | None,
         typer.Argument(
-            metavar="DESIGN_FOLDER", help="Folder of a design; default: a design is made."
+            metavar="DESIGN_FOLDER", help="Folder of a design; default: a new design is made."
         ),
     ] = None,
     output: Annotated[
@@ -45,19 +45,23 @@ def robustness(
     ] = Path("out/robustness"),
     runs: Annotated[int, typer.Option(min=1, help="Number of robots.")] = 100,
     wrong: Annotated[
-        float, typer.Option(min=0.0, help="Share by which every parameter is off.")
+        float, typer.Option(min=0.0, help="Relative error of the guess of every parameter.")
     ] = 0.2,
     latency: Annotated[
         float | None,
-        typer.Option(help="Delay of the control [s], whole timesteps; default: 5 ms, rounded up."),
+        typer.Option(
+            help="Delay of the control in seconds, a multiple of the timestep; default: 0.005, "
+            "rounded up."
+        ),
     ] = None,
     feedback: Annotated[
-        bool, typer.Option("--feedback", help="Use the gains on what is measured.")
+        bool,
+        typer.Option("--feedback", help="The controller adds the gains times the deviation."),
     ] = False,
     noise: Annotated[
-        float, typer.Option(min=0.0, help="Noise of the robot over the stated noise.")
+        float, typer.Option(min=0.0, help="Ratio of the robots' noise to the stated noise.")
     ] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes; default: one per core.")
     ] = None,
@@ -66,13 +70,17 @@ def robustness(
         typer.Option(
             metavar="KIND=SHARE",
             help=(
-                "Share of half a range that a design made here stays away from limits of a kind; "
-                "may be given several times."
+                "Distance of a new design from limits of a kind, as a fraction of half a range; "
+                "may be given several times. Default: " + ", ".join(DEFAULT_RESERVE) + "."
             ),
         ),
     ] = None,
 ) -> None:
-    """Play a design on robots that differ from the model: do the limits hold, do the intervals hold the true values?"""
+    """Play a design on simulated robots that differ from the model.
+
+    The result says how many robots keep the limits, and how many of the 95 % intervals contain the
+    true values.
+    """
     stated = mjfim.Experiment.from_file(experiment)
     conditions = RobotConditions(
         wrong=wrong,
@@ -86,7 +94,7 @@ def robustness(
         shares = parse_reserve(reserve or DEFAULT_RESERVE)
         design_folder = design_with_reserve(stated, shares, output / "design")
 
-    clock = time.perf_counter()
+    begun = time.perf_counter()
     with Pool(min(jobs or cores(), runs)) as pool, progress("playing") as show:
         result = assess_robustness(
             stated,
@@ -96,10 +104,16 @@ def robustness(
             callback=show,
             executor=pool,
         )
+    seconds = time.perf_counter() - begun
 
-    seconds = time.perf_counter() - clock
     with writing(output) as results:
         results.write_robustness_folder(output, result, seconds)
+    _report(result, runs, seconds, output)
+    raise typer.Exit(0 if result.ok and result.runs == runs else 1)
+
+
+def _report(result: Robustness, runs: int, seconds: float, output: Path) -> None:
+    """Print the result, the files and, after Ctrl-C, the number of robots that are missing."""
     out.print(render(describe_robustness(result)))
     errors.print(
         f"{result.runs} runs in {seconds:.0f} s; wrote playback.json, playback.npz, playback.png "
@@ -108,20 +122,19 @@ def robustness(
     )
     if result.runs < runs:
         errors.print(f"mjfim: interrupted; only {result.runs} of {runs} robots are done")
-    raise typer.Exit(0 if result.ok and result.runs == runs else 1)
 
 
 def parse_reserve(words: Sequence[str]) -> dict[str, float]:
-    """Read the shares of half ranges by which a design stays away from its limits.
+    """Read the reserves of a design from the command line.
 
     Args:
-        words: `KIND=SHARE` each.
+        words: Reserves, each as `KIND=SHARE`.
 
     Returns:
-        The shares by kind.
+        Reserve by kind of limit, as a fraction of half a range.
 
     Raises:
-        ExperimentError: A kind is unknown, or a share is no number from 0 to 1.
+        ExperimentError: A kind is unknown, or a reserve is not a number from 0 to 1.
     """
     shares = {}
     for word in words:
@@ -133,12 +146,13 @@ def parse_reserve(words: Sequence[str]) -> dict[str, float]:
             shares[kind] = float(text)
         except ValueError:
             raise ExperimentError(
-                f"--reserve: {word!r} is not {kind}=SHARE, as in {kind}=0.2"
+                f"--reserve: {word!r}: expected a number, as in {kind}=0.2"
             ) from None
 
         if not 0.0 <= shares[kind] < 1.0:
             raise ExperimentError(
-                f"--reserve: {word!r}: a share of half of the range, at least 0 and below 1"
+                f"--reserve: {word!r}: expected a fraction of half the range, at least 0 and "
+                "below 1"
             )
     return shares
 
@@ -148,7 +162,11 @@ def tightened(experiment: mjfim.Experiment, reserve: Mapping[str, float]) -> mjf
 
     Args:
         experiment: The experiment.
-        reserve: Shares of half ranges by which limits become tighter, by kind.
+        reserve: Distance by which limits become tighter, by kind of limit, as a fraction of half a
+            range; for a clearance, as a fraction of it.
+
+    Returns:
+        The changed experiment.
     """
     tables: dict[str, dict[str, tuple[float, float]]] = {}
     for limit in DesignTask.resolve(experiment).limits:
@@ -168,11 +186,11 @@ def tightened(experiment: mjfim.Experiment, reserve: Mapping[str, float]) -> mjf
 def design_with_reserve(
     experiment: mjfim.Experiment, reserve: Mapping[str, float], folder: Path
 ) -> Path:
-    """Design with a reserve to all limits, write the design, and say what it is like.
+    """Design with a reserve to the limits, write the design, and print its status and margins.
 
     Args:
         experiment: The experiment.
-        reserve: Shares of half ranges by which the design stays away from its limits, by kind.
+        reserve: Reserve by kind of limit, as a fraction of half a range.
         folder: Folder for the design.
 
     Returns:
@@ -185,7 +203,7 @@ def design_with_reserve(
     write_design(folder, design, task.system)
     margins = ", ".join(f"{kind} {margin:.3g}" for kind, margin in design.limits.items())
     errors.print(f"designed in {design.seconds:.0f} s: {design.status.value}", markup=False)
-    errors.print(f"margins, reserve taken off: {margins}", markup=False)
+    errors.print(f"margins to the tightened limits: {margins}", markup=False)
     for warning in design.warnings:
         errors.print(f"warning: {warning}", markup=False)
     return folder

@@ -1,4 +1,4 @@
-"""`mjfim simulate` and `mjfim montecarlo`: synthetic recordings and the accuracy that they lead to."""
+"""`mjfim simulate` and `mjfim montecarlo`: synthetic recordings, and estimates from them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def simulate(
     ],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
 ) -> None:
-    """Play a design on the model at its `true` values, with noise: a synthetic recording."""
+    """Simulate a recording of a design at the `true` parameter values, with noise."""
     system = System.resolve(mjfim.Experiment.from_file(experiment))
     check_file(output)
     trajectory = archive.read_design(design_file)["final"]
@@ -52,14 +52,15 @@ def montecarlo(
     experiment: ExperimentFile,
     design_file: DesignFile,
     output: Folder,
-    trials: Annotated[int, typer.Option(min=2, help="Trials per trajectory.")] = 1500,
+    trials: Annotated[int, typer.Option(min=2, help="Number of recordings per trajectory.")] = 1500,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     measure_rate: Annotated[
-        float | None, typer.Option(min=0.0, help="Measurement rate [Hz]; divides the rate.")
+        float | None,
+        typer.Option(min=0.0, help="Rate of the measurements in Hz; overrides measure_rate."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare the estimator with the Cramér-Rao bound, on the initial and the designed trajectory."""
+    """Compare estimates with the Cramér-Rao bound on the initial and on the designed trajectory."""
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(
         stated if measure_rate is None else stated.replace(measure_rate=measure_rate)
@@ -68,6 +69,7 @@ def montecarlo(
     for trajectory in named.values():
         archive.check_fits(design_file, trajectory, system)
     check_folder(output)
+
     with progress(f"{trials} trials") as show:
         study = monte_carlo_system(system, named, trials=trials, seed=seed, callback=show)
 
@@ -79,8 +81,7 @@ def montecarlo(
     errors.print(f"wrote {output}/")
     if len(study.sets) < len(named):
         errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")
-    raise typer.Exit(
-        0
-        if len(study.sets) == len(named) and all(s.failed == 0 for s in study.sets.values())
-        else 1
-    )
+
+    is_complete = len(study.sets) == len(named)
+    has_failures = any(trials.failed for trials in study.sets.values())
+    raise typer.Exit(0 if is_complete and not has_failures else 1)

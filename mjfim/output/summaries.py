@@ -52,6 +52,9 @@ MAX_MATRIX = 5
 LOG_NAME_WIDTH = 34
 PREDICTION_NAME_WIDTH = 40
 
+# Jitter of a log below this fraction of the sample period is round-off of the time stamps.
+JITTER_ROUND_OFF = 1e-6
+
 # Smallest divisor of the improvement of an eigenvalue; avoids a division by zero.
 TINY = 1e-300
 
@@ -443,6 +446,13 @@ def _prediction_table(predictions: Sequence[Prediction]) -> SummaryTable:
 # ---- logs
 
 
+def _jitter(log: LogSummary) -> Cell:
+    """Return the jitter of a log [ms]; "-" if it is only round-off of the time stamps."""
+    if log.jitter_std * log.rate < JITTER_ROUND_OFF:
+        return "-"
+    return Quantity(value=1e3 * log.jitter_std, digits=2, suffix=" ms")
+
+
 def describe_logs(logs: Sequence[LogSummary]) -> Summary:
     """Describe what was read: the clock of every log, then the range of its columns.
 
@@ -456,7 +466,7 @@ def describe_logs(logs: Sequence[LogSummary]) -> Summary:
                 f"{log.rows:,}",
                 Quantity(value=log.duration, digits=4, suffix=" s"),
                 Quantity(value=log.rate, digits=5, suffix=" Hz"),
-                Quantity(value=1e3 * log.jitter_std, digits=2, suffix=" ms"),
+                _jitter(log),
                 Quantity(value=1e3 * log.longest_step, digits=3, suffix=" ms"),
                 f"{log.dropped:,} rows" if log.dropped else "-",
             )
