@@ -298,7 +298,9 @@ class System:
     def rest(self) -> Array:
         """(nu,) control of the initial keyframe, zero without one."""
         key = keyframe(self.model, "initial.keyframe", self.experiment.initial.keyframe)
-        return np.zeros(len(self.controls)) if key is None else np.array(key.ctrl)
+        if key is None:
+            return np.zeros(len(self.controls))
+        return np.array(key.ctrl)
 
     @cached_property
     def _whole_model(self) -> PlantModel:

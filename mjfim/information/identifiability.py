@@ -12,6 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, UnidentifiableError
+from mjfim.information.criteria import SINGULAR_RATIO
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
@@ -352,8 +353,11 @@ def _null_space(
 def _rows_of_information(information: Array) -> Array:
     """(n, p) rows J with J'J equal to an information matrix (p, p)."""
     values, vectors = np.linalg.eigh(information)
-    kept = values > 1e-14 * max(float(values[-1]), 0.0)
-    return np.asarray(np.sqrt(values[kept])[:, None] * vectors.T[kept])
+    largest = max(float(values[-1]), 0.0)
+    kept = values > SINGULAR_RATIO * largest
+
+    lengths = np.sqrt(values[kept])
+    return np.asarray(lengths[:, None] * vectors.T[kept])
 
 
 def _hidden_from_earlier(test: IdentifiabilityTest, directions: Array) -> Array:

@@ -232,21 +232,28 @@ def _complement(directions: Array) -> Array:
     t, k = directions.shape
     if not k:
         return np.eye(t)
-    return np.asarray(np.linalg.qr(directions, mode="complete")[0][:, k:])
+
+    Q = np.linalg.qr(directions, mode="complete")[0]
+    return np.asarray(Q[:, k:])
 
 
 def _independent(directions: Array) -> Array:
     """Orthonormal columns that span the space of (t, m) directions."""
-    U, s, _ = np.linalg.svd(directions, full_matrices=False)
-    return np.asarray(U[:, s > DEPENDENT * max(s.max(initial=0.0), SMALLEST_NORM)])
+    U, sizes, _ = np.linalg.svd(directions, full_matrices=False)
+    largest = max(sizes.max(initial=0.0), SMALLEST_NORM)
+    kept = sizes > DEPENDENT * largest
+    return np.asarray(U[:, kept])
 
 
 def _range(A: Array) -> Array:
     """Orthonormal basis of the range of A: (n, m); its columns are scaled to unit length first."""
     length = np.linalg.norm(A, axis=0)
     nonzero = length > 0.0
-    U, s, _ = np.linalg.svd(A[:, nonzero] / length[nonzero], full_matrices=False)
-    return np.asarray(U[:, s > ZERO_SINGULAR_VALUES[0]])
+    unit = A[:, nonzero] / length[nonzero]
+
+    U, sizes, _ = np.linalg.svd(unit, full_matrices=False)
+    kept = sizes > ZERO_SINGULAR_VALUES[0]
+    return np.asarray(U[:, kept])
 
 
 def parameter_groups(

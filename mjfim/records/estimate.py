@@ -197,8 +197,9 @@ class WorstResidual:
     share: float
 
     def __str__(self) -> str:
+        percent = 100 * self.share
         interval = f"{self.begin:.3g} to {self.end:.3g} s of {self.recording}"
-        size = f"{self.size:.2g} σ, {100 * self.share:.0f} % of the sum of squares"
+        size = f"{self.size:.2g} σ, {percent:.0f} % of the sum of squares"
         return f"largest residuals in {self.output}, {interval}: {size}"
 
     def summary(self) -> dict[str, Any]:

@@ -28,7 +28,7 @@ MIN_RESERVE = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class RobotConditions:
-    """How the simulated robots differ from the model.
+    """Differences between the simulated robots and the model.
 
     Attributes:
         wrong: Relative error of the guess of every parameter; its sign is random.

@@ -231,7 +231,7 @@ class _Encoder:
 
 
 def _encode_table(value: BaseModel, path: str) -> dict[str, Any]:
-    """Return the keys that an experiment states, with those that its file does not hold, as plain values."""
+    """Return plain values of the keys that an experiment states, and of those only Python has."""
     try:
         stated = value.model_dump(mode="json", exclude_unset=True)
     except PydanticSerializationError:

@@ -124,14 +124,11 @@ def _table(
     unread: list[str] = []
     for name, parts in labels.items():
         shape, dtype = headers[name]
-
-        # A control is held from each row to the next one, so the last row may have no control.
         is_control = name.startswith("ctrl") or not controls.isdisjoint(parts)
-        fits = not shape or shape[0] == rows or (is_control and shape[0] == rows - 1)
 
         if dtype.kind not in "fiub":
             faults.update(dict.fromkeys(parts, NOT_NUMERIC))
-        elif not fits:
+        elif not _fits(shape, rows, is_control):
             faults.update(dict.fromkeys(parts, length_fault(shape[0], spec.time, rows)))
         elif needed.isdisjoint(parts):
             unread += parts
@@ -139,6 +136,15 @@ def _table(
             columns.update(zip(parts, _values(archive, name, rows).T, strict=True))
 
     return Table(source=path, columns=columns, faults=faults, unread=tuple(unread))
+
+
+def _fits(shape: tuple[int, ...], rows: int, is_control: bool) -> bool:
+    """Whether an array of this shape has a value for every row, or is a number for all rows."""
+    if not shape:
+        return True
+
+    # A control is held from each row to the next one, so the last row may have no control.
+    return shape[0] == rows or (is_control and shape[0] == rows - 1)
 
 
 def _labels(name: str, shape: tuple[int, ...]) -> list[str]:
