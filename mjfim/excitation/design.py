@@ -169,11 +169,11 @@ def _identifiability(
         begin = task.problem.point(trajectory, CENTRAL_DIFFERENCES)
 
     if first.information is None or begin.trajectory is None or begin.sensitivity is None:
-        reason = "when the parameters move a little along the initial control"
+        reason = "when the parameters change slightly along the initial control"
         if task.samples_of_parameters is not None:
             reason += (
-                ", or at a parameter sample of [robust]; bounds keep samples where the model "
-                "makes sense"
+                ", or at a parameter sample of [robust]; state bounds within which the model is "
+                "valid"
             )
         raise SimulationDivergedError(f"the simulation diverges {reason}")
 
@@ -434,12 +434,7 @@ def designable(task: DesignTask) -> Identifiability:
         SimulationDivergedError: The simulation diverges along the initial control.
     """
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    if first.trajectory is None or first.sensitivity is None:
-        raise SimulationDivergedError(
-            "the simulation diverges when the parameters move a little along the initial control"
-        )
-
-    identifiability = task.identifiability_test.along(first.trajectory, first.sensitivity)
+    identifiability = _identifiability(task, first, None)
     require_designable(task, identifiability)
     return identifiability
 

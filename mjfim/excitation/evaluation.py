@@ -104,7 +104,7 @@ def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
     simulated = task.plant.simulate(task.theta, trajectory.ctrl)
     point = task.problem.point(simulated, CENTRAL_DIFFERENCES)
     if point.trajectory is None or point.sensitivity is None:
-        raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
+        raise SimulationDivergedError("the trajectory diverges when the parameters change slightly")
 
     identifiability = task.identifiability_test.along(point.trajectory, point.sensitivity)
     stage = DescentLevel(task, identifiability.basis)

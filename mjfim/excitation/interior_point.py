@@ -334,7 +334,7 @@ class InteriorPointMethod:
 
         point = self._problem(weights[0], self.constraints).point(control)
         if point.values is None:
-            # The simulation diverges when the parameters move a little.
+            # The simulation diverges when the parameters change slightly.
             return
 
         for number, mu in enumerate(stages):

@@ -117,7 +117,7 @@ def _initial_information(task: DesignTask) -> Array:
     point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError(
-            "the simulation diverges when the parameters move a little along the initial control"
+            "the simulation diverges when the parameters change slightly along the initial control"
         )
 
     # The initial control may excite some combinations only; the others carry no information.
