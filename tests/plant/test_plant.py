@@ -14,9 +14,9 @@ from scipy.interpolate import CubicSpline
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.task import DesignTask
-from mjfim.model.loading import ModelSource, compile_spec, load_spec, unconstrained
+from mjfim.model.loading import ModelSource, compile_spec, load_spec
 from mjfim.model.mujoco_log import silence_mujoco_log
-from mjfim.model.variants import PlantModel
+from mjfim.model.variants import PlantModel, unconstrained
 from mjfim.optimize.lq import LinearRecursion, TangentCurve, regulator
 from mjfim.output.mjcf.write import write_spec
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
