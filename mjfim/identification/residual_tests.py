@@ -57,22 +57,28 @@ SMALLEST_SQUARES = 1e-300
 
 
 def is_larger_than_noise(chi2: float, dof: int) -> bool:
-    """True where residuals are significantly larger than the stated noise.
+    """Test whether residuals are larger than the stated noise.
 
     Args:
         chi2: Sum of squared whitened residuals.
         dof: Degrees of freedom.
+
+    Returns:
+        True where the difference is significant and relevant.
     """
     significant = chi2_distribution.sf(chi2, dof) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) > RELEVANT_SIZE_RATIO)
 
 
 def is_smaller_than_noise(chi2: float, dof: int) -> bool:
-    """True where residuals are significantly smaller than the stated noise.
+    """Test whether residuals are smaller than the stated noise.
 
     Args:
         chi2: Sum of squared whitened residuals.
         dof: Degrees of freedom.
+
+    Returns:
+        True where the difference is significant and relevant.
     """
     significant = chi2_distribution.cdf(chi2, dof) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) < 1.0 / RELEVANT_SIZE_RATIO)
