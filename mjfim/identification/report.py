@@ -254,9 +254,9 @@ def _warnings(findings: _Findings) -> Iterator[str]:
 
     # Where the misfit is, and where it may come from.
     if findings.reasons and findings.quality.worst_residual is not None:
-        yield f"residuals are {findings.quality.worst_residual}"
+        yield str(findings.quality.worst_residual)
     for term in findings.missing:
-        yield f"the residuals look like {term}"
+        yield f"the model may lack {term}"
 
     yield from _implausible_estimates(result.task.system.parameters, result.theta)
     for name, remark in findings.accuracy.poorly_known:
