@@ -1027,22 +1027,28 @@ def describe_campaign(campaign: Campaign, parameters: ParameterSet, *, simulated
     Args:
         campaign: The campaign.
         parameters: The parameters of the experiment.
-        simulated: True where the recordings were simulated at the true values.
+        simulated: True if the recordings were simulated at the true values.
+
+    Returns:
+        The estimates and the status; before the first estimate, the status alone.
     """
+    status = Paragraph(text=str(campaign))
+    if campaign.estimate is None:
+        return Summary(title="Campaign", outcome="", parts=(status,))
+
     headings = ["parameter", "guess", "estimate", "formal σ", "wanted σ"]
     if simulated:
         headings.append("error")
 
     rows = []
-    if campaign.estimate is not None:
-        for j in parameters.interest.tolist():
-            true = float(parameters.true[j]) if simulated else None
-            rows.append(_campaign_row(campaign, campaign.estimate, parameters, j=j, true=true))
+    for j in parameters.interest.tolist():
+        true = float(parameters.true[j]) if simulated else None
+        rows.append(_campaign_row(campaign, campaign.estimate, parameters, j=j, true=true))
 
     table = SummaryTable(
-        key="campaign", title=str(campaign), columns=columns(*headings), rows=tuple(rows)
+        key="campaign", title="Estimates", columns=columns(*headings), rows=tuple(rows)
     )
-    return Summary(title="Campaign", outcome="", parts=(table,))
+    return Summary(title="Campaign", outcome="", parts=(table, status))
 
 
 def _campaign_row(

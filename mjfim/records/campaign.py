@@ -153,7 +153,12 @@ class Campaign(SavedRecord):
 
     def __str__(self) -> str:
         missed = f": {self.short}" if self.short else ""
-        return f"{self.status.value}{missed}; {len(self.rounds)} rounds"
+        if not self.rounds:
+            return f"{self.status.value}{missed}"
+
+        count = len(self.rounds)
+        rounds = "1 round" if count == 1 else f"{count} rounds"
+        return f"{self.status.value}{missed}; {rounds}"
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of campaign.json."""
