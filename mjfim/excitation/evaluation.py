@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.levels import DescentLevel
@@ -101,7 +103,35 @@ def evaluate(
 
 def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
     """Evaluate the control of a trajectory in a resolved task. See `evaluate`."""
-    simulated = task.plant.simulate(task.theta, trajectory.ctrl)
+    return _evaluate_control(task, trajectory.ctrl)
+
+
+def criterion_of(task: DesignTask, control: Array) -> float:
+    """Compute the criterion phi along a control.
+
+    Args:
+        task: The task.
+        control: (N, nu) control [u-unit].
+
+    Returns:
+        The criterion, finite and positive.
+
+    Raises:
+        ValueError: The control does not fit the task.
+        MjfimError: The criterion is not finite and positive, or cannot be computed.
+    """
+    if control.shape != task.control.shape:
+        raise ValueError(f"a control of shape {control.shape} instead of {task.control.shape}")
+
+    value = _evaluate_control(task, control).criterion
+    if not (np.isfinite(value) and value > 0.0):
+        raise SimulationDivergedError(f"the criterion is {value}")
+    return value
+
+
+def _evaluate_control(task: DesignTask, control: Array) -> Evaluation:
+    """Evaluate a control: (N, nu), in a resolved task."""
+    simulated = task.plant.simulate(task.theta, control)
     point = task.problem.point(simulated, CENTRAL_DIFFERENCES)
     if point.trajectory is None or point.sensitivity is None:
         raise SimulationDivergedError("the trajectory diverges when the parameters change slightly")

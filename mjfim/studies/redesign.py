@@ -21,7 +21,7 @@ from mjfim.arrays import Array
 from mjfim.budget import StopToken
 from mjfim.errors import MjfimError, SimulationDivergedError
 from mjfim.excitation.design import design_budget, design_task
-from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.evaluation import criterion_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.records.design import Design, Status
@@ -133,29 +133,13 @@ def _information_weight(base: DesignTask, moved: Experiment, history: CampaignHi
     first_task = base.restated(restate_experiment(base, history.first_theta))
     task = base.restated(moved, added_information=history.estimate.data)
     try:
-        first = _criterion_value(first_task, history.first_control)
-        last = _criterion_value(task, history.last_control)
+        first = criterion_of(first_task, history.first_control)
+        last = criterion_of(task, history.last_control)
     except (MjfimError, ValueError):
         # Where a value is missing, take the weight for equal experiments.
         return stated * rounds**2
 
     return float(stated * rounds * first / last)
-
-
-def _criterion_value(task: DesignTask, control: Array) -> float:
-    """Criterion phi along a control: (N, nu).
-
-    Raises:
-        ValueError: The control does not fit the task.
-        MjfimError: The criterion is not finite and positive, or cannot be computed.
-    """
-    if control.shape != task.control.shape:
-        raise ValueError(f"a control of shape {control.shape} instead of {task.control.shape}")
-
-    value = evaluate_task(task, task.plant.simulate(task.theta, control)).criterion
-    if not (np.isfinite(value) and value > 0.0):
-        raise SimulationDivergedError(f"the criterion is {value}")
-    return value
 
 
 def restate_experiment(
