@@ -1,4 +1,4 @@
-"""Atomic writing of files: under a temporary name in the same folder, then renamed."""
+"""Atomic writing of files: each is written under a temporary name in its folder, then renamed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         path: Name of the final file.
 
     Yields:
-        Temporary path in the same folder, with the same suffix.
+        Temporary path in the folder of the final file, with an equal suffix.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

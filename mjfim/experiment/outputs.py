@@ -44,7 +44,7 @@ def resolve_outputs(
         coordinates: What can be measured on its model.
         space: The state space of the model.
         stride: Samples from one measurement to the next at `measure_rate`.
-        stride_of_key: Samples between measurements for the keys of the table `noise` that state another rate.
+        stride_of_key: Samples between measurements, by key of the table `noise`, if it states a rate.
 
     Returns:
         The outputs, and the noise with their covariance and strides.

@@ -49,7 +49,7 @@ class MonteCarloStudy(SavedRecord):
         theta: (p,) true values.
         measure_rate: Rate of the measurements [Hz].
         sets: Statistics by name of the trajectory (`initial`, `final`).
-        information: (p, p) Fisher information of each trajectory, by the same names.
+        information: (p, p) Fisher information of each trajectory, with the keys of `sets`.
     """
 
     parameters: tuple[str, ...]

@@ -318,7 +318,7 @@ def test_arrays_of_other_lengths(tmp_path: Path) -> None:
         tmp_path / "log.npz", RecordingSpec(columns={"qpos:j": "q", "ctrl:m": "u"})
     )
     assert np.isnan(table.column("u")[-1])
-    with pytest.raises(RecordingError, match=r"column 'q' has 3 rows where 't' has 4"):
+    with pytest.raises(RecordingError, match=r"column 'q' has 3 rows, but 't' has 4"):
         table.column("q")
     with pytest.raises(RecordingError, match=r"column 'name' is not numeric"):
         table.column("name")
@@ -423,7 +423,7 @@ def test_json_lists(tmp_path: Path) -> None:
     )
     assert np.array_equal(table.column("q"), [1, np.nan, 3], equal_nan=True)
     assert table.column("k").tolist() == [4, 4, 4]
-    with pytest.raises(RecordingError, match=r"column 'short' has 2 rows where 't' has 3"):
+    with pytest.raises(RecordingError, match=r"column 'short' has 2 rows, but 't' has 3"):
         table.column("short")
     with pytest.raises(RecordingError, match=r"column 's' is not numeric"):
         table.column("s")

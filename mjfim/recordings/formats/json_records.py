@@ -56,7 +56,7 @@ def _table(path: Path, content: Any, spec: RecordingSpec) -> Table:
         records = records[key]
     columns, faults = _columns_of_records(records)
 
-    # A field of the records hides a constant of the same name.
+    # A field of the records takes precedence over a constant with this name.
     for name, value in _leaves(_without_records(content, keys)):
         if name in columns or name in faults:
             continue

@@ -146,7 +146,7 @@ def length_fault(length: int, time: str, rows: int) -> str:
     Returns:
         The end of a sentence that begins with the column's name.
     """
-    return f"has {length} rows where {time!r} has {rows}; all columns need the same number of rows"
+    return f"has {length} rows, but {time!r} has {rows}; all columns need equal numbers of rows"
 
 
 def one_line(error: Exception) -> str:
