@@ -41,10 +41,10 @@ def resolve_outputs(
 
     Args:
         experiment: The experiment.
-        coordinates: What can be measured on its model.
+        coordinates: Coordinates of its model that can be measured.
         space: The state space of the model.
         stride: Samples from one measurement to the next at `measure_rate`.
-        stride_of_key: Samples between measurements, by key of the table `noise`, if it states a rate.
+        stride_of_key: Samples between measurements, for each key of `noise` that states a rate.
 
     Returns:
         The outputs, and the noise with their covariance and strides.
