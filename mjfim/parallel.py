@@ -5,9 +5,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
+from multiprocessing import connection
 from multiprocessing.synchronize import Event
 from typing import Any, TypeVar
 
@@ -34,9 +36,11 @@ def cores() -> int:
 class Pool(ProcessPoolExecutor):
     """Worker processes, at most one per core, that share one request to stop.
 
-    Only the parent process reacts to Ctrl-C; the workers continue until `stop` is called. Another
-    executor of `concurrent.futures` can be used instead of a pool. Its processes do not receive the
-    request to stop, so their tasks run to the end.
+    Only the parent process reacts to Ctrl-C; the workers continue until `stop` is called. If the
+    parent process is killed, its workers end by themselves.
+
+    Another executor of `concurrent.futures` can be used instead of a pool. Its processes do not
+    receive the request to stop, so their tasks run to the end.
 
     Args:
         count: Number of processes; the default and the maximum are one per core.
@@ -171,7 +175,30 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def _initialize_worker(stop: Event) -> None:
-    """Prepare a new worker process: it ignores Ctrl-C, and its token follows the pool's event."""
+    """Prepare a new worker process.
+
+    It ignores Ctrl-C, its token follows the pool's event, and it ends with its parent process.
+
+    Args:
+        stop: The pool's event.
+    """
     global _pool_token
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _pool_token = StopToken(also=stop.is_set)
+
+    watch = threading.Thread(target=_end_with_parent, name="mjfim-parent-watch", daemon=True)
+    watch.start()
+
+
+def _end_with_parent() -> None:
+    """Wait until the parent process is gone, then end this process at once.
+
+    A worker waits for tasks from a queue whose other end it holds itself, so the queue does not
+    tell it that the parent process was killed.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    connection.wait([parent.sentinel])
+    os._exit(1)

@@ -26,6 +26,7 @@ from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 from tests.support.cli import names, read, write_experiment
 from tests.support.limits import HARD, cart_inside
+from tests.support.paths import ROOT
 
 
 def identity() -> int:
@@ -152,6 +153,38 @@ def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
     assert data["status"] == "interrupted"
     assert data["final"]["cost"] < data["initial"]["cost"]
     assert "out" in names(tmp_path)
+
+
+# A program with one busy and one idle worker, which says when both are running.
+BUSY_AND_IDLE = """
+import time
+
+import mjfim
+
+if __name__ == "__main__":
+    with mjfim.Pool(2) as pool:
+        pool.submit(time.sleep, 60.0)
+        pool.submit(time.sleep, 0.0).result()
+        print("running", flush=True)
+        time.sleep(60.0)
+"""
+
+
+@pytest.mark.slow
+def test_the_workers_of_a_killed_process_end_by_themselves(tmp_path: Path) -> None:
+    """The processes share one stdout, which ends when the last of them has ended."""
+    script = tmp_path / "busy_and_idle.py"
+    script.write_text(BUSY_AND_IDLE, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "running\n"
+
+        process.kill()
+        process.communicate(timeout=5.0)
+    assert process.returncode != 0
 
 
 def test_a_start_that_fails_does_not_end_the_others(
