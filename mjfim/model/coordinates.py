@@ -179,7 +179,7 @@ class ModelCoordinates:
 
     @property
     def measurable(self) -> tuple[str, ...]:
-        """Columns of everything that a recording may hold: components of the state, then sensors."""
+        """Columns that a recording may hold: components of the state, then sensors."""
         state = [component.name for component in self.state]
         return (*state, *(component.name for component in self.sensors))
 
@@ -403,7 +403,7 @@ def sensor_components(model: Any) -> tuple[SensorComponent, ...]:
 
 
 def measurable_columns(model: Any) -> tuple[str, ...]:
-    """Columns of everything that a recording may hold: components of the state, then sensors."""
+    """Columns that a recording may hold: components of the state, then sensors."""
     state = [component.name for component in state_components(model)]
     return (*state, *(component.name for component in sensor_components(model)))
 

@@ -135,7 +135,7 @@ class ParameterWriter:
         return found
 
     def require_physical_bodies(self, base: PlantModel) -> None:
-        """Raise ExperimentError if the guess or the true values give a body an unphysical inertia."""
+        """Raise ExperimentError if the guess or the true values make an inertia unphysical."""
         p = self._parameters
         for key, theta in (("guess", p.guess), ("true", p.true)):
             for columns, fault in self.unphysical_bodies(base, theta):

@@ -286,7 +286,7 @@ class ParameterSet:
 
     @cached_property
     def moved_bodies(self) -> set[str] | None:
-        """Bodies whose inertial frame parameters move; None where a parameter may change anything."""
+        """Bodies whose inertial frame parameters move; None where a parameter may move any."""
         return None if self.needs_compile.any() else moved_bodies(self.parameters)
 
     @property
