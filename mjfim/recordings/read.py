@@ -220,7 +220,7 @@ def _matrices(channels: Channels) -> dict[str, list[str]]:
 
 def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
     """(M,) times of all rows [s], and the rows inside the window."""
-    t = table.column(spec.time) * SECONDS[spec.time_unit]
+    t = table.measurement(spec.time) * SECONDS[spec.time_unit]
     if spec.window is None or not len(t):
         return t, slice(0, len(t))
 
@@ -254,6 +254,10 @@ def _columns(
     columns = {}
 
     for name, source in sources.items():
+        # Truth values may switch a control or a factor on and off.
+        if not name.startswith("ctrl:"):
+            table.measurement(source.column)
+
         for raw in (source.column, *source.multiply_by):
             check_finite(f"{table.source}: column {raw!r}", table.column(raw)[rows], rows.start)
 

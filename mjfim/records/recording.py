@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
 from mjfim.arrays import Array, freeze
+from mjfim.errors import RecordingError
 from mjfim.records.serialization import SavedRecord
 
 
@@ -32,6 +35,12 @@ class Recording(SavedRecord):
     made_by: ClassVar[str] = "Recording.save"
 
     def __post_init__(self) -> None:
+        for name in ("t", "y"):
+            if np.asarray(getattr(self, name)).dtype == np.bool_:
+                raise RecordingError(
+                    f"{self.name}: {name!r} holds truth values (True and False), which are no "
+                    "measurement; give an array of numbers"
+                )
         freeze(self, "t", "ctrl", "y")
 
     def summary(self) -> dict[str, Any]:

@@ -9,9 +9,13 @@ import io
 import json
 import os
 import pickle
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow
@@ -201,12 +205,70 @@ def test_text_is_a_fault_only_if_it_is_used(tmp_path: Path) -> None:
         table.column("mode")
 
 
+def test_parquet_columns_of_one_name(tmp_path: Path) -> None:
+    """It is not clear which of the columns is meant, so the file is refused."""
+    twice = pyarrow.table([[0.0, 1.0], [1.0, 2.0], [3.0, 4.0]], names=["t", "q", "q"])
+    pyarrow.parquet.write_table(twice, tmp_path / "log.parquet")
+    for spec in (ALL, RecordingSpec(columns={"qpos:j": "q", "ctrl:m": "t"})):
+        with pytest.raises(RecordingError, match=r"log\.parquet: more than one column .* 'q'"):
+            read_columns(tmp_path / "log.parquet", spec)
+
+
+def test_parquet_dictionaries(tmp_path: Path) -> None:
+    """A dictionary of numbers gives its numbers; one of text is refused, also of digits."""
+    contents = {
+        "t": pyarrow.array([0.0, 1.0, 2.0]),
+        "q": pyarrow.array([7.5, None, -2.0]).dictionary_encode(),
+        "text": pyarrow.array(["1", "2", "1"]).dictionary_encode(),
+        "view": pyarrow.array(["1", "2", "1"]).cast(pyarrow.string_view()),
+        "bytes": pyarrow.array([b"1", b"2", b"1"]),
+        "on": pyarrow.array([True, False, True]).dictionary_encode(),
+    }
+    pyarrow.parquet.write_table(pyarrow.table(contents), tmp_path / "log.parquet")
+    table = read_columns(tmp_path / "log.parquet", ALL)
+
+    assert np.array_equal(table.column("q"), [7.5, np.nan, -2.0], equal_nan=True)
+    assert table.truth_values == {"on"}
+    for name in ("text", "view", "bytes"):
+        with pytest.raises(RecordingError, match=f"column '{name}' is not numeric"):
+            table.column(name)
+
+
+def as_csv_text(path: Path, columns: dict[str, list[Any]]) -> None:
+    """Write a CSV file with the values as JSON spells them."""
+    rows = zip(*columns.values(), strict=True)
+    lines = (",".join(json.dumps(value) for value in row) for row in rows)
+    path.write_text("\n".join((",".join(columns), *lines)), encoding="utf-8")
+
+
+TRUTH_WRITERS: dict[str, Callable[[Path, dict[str, list[Any]]], None]] = {
+    ".csv": as_csv_text,
+    ".parquet": lambda path, columns: pyarrow.parquet.write_table(pyarrow.table(columns), path),
+    ".npz": lambda path, columns: np.savez(path, **{n: np.array(c) for n, c in columns.items()}),
+    ".json": lambda path, columns: path.write_text(json.dumps(columns), encoding="utf-8") and None,
+}
+
+
+@pytest.mark.parametrize("ending", TRUTH_WRITERS)
+def test_truth_values_are_no_measurement(ending: str, tmp_path: Path) -> None:
+    """They are 1 and 0 for a control or a factor, but neither a time nor a measured column."""
+    path = tmp_path / f"log{ending}"
+    TRUTH_WRITERS[ending](path, {"t": [0.0, 0.1, 0.2], "q": [True, False, True]})
+    table = read_columns(path, ALL)
+
+    assert table.measurement("t").tolist() == [0.0, 0.1, 0.2]
+    assert table.column("q").tolist() == [1.0, 0.0, 1.0]
+    with pytest.raises(RecordingError, match=rf"log\{ending}: column 'q' holds truth values"):
+        table.measurement("q")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("t,q,q\n0,1,2\n", "more than one column is named 'q'"),
         ("t,q\n0,1\n1\n", "not a readable CSV table: .*Expected 2 columns, got 1"),
         ("t,q\xff\n0,1\n", "not a readable CSV table"),
+        ("t,q\n0,1\n1," + "2" * 3_000_000 + "\n", "a line of about 1 MB or more"),
     ],
 )
 def test_ill_formed_csv(text: str, message: str, tmp_path: Path) -> None:
@@ -214,6 +276,105 @@ def test_ill_formed_csv(text: str, message: str, tmp_path: Path) -> None:
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(RecordingError, match=message):
         read_columns(path, ALL)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (gzip.compress(b"t,q,q\n0,1,2\n"), "more than one column is named 'q'"),
+        (gzip.compress(b"t,q\n0,1\n1\n"), "Expected 2 columns, got 1"),
+        (gzip.compress(b"t,q\n0," + b"2" * 3_000_000), "a line of about 1 MB or more"),
+        (gzip.compress(b"t,q\n0,1\n") + b"more", "Not a gzipped file"),
+        (b"t,q\n0,1\n", "Not a gzipped file"),
+    ],
+)
+def test_ill_formed_packed_csv(content: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=message):
+        read_columns(path, ALL)
+
+
+def test_pyarrow_reads_no_python_stream(
+    columns: Columns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread of pyarrow that reads from Python can abort the process at its end."""
+    sources: list[object] = []
+
+    def spy(function: Callable[..., Any]) -> Callable[..., Any]:
+        """Keep the source of every call."""
+
+        def call(source: object, *args: Any, **kwargs: Any) -> Any:
+            """Keep the source and call the function."""
+            sources.append(source)
+            return function(source, *args, **kwargs)
+
+        return call
+
+    for name in ("open_csv", "read_csv"):
+        monkeypatch.setattr(pyarrow.csv, name, spy(getattr(pyarrow.csv, name)))
+    for ending in (".csv", ".csv.gz"):
+        WRITERS[ending](tmp_path / f"log{ending}", columns)
+        assert same(read_columns(tmp_path / f"log{ending}", ALL), columns)
+
+    assert len(sources) == 4
+    for source in sources:
+        assert isinstance(source, (str, pyarrow.NativeFile))
+        assert not isinstance(source, pyarrow.PythonFile)
+
+
+@pytest.fixture(scope="module")
+def faulty_logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Five packed logs of 13 MB with one fault each, most of them in the first block."""
+    folder = tmp_path_factory.mktemp("faulty")
+    numbers = np.random.default_rng(5).standard_normal(1_000_000).astype(str).tolist()
+    rows = [f"{k},{numbers[2 * k]},{numbers[2 * k + 1]}" for k in range(330_000)]
+
+    def packed(header: str, row: str) -> bytes:
+        """Pack the rows with another row 1000."""
+        text = "\n".join((header, *rows[:1000], row, *rows[1001:]))
+        return gzip.compress(text.encode(), compresslevel=1)
+
+    contents = {
+        "ragged": packed("t,q,u", "1,2"),
+        "twice": packed("t,q,q", rows[1000]),
+        "long": packed("t,q,u", "1," + "2" * 3_000_000 + ",3"),
+        "truncated": packed("t,q,u", rows[1000])[:5_000_000],
+        "unpacked": "\n".join(("t,q,u", *rows)).encode(),
+    }
+    for name, content in contents.items():
+        (folder / f"{name}.csv.gz").write_bytes(content)
+    return [folder / f"{name}.csv.gz" for name in contents]
+
+
+READ_AND_END = """
+import sys
+from pathlib import Path
+from mjfim.errors import RecordingError
+from mjfim.recordings.formats.read import read_columns
+from mjfim.recordings.spec import RecordingSpec
+try:
+    read_columns(Path(sys.argv[1]), RecordingSpec())
+except RecordingError as error:
+    print(error)
+"""
+
+
+@pytest.mark.slow
+def test_processes_end_after_faulty_packed_logs(faulty_logs: list[Path]) -> None:
+    """Twenty processes refuse a faulty log and end with exit code 0; none hangs or aborts."""
+    messages = {"ragged": "Expected 3", "twice": "more than one", "long": "1 MB or more"}
+
+    def read(path: Path) -> subprocess.CompletedProcess[str]:
+        """Read a log in a process of its own."""
+        command = [sys.executable, "-c", READ_AND_END, str(path)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
+
+    paths = faulty_logs * 4
+    with ThreadPoolExecutor(2) as pool:
+        for path, done in zip(paths, pool.map(read, paths), strict=True):
+            assert (done.returncode, done.stderr) == (0, "")
+            assert messages.get(path.name.split(".")[0], "not a readable CSV") in done.stdout
 
 
 def bomb_csv(path: Path) -> None:
@@ -265,6 +426,15 @@ def test_packed_logs_are_not_refused_as_bombs(
 
 
 # ---- npz
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_npz_arrays_of_one_name(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
+        for _ in range(2):
+            archive.writestr("t.npy", b"")
+    with pytest.raises(RecordingError, match="more than one column is named 't'"):
+        read_columns(tmp_path / "log.npz", ALL)
 
 
 class Trap:
@@ -392,6 +562,18 @@ def test_json_records(tmp_path: Path) -> None:
     }
     assert same(table, {name: np.array(v, dtype=np.float64) for name, v in expected.items()})
     assert set(table.faults) == {"motor.name", "note"}
+
+
+def test_json_truth_values(tmp_path: Path) -> None:
+    """One truth value among numbers is enough; a constant may be one, too."""
+    content = {"on": True, "kp": 1, "log": [{"t": 0, "q": [1, True]}, {"t": 1, "q": [2, 3]}]}
+    assert read_json(content, tmp_path).truth_values == {"on", "q[1]"}
+
+
+def test_json_keys_that_occur_twice(tmp_path: Path) -> None:
+    (tmp_path / "log.json").write_text('[{"t": 0, "q": 1, "q": 2}]', encoding="utf-8")
+    with pytest.raises(RecordingError, match="the key 'q' occurs twice"):
+        read_columns(tmp_path / "log.json", ALL)
 
 
 def test_json_with_several_lists_of_records(tmp_path: Path) -> None:

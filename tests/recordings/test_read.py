@@ -124,6 +124,17 @@ def test_formula(read: Read) -> None:
     assert logged.recording.outputs == ("qpos:pin",)
 
 
+def test_truth_values(read: Read) -> None:
+    """They may switch a control on and off, but they are no measured position."""
+    on = np.where(T < 1.0, "true", "false")
+    spec = {"column": "on", "multiply_by": ["on"]}
+    logged = read({"on": on, "q": wave()}, columns={"ctrl:push": spec, "qpos:pin": "q"})
+    assert np.array_equal(logged.recording.ctrl[:, 0], (T < 1.0)[:-1])
+
+    with pytest.raises(RecordingError, match=r"lab\.csv: column 'on' holds truth values"):
+        read({"on": on}, columns={"qpos:pin": "on"})
+
+
 def test_the_former_name_of_multiply_by_is_refused(tmp_path: Path) -> None:
     """The message names the file and the key, and says how the key is called now."""
     file = tmp_path / "study.toml"

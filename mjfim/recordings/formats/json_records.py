@@ -35,7 +35,7 @@ def read_json(path: Path, spec: RecordingSpec) -> Table:
         RecordingError: The file is damaged, or it is not clear which list holds the records.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_object)
         return _table(path, content, spec)
     except (ValueError, OSError) as error:
         raise RecordingError(
@@ -54,7 +54,7 @@ def _table(path: Path, content: Any, spec: RecordingSpec) -> Table:
     records = content
     for key in keys:
         records = records[key]
-    columns, faults = _columns_of_records(records)
+    columns, faults, truth_values = _columns_of_records(records)
 
     # A field of the records takes precedence over a constant with this name.
     for name, value in _leaves(_without_records(content, keys)):
@@ -62,10 +62,22 @@ def _table(path: Path, content: Any, spec: RecordingSpec) -> Table:
             continue
         if isinstance(value, NUMBERS):
             columns[name] = np.full(len(records), _number(value))
+            if isinstance(value, bool):
+                truth_values.add(name)
         elif isinstance(value, str):
             faults[name] = NOT_NUMERIC
 
-    return Table(source=path, columns=columns, faults=faults)
+    return Table(source=path, columns=columns, faults=faults, truth_values=frozenset(truth_values))
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Build a JSON object from its keys and values; refuse a key that occurs twice."""
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice!r} occurs twice in one object")
+    return content
 
 
 def _keys_of_records(path: Path, content: Any, spec: RecordingSpec) -> tuple[str, ...] | None:
@@ -146,10 +158,14 @@ def _leaves(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
 
 def _columns_of_records(
     records: Sequence[Mapping[str, Any]],
-) -> tuple[dict[str, Array], dict[str, str]]:
-    """Columns and faults by name; fields may be missing in some of the records."""
+) -> tuple[dict[str, Array], dict[str, str], set[str]]:
+    """Columns and faults by name, and the names of columns that hold truth values.
+
+    Fields may be missing in some of the records.
+    """
     columns: dict[str, Array] = {}
     faults: dict[str, str] = {}
+    truth_values: set[str] = set()
     lengths: dict[str, int] = {}
 
     for row, record in enumerate(records):
@@ -164,12 +180,16 @@ def _columns_of_records(
                     faults.setdefault(name, NOT_NUMERIC)
                     continue
 
+                if isinstance(item, bool):
+                    truth_values.add(name)
+
                 column = columns.get(name)
                 if column is None:
                     column = columns[name] = np.full(len(records), np.nan)
                 column[row] = _number(item)
 
-    return {name: column for name, column in columns.items() if name not in faults}, faults
+    usable = {name: column for name, column in columns.items() if name not in faults}
+    return usable, faults, truth_values
 
 
 def _ragged(field: str, items: list[Any], row: int, lengths: dict[str, int]) -> dict[str, str]:
@@ -196,7 +216,13 @@ def _table_of_lists(path: Path, content: Mapping[str, Any], time: str) -> Table:
     rows = len(lists[time])
     columns: dict[str, Array] = {}
     faults: dict[str, str] = {}
+    truth_values: set[str] = set()
     for name, value in values.items():
+        # A single value is a constant, which holds for all rows; a single null is none.
+        items = value if name in lists else [value]
+        if any(isinstance(item, bool) for item in items):
+            truth_values.add(name)
+
         if name in lists and len(value) != rows:
             faults[name] = length_fault(len(value), time, rows)
         elif name in lists and all(v is None or isinstance(v, NUMBERS) for v in value):
@@ -206,7 +232,7 @@ def _table_of_lists(path: Path, content: Mapping[str, Any], time: str) -> Table:
         else:
             faults[name] = NOT_NUMERIC
 
-    return Table(source=path, columns=columns, faults=faults)
+    return Table(source=path, columns=columns, faults=faults, truth_values=frozenset(truth_values))
 
 
 def _number(value: float | None) -> float:

@@ -16,6 +16,7 @@ from mjfim.errors import RecordingError
 from mjfim.recordings.formats.table import (
     NOT_NUMERIC,
     Table,
+    check_names,
     check_unpacked_size,
     columns_to_read,
     length_fault,
@@ -68,6 +69,8 @@ def read_npz(path: Path, spec: RecordingSpec) -> Table:
             check_unpacked_size(path, path.stat().st_size, unpacked)
 
             members = [name for name in archive.namelist() if name.endswith(".npy")]
+            check_names(path, [name.removesuffix(".npy") for name in members])
+
             headers = {name.removesuffix(".npy"): _header(path, archive, name) for name in members}
             return _table(path, archive, headers, spec)
     except DAMAGED as error:
@@ -122,9 +125,13 @@ def _table(
     columns: dict[str, Array] = {}
     faults: dict[str, str] = {}
     unread: list[str] = []
+    truth_values: set[str] = set()
     for name, parts in labels.items():
         shape, dtype = headers[name]
         is_control = name.startswith("ctrl") or not controls.isdisjoint(parts)
+
+        if dtype.kind == "b":
+            truth_values.update(parts)
 
         if dtype.kind not in "fiub":
             faults.update(dict.fromkeys(parts, NOT_NUMERIC))
@@ -135,7 +142,13 @@ def _table(
         else:
             columns.update(zip(parts, _values(archive, name, rows).T, strict=True))
 
-    return Table(source=path, columns=columns, faults=faults, unread=tuple(unread))
+    return Table(
+        source=path,
+        columns=columns,
+        faults=faults,
+        unread=tuple(unread),
+        truth_values=frozenset(truth_values),
+    )
 
 
 def _fits(shape: tuple[int, ...], rows: int, is_control: bool) -> bool:

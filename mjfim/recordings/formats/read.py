@@ -6,10 +6,8 @@ CSV and Parquet files are read here; each of the other formats has a module.
 from __future__ import annotations
 
 import gzip
-import io
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +25,7 @@ from mjfim.recordings.formats.table import (
     NOT_NUMERIC,
     Table,
     check_column_size,
+    check_names,
     check_unpacked_size,
     columns_to_read,
     one_line,
@@ -36,7 +35,10 @@ from mjfim.recordings.spec import RecordingSpec
 # Errors that pyarrow and gzip raise for a damaged file.
 DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)
 
-# Number of bytes that are unpacked at once if the reader requests no number.
+# Explanation of pyarrow's error for a line that is longer than the blocks in which it reads.
+LONG_LINE = "it has a line of about 1 MB or more; each row of the log needs a line of its own"
+
+# Number of bytes that are unpacked at once.
 CHUNK = 1 << 20
 
 
@@ -100,19 +102,20 @@ def read_table(path: Path) -> dict[str, Array]:
 def _read_csv(path: Path, spec: RecordingSpec) -> Table:
     """Read the needed columns of a CSV file."""
     try:
-        with _opened(path) as source, pyarrow.csv.open_csv(source) as head:
-            names = list(head.schema.names)
+        if _is_packed(path):
+            _check_packed(path)
 
-        duplicate = next((name for name in names if names.count(name) > 1), None)
-        if duplicate is not None:
-            raise RecordingError(f"{path}: more than one column is named {duplicate!r}")
+        with pyarrow.csv.open_csv(_source(path)) as head:
+            names = list(head.schema.names)
+        check_names(path, names)
 
         needed = columns_to_read(names, spec)
         table = _parse_csv(path, needed)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file") from None
     except DAMAGED as error:
-        raise RecordingError(f"{path}: not a readable CSV table: {one_line(error)}") from None
+        fault = LONG_LINE if "straddling object" in str(error) else one_line(error)
+        raise RecordingError(f"{path}: not a readable CSV table: {fault}") from None
 
     return _from_arrow(path, table, tuple(name for name in names if name not in needed))
 
@@ -135,41 +138,36 @@ def _parse_csv(path: Path, names: list[str]) -> Any:
 def _parse_csv_as(path: Path, names: list[str], types: dict[str, Any]) -> Any:
     """Parse columns; the type of a column without a stated type is inferred from its content."""
     options = pyarrow.csv.ConvertOptions(include_columns=names, column_types=types)
-    with _opened(path) as source:
-        return pyarrow.csv.read_csv(source, convert_options=options)
+    return pyarrow.csv.read_csv(_source(path), convert_options=options)
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Yield a source for pyarrow: the file, or its unpacked content if it ends in `.gz`."""
-    if path.suffix.lower() != ".gz":
-        yield str(path)
-        return
+def _is_packed(path: Path) -> bool:
+    """Whether the name of a file says that it is packed by gzip."""
+    return path.suffix.lower() == ".gz"
+
+
+def _source(path: Path) -> Any:
+    """Return what pyarrow reads: the file, or its content unpacked by pyarrow itself.
+
+    After a faulty row, a thread of pyarrow may still read while the process ends. Therefore the
+    source must not call Python, which would abort the process or let it hang.
+    """
+    if not _is_packed(path):
+        return str(path)
+    return pyarrow.input_stream(str(path), compression="gzip")
+
+
+def _check_packed(path: Path) -> None:
+    """Unpack a gzip file once without keeping it; refuse damage and a decompression bomb.
+
+    pyarrow unpacks without limit, so the whole file is checked before pyarrow reads it.
+    """
+    unpacked = 0
 
     with path.open("rb") as packed, gzip.GzipFile(fileobj=packed) as stream:
-        yield _SizeCheckedStream(path, packed, stream)
-
-
-class _SizeCheckedStream(io.RawIOBase):
-    """Stream of the content of a gzip file, which refuses to unpack a decompression bomb."""
-
-    def __init__(self, path: Path, packed: io.BufferedReader, stream: gzip.GzipFile) -> None:
-        self._path = path
-        self._packed = packed
-        self._stream = stream
-        self._unpacked_size = 0
-
-    def readable(self) -> bool:
-        """Return True, because this stream can be read."""
-        return True
-
-    def read(self, size: int = -1) -> bytes:
-        """Read the next bytes of the content; fewer than `size` at its end."""
-        data = self._stream.read(size if size >= 0 else CHUNK)
-
-        self._unpacked_size += len(data)
-        check_unpacked_size(self._path, self._packed.tell(), self._unpacked_size)
-        return data
+        while chunk := stream.read(CHUNK):
+            unpacked += len(chunk)
+            check_unpacked_size(path, packed.tell(), unpacked)
 
 
 def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
@@ -177,6 +175,8 @@ def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
     try:
         with pyarrow.parquet.ParquetFile(path) as file:
             names = list(file.schema_arrow.names)
+            check_names(path, names)
+
             needed = columns_to_read(names, spec)
             check_column_size(path, file.metadata.num_rows, len(needed))
             table = file.read(columns=needed)
@@ -192,6 +192,7 @@ def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
     """Convert the columns of an arrow table to float64."""
     columns: dict[str, Array] = {}
     faults: dict[str, str] = {}
+    truth_values: set[str] = set()
 
     # Each column is dropped after its conversion, so that memory never holds two copies of the
     # whole table.
@@ -200,26 +201,42 @@ def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
         column = table.column(0)
         table = table.remove_column(0)
 
-        numbers = _as_numbers(column)
-        if numbers is None:
-            faults[name] = NOT_NUMERIC
+        # A dictionary holds what its values are.
+        kind = column.type.value_type if pyarrow.types.is_dictionary(column.type) else column.type
+        if pyarrow.types.is_boolean(kind):
+            truth_values.add(name)
+
+        fault = _fault_of_type(kind)
+        if fault is None:
+            numbers = column.cast(pyarrow.float64(), safe=False)
+            columns[name] = np.asarray(numbers.to_numpy(zero_copy_only=False))
         else:
-            columns[name] = numbers
+            faults[name] = fault
 
-    return Table(source=path, columns=columns, faults=faults, unread=unread)
+    return Table(
+        source=path,
+        columns=columns,
+        faults=faults,
+        unread=unread,
+        truth_values=frozenset(truth_values),
+    )
 
 
-def _as_numbers(column: Any) -> Array | None:
-    """(M,) numbers of an arrow column; None for text, even if every field looks like a number."""
-    kind = column.type
-    if pyarrow.types.is_string(kind) or pyarrow.types.is_large_string(kind):
-        return None
+def _fault_of_type(kind: Any) -> str | None:
+    """Reason why a column of this arrow type holds no numbers; None if it holds numbers.
 
-    try:
-        numbers = column.cast(pyarrow.float64(), safe=False)
-    except (pyarrow.ArrowInvalid, pyarrow.ArrowNotImplementedError):
-        return None
-    return np.asarray(numbers.to_numpy(zero_copy_only=False))
+    Text is refused even if every field looks like a number.
+    """
+    # A column without any value has the type null.
+    types = pyarrow.types
+    numeric = (
+        types.is_integer,
+        types.is_floating,
+        types.is_decimal,
+        types.is_boolean,
+        types.is_null,
+    )
+    return None if any(is_kind(kind) for is_kind in numeric) else NOT_NUMERIC
 
 
 Reader = Callable[[Path, RecordingSpec], Table]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,12 +37,15 @@ class Table:
         faults: Reasons why columns cannot be used, by column name, each the end of a sentence that
             begins with the column, such as `is not numeric`.
         unread: Names of the columns that were not read because they were not requested.
+        truth_values: Names of the columns that hold true and false in the file, which are 1 and 0
+            in `columns`. They may switch a control, but they are no measurement.
     """
 
     source: Path
     columns: dict[str, Array]
     faults: dict[str, str] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
+    truth_values: frozenset[str] = frozenset()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -68,6 +72,42 @@ class Table:
 
         found = ", ".join(self.names) or "none"
         raise RecordingError(f"{self.source}: column {name!r} is missing; found: {found}")
+
+    def measurement(self, name: str) -> Array:
+        """Return one column that holds times or measured numbers.
+
+        Args:
+            name: Name of the column in the file.
+
+        Returns:
+            (M,) numbers, NaN where a field is empty.
+
+        Raises:
+            RecordingError: The column is missing, cannot be used, or holds truth values.
+        """
+        if name in self.truth_values:
+            raise RecordingError(
+                f"{self.source}: column {name!r} holds truth values (true and false), which are no "
+                "measurement; name a column of numbers, or write 1 and 0 if these are the numbers"
+            )
+        return self.column(name)
+
+
+def check_names(path: Path, names: Sequence[str]) -> None:
+    """Refuse a name that several columns have, because it is not clear which one is meant.
+
+    Args:
+        path: The file, for the message.
+        names: Names of all columns of the file.
+
+    Raises:
+        RecordingError: A name occurs more than once.
+    """
+    name, count = Counter(names).most_common(1)[0] if names else ("", 0)
+    if count > 1:
+        raise RecordingError(
+            f"{path}: more than one column is named {name!r}; every column needs a name of its own"
+        )
 
 
 def columns_to_read(names: Iterable[str], spec: RecordingSpec) -> list[str]:
