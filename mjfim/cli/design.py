@@ -112,7 +112,7 @@ def design(
     errors.print(f"wrote {output}/ (to see the motion: mjfim replay {output})", markup=False)
     if not result.success:
         errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
-    raise typer.Exit(0 if result.success and (found is None or found.closed) else 1)
+    raise typer.Exit(0 if result.sound and (found is None or found.closed) else 1)
 
 
 def _shortest(

@@ -1,6 +1,7 @@
 """The command line: one function per verb.
 
-Exit codes: 0 done, 1 ran but did not reach its goal, 2 misuse.
+Exit codes: 0 goal reached, or budget used up with a sound result; 1 the user must look at the
+result; 2 misuse.
 """
 
 from __future__ import annotations

@@ -354,7 +354,7 @@ class _Report:
             )
 
         status = Status.INTERRUPTED if interrupted else best.status
-        if status.success and (rough is not None or clamped):
+        if status.ended_as_planned and (rough is not None or clamped):
             status = Status.ROUGH
         if task.is_limited and not found.is_feasible and not interrupted:
             status = Status.INFEASIBLE

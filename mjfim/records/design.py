@@ -85,8 +85,8 @@ class Status(Enum):
         "within the accuracy of the finite differences"
     )
     MAX_ITERATIONS = (
-        "stopped at max_iterations or seconds before convergence; raise them, or start from the "
-        "result"
+        "stopped at its budget (max_iterations or seconds) before convergence; for a better "
+        "result, raise it or start from this one"
     )
     INFEASIBLE = (
         "found no trajectory that keeps all limits; the margins show which limit is violated: "
@@ -99,6 +99,11 @@ class Status(Enum):
     def success(self) -> bool:
         """True if the result is a (local) optimum to the requested tolerance."""
         return self in (Status.CONVERGED, Status.SMOOTHED)
+
+    @property
+    def ended_as_planned(self) -> bool:
+        """True if the optimisation converged, or used up the budget that the user gave it."""
+        return self.success or self is Status.MAX_ITERATIONS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,6 +286,17 @@ class Design(SavedRecord):
     def success(self) -> bool:
         """True if the optimisation converged and the trajectory keeps all limits."""
         return self.status.success and self.within_limits
+
+    @property
+    def sound(self) -> bool:
+        """True if the trajectory can be used as it is; the command line then exits with 0.
+
+        The optimisation converged, or it used up its budget and found a trajectory other than the
+        initial one. The trajectory keeps all limits, and derivatives exist along it.
+        """
+        has_moved = not np.array_equal(self.final.trajectory.ctrl, self.initial.trajectory.ctrl)
+        is_useful = self.status.success or has_moved
+        return self.status.ended_as_planned and self.within_limits and is_useful
 
     @property
     def within_limits(self) -> bool:

@@ -67,14 +67,19 @@ def test_second_run_into_the_same_folder(
 @pytest.mark.parametrize(
     ("lines", "status", "satisfied"),
     [
-        ({"max_iterations": "1"}, "max_iterations", True),
+        (
+            {"max_iterations": "1\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"},
+            "max_iterations",
+            False,
+        ),
+        ({"max_iterations": "0"}, "max_iterations", True),
         (
             {"max_iterations": "40\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"},
             "converged",
             False,
         ),
     ],
-    ids=["not-converged", "limits-violated"],
+    ids=["budget-and-limits-violated", "no-improvement", "limits-violated"],
 )
 def test_design_that_misses_its_goal(
     tmp_path: Path, lines: dict[str, str], status: str, satisfied: bool
@@ -84,6 +89,28 @@ def test_design_that_misses_its_goal(
     data = loads(result.stdout)
     assert (result.exit_code, data["status"], data["limits"]["satisfied"]) == (1, status, satisfied)
     assert bool(data["warnings"]) is not satisfied
+
+
+@pytest.mark.usefixtures("no_files")
+@pytest.mark.parametrize("lines", [{"max_iterations": "1"}, {"max_iterations": "40\nseconds = 0.2"}])
+def test_design_that_stops_at_its_budget(tmp_path: Path, lines: dict[str, str]) -> None:
+    """The exit code is 0 and the outcome names the budget: the trajectory is better than before."""
+    path = write_experiment(tmp_path, tolerance="1e-12", **lines)
+    result = run("design", path, "-o", tmp_path / "out")
+    assert result.exit_code == 0
+    assert "stopped at its budget" in result.stdout
+    assert "stopped at its budget" in result.stderr
+
+
+@pytest.mark.usefixtures("no_files")
+def test_budget_used_up_where_derivatives_do_not_exist(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A trajectory that is not smooth has to be looked at, whatever ended the search."""
+    monkeypatch.setattr("mjfim.excitation.design.saturated_actuators", lambda *_: ["motor"])
+    path = write_experiment(tmp_path, max_iterations="1")
+    result = run("design", path, "-o", tmp_path / "out", "--json")
+    assert (result.exit_code, loads(result.stdout)["status"]) == (1, "rough")
 
 
 BAD_LINES: dict[str, tuple[dict[str, str], list[str]]] = {
