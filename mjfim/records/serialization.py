@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from enum import Enum
@@ -31,6 +30,12 @@ from pydantic_core import PydanticSerializationError
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import RecordingError, RenamedFields
+from mjfim.records.unpacked_size import (
+    DAMAGED_ARCHIVE,
+    Header,
+    array_headers,
+    check_is_archive,
+)
 
 # Name of the text array in an npz file that holds all fields of a record that are not arrays.
 RECORD = "record"
@@ -124,24 +129,28 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise RecordingError(f"{path}: no such {kind} file")
 
+    check_is_archive(path, kind)
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (
-        ValueError,
-        OSError,
-        EOFError,
-        AttributeError,
-        TypeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
-        reason = str(error)
-        if "pickle" in reason:
-            reason = "it was not written by NumPy, or holds pickles, which are refused"
+        with zipfile.ZipFile(path) as archive:
+            headers = array_headers(path, archive)
+        _refuse_pickles(path, kind, headers)
+
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as loaded:
+            return {name: loaded[name] for name in headers}
+    except DAMAGED_ARCHIVE as error:
         raise RecordingError(
-            f"{path}: not a {kind} archive (npz without pickles): {reason}"
+            f"{path}: not a {kind} archive (npz without pickles), or damaged: {error}"
         ) from None
+
+
+def _refuse_pickles(path: Path, kind: str, headers: Mapping[str, Header]) -> None:
+    """Refuse arrays of Python objects, which NumPy can only unpickle."""
+    for name, (_, dtype) in headers.items():
+        if dtype.hasobject:
+            raise RecordingError(
+                f"{path}: not a {kind} archive (npz without pickles): array {name!r} holds "
+                "pickles, which are refused"
+            )
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:

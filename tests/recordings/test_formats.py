@@ -25,10 +25,10 @@ import pytest
 from numpy.typing import NDArray
 
 from mjfim.errors import RecordingError
-from mjfim.recordings.formats import table as limits
 from mjfim.recordings.formats.read import read_columns
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import RecordingSpec
+from mjfim.records import unpacked_size as limits
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
@@ -430,10 +430,21 @@ def test_packed_logs_are_not_refused_as_bombs(
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_npz_arrays_of_one_name(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    np.save(stream, np.arange(3.0))
     with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
         for _ in range(2):
-            archive.writestr("t.npy", b"")
-    with pytest.raises(RecordingError, match="more than one column is named 't'"):
+            archive.writestr("t.npy", stream.getvalue())
+    with pytest.raises(RecordingError, match="more than one array is named 't'"):
+        read_columns(tmp_path / "log.npz", ALL)
+
+
+def test_single_array_instead_of_an_archive(tmp_path: Path) -> None:
+    with (tmp_path / "log.npz").open("wb") as stream:
+        np.save(stream, np.arange(3.0))
+    with pytest.raises(
+        RecordingError, match=r"log\.npz: not a log archive: it holds a single array .*numpy\.savez"
+    ):
         read_columns(tmp_path / "log.npz", ALL)
 
 

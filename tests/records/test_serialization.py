@@ -5,8 +5,10 @@ clear message.
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import shutil
+import zipfile
 from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
@@ -23,6 +25,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.output import archive
+from mjfim.records import unpacked_size
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison, MethodResult
@@ -391,6 +394,39 @@ def test_files_of_others_are_refused(tmp_path: Path) -> None:
     np.savez(path, record=np.array([{}], dtype=object))
     with pytest.raises(RecordingError, match=r"design\.npz: not a design archive .*pickles"):
         Design.load(path)
+
+
+def test_archives_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are refused before memory is allocated, as logs are."""
+    path = tmp_path / "design.npz"
+    np.savez_compressed(path, t=np.zeros(1_000_000))
+    monkeypatch.setattr(unpacked_size, "UNSUSPICIOUS_SIZE", 1_000_000)
+    with pytest.raises(RecordingError, match=r"design\.npz: unpacks to more than 200 times"):
+        Design.load(path)
+
+    monkeypatch.setattr(unpacked_size, "MAX_UNPACKED_SIZE", 2_000_000)
+    with pytest.raises(RecordingError, match=r"design\.npz: unpacks to more than 0\.00186 GiB"):
+        Design.load(path)
+
+
+def test_headers_that_announce_too_much(tmp_path: Path) -> None:
+    """No memory is allocated for numbers that the file does not hold."""
+    stream = io.BytesIO()
+    header = {"descr": "<f8", "fortran_order": False, "shape": (10**13,)}
+    np.lib.format.write_array_header_1_0(stream, header)
+    with zipfile.ZipFile(tmp_path / "design.npz", "w") as archive:
+        archive.writestr("t.npy", stream.getvalue())
+    with pytest.raises(RecordingError, match="declares more numbers than it holds"):
+        Design.load(tmp_path)
+
+
+def test_single_array_instead_of_an_archive(tmp_path: Path) -> None:
+    with (tmp_path / "design.npz").open("wb") as opened:
+        np.save(opened, np.arange(3.0))
+    with pytest.raises(
+        RecordingError, match=r"not a design archive: it holds a single array .*numpy\.savez"
+    ):
+        Design.load(tmp_path)
 
 
 def test_a_failing_disk_keeps_the_old_files(

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import math
 import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,34 +14,20 @@ from mjfim.errors import RecordingError
 from mjfim.recordings.formats.table import (
     NOT_NUMERIC,
     Table,
-    check_names,
-    check_unpacked_size,
     columns_to_read,
     length_fault,
     one_line,
 )
 from mjfim.recordings.spec import RecordingSpec
+from mjfim.records.unpacked_size import (
+    DAMAGED_ARCHIVE,
+    Header,
+    array_headers,
+    check_is_archive,
+)
 
 # Largest number of columns of one matrix. If a matrix has more, its rows are probably not times.
 MAX_COLUMNS = 4096
-
-# NumPy's readers of array headers, by version of the NPY format.
-HEADER_READERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
-
-# Errors that zipfile and NumPy raise for a damaged archive.
-DAMAGED = (
-    ValueError,
-    OSError,
-    EOFError,
-    KeyError,
-    NotImplementedError,
-    RuntimeError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 def read_npz(path: Path, spec: RecordingSpec) -> Table:
@@ -61,30 +45,21 @@ def read_npz(path: Path, spec: RecordingSpec) -> Table:
     Raises:
         RecordingError: The archive is damaged or too large, holds pickled objects, or has no time.
     """
+    check_is_archive(path, "log")
     try:
         with zipfile.ZipFile(path) as archive:
-            # All sizes are checked before memory is allocated: that of the archive, then those of
-            # the arrays.
-            unpacked = sum(info.file_size for info in archive.infolist())
-            check_unpacked_size(path, path.stat().st_size, unpacked)
-
-            members = [name for name in archive.namelist() if name.endswith(".npy")]
-            check_names(path, [name.removesuffix(".npy") for name in members])
-
-            headers = {name.removesuffix(".npy"): _header(path, archive, name) for name in members}
+            headers = array_headers(path, archive)
+            for name, (shape, dtype) in headers.items():
+                _check_array(path, name, shape, dtype)
             return _table(path, archive, headers, spec)
-    except DAMAGED as error:
+    except DAMAGED_ARCHIVE as error:
         raise RecordingError(
             f"{path}: not a readable npz archive (damaged or truncated?): {one_line(error)}"
         ) from None
 
 
-def _header(path: Path, archive: zipfile.ZipFile, member: str) -> tuple[tuple[int, ...], np.dtype]:
-    """Read shape and type of one array; refuse pickled objects and arrays that are too large."""
-    with archive.open(member) as stream:
-        shape, _, dtype = HEADER_READERS[np.lib.format.read_magic(stream)](stream)
-
-    name = member.removesuffix(".npy")
+def _check_array(path: Path, name: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    """Refuse pickled objects, and matrices whose rows are probably not times."""
     if dtype.hasobject:
         raise RecordingError(
             f"{path}: array {name!r} holds pickled objects, which are never read; save it as "
@@ -97,17 +72,11 @@ def _header(path: Path, archive: zipfile.ZipFile, member: str) -> tuple[tuple[in
             "values of one time"
         )
 
-    # NumPy allocates the whole array before it reads the content.
-    if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size:
-        raise ValueError(f"{member} declares more numbers than it holds")
-
-    return shape, dtype
-
 
 def _table(
     path: Path,
     archive: zipfile.ZipFile,
-    headers: Mapping[str, tuple[tuple[int, ...], np.dtype]],
+    headers: Mapping[str, Header],
     spec: RecordingSpec,
 ) -> Table:
     """Read the arrays that are needed; headers: shape and type of each array by its name."""

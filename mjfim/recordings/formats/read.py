@@ -24,13 +24,12 @@ from mjfim.recordings.formats.ros2_bag import read_bag
 from mjfim.recordings.formats.table import (
     NOT_NUMERIC,
     Table,
-    check_column_size,
     check_names,
-    check_unpacked_size,
     columns_to_read,
     one_line,
 )
 from mjfim.recordings.spec import RecordingSpec
+from mjfim.records.unpacked_size import check_column_size, check_unpacked_size
 
 # Errors that pyarrow and gzip raise for a damaged file.
 DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)

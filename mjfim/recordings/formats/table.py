@@ -1,4 +1,4 @@
-"""Columns of numbers of a log file by name, and limits of its size."""
+"""Columns of numbers of a log file by name."""
 
 from __future__ import annotations
 
@@ -10,15 +10,6 @@ from pathlib import Path
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.recordings.spec import RecordingSpec
-
-# Largest size of a file's unpacked content, and of the columns read from it [bytes].
-MAX_UNPACKED_SIZE = 4 * 2**30
-
-# Unpacked size below which the packing ratio of a file is not checked [bytes].
-UNSUSPICIOUS_SIZE = 64 * 2**20
-
-# Largest plausible ratio of unpacked to packed size of a log.
-MAX_PACKING_RATIO = 200.0
 
 # Longest quotation of another library's error message [characters].
 MAX_QUOTATION = 200
@@ -130,49 +121,6 @@ def columns_to_read(names: Iterable[str], spec: RecordingSpec) -> list[str]:
         stated.update((source.column, *source.multiply_by))
 
     return [name for name in names if name in stated or name.startswith("ctrl")]
-
-
-def check_unpacked_size(path: Path, packed: int, unpacked: int) -> None:
-    """Refuse a decompression bomb.
-
-    Args:
-        path: The file, for messages.
-        packed: Size of the packed content [bytes].
-        unpacked: Size of the unpacked content so far, or as the file declares it [bytes].
-
-    Raises:
-        RecordingError: The unpacked content is too large, or far larger than the packed one.
-    """
-    if unpacked > MAX_UNPACKED_SIZE:
-        raise RecordingError(
-            f"{path}: unpacks to more than {MAX_UNPACKED_SIZE / 2**30:.3g} GiB, the largest size "
-            "that is read; split the file"
-        )
-
-    if unpacked > UNSUSPICIOUS_SIZE and unpacked > MAX_PACKING_RATIO * packed:
-        raise RecordingError(
-            f"{path}: unpacks to more than {MAX_PACKING_RATIO:g} times its size, which is unusual "
-            "for a log; if it is a log, unpack it first"
-        )
-
-
-def check_column_size(path: Path, rows: int, columns: int) -> None:
-    """Refuse columns that would not fit into memory.
-
-    Args:
-        path: The file, for messages.
-        rows: Number of rows of the file.
-        columns: Number of columns that are to be read.
-
-    Raises:
-        RecordingError: The columns are too large as float64 numbers.
-    """
-    if rows * columns * 8 > MAX_UNPACKED_SIZE:
-        raise RecordingError(
-            f"{path}: {rows} rows of {columns} columns are more than "
-            f"{MAX_UNPACKED_SIZE / 2**30:.3g} GiB, the largest size that is read; name fewer "
-            "columns in [recording.columns]"
-        )
 
 
 def length_fault(length: int, time: str, rows: int) -> str:
