@@ -343,8 +343,19 @@ class System:
 
 
 def _require_supported(source: ModelSource) -> None:
-    """Raise ModelError for a model without actuators, or with a state that mjfim cannot read."""
+    """Raise ModelError for a model that mjfim cannot use.
+
+    It has no actuators, a state that mjfim cannot read, or a timestep that is not positive.
+    """
     model = source.model
+    timestep = float(model.opt.timestep)
+
+    # MuJoCo compiles a model with any timestep. The comparison is false for NaN.
+    if not 0.0 < timestep < np.inf:
+        raise ModelError(
+            f"{source.path}: option.timestep is {timestep:g} s; it must be a positive number, for "
+            "example 0.002"
+        )
     if model.nu == 0:
         raise ModelError(
             f"{source.path}: the model has no actuator; an experiment needs at least one"

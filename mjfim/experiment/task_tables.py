@@ -9,9 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from mjfim.recordings.spec import Finite, Positive, Range, Section
-
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+from mjfim.recordings.spec import Finite, NonNegative, Positive, Range, Section
 
 
 class Cost(Section):

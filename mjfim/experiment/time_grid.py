@@ -9,6 +9,10 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import NoiseSpec
 from mjfim.model.variants import ModelVariant
 
+# Largest number of engine steps of a sample, so that a mistyped rate or timestep does not exhaust the
+# memory.
+MAX_SUBSTEPS = 100_000
+
 # A ratio of two rates counts as a whole number within this relative tolerance.
 RATE_TOLERANCE = 1e-6
 
@@ -98,7 +102,7 @@ def noise_strides(experiment: Experiment) -> dict[str, int]:
 def _substeps(rate: float, timestep: float) -> int:
     """Engine steps per sample.
 
-    Raises ExperimentError if a sample is not a whole number of timesteps [s].
+    Raises ExperimentError if a sample is not a whole number of timesteps [s], or too many of them.
     """
     ratio = 1.0 / (rate * timestep)
     n = round(ratio)
@@ -108,6 +112,11 @@ def _substeps(rate: float, timestep: float) -> int:
         raise ExperimentError(
             f"rate: at {rate:g} Hz, a sample is not a whole number of timesteps ({timestep:g} s); "
             f"valid for example: {valid} Hz"
+        )
+    if n > MAX_SUBSTEPS:
+        raise ExperimentError(
+            f"rate: at {rate:g} Hz, a sample is {n:g} timesteps ({timestep:g} s); at most "
+            f"{MAX_SUBSTEPS:g} are possible, that is {1.0 / (MAX_SUBSTEPS * timestep):g} Hz or more"
         )
     return n
 

@@ -26,6 +26,9 @@ from mjfim.records.trajectory import Trajectory
 # Fewest rows of a trajectory that a design can have.
 MIN_ROWS = 3
 
+# Largest deviation of one sample period of a design from their mean, relative to the mean.
+SPACING_TOLERANCE = 1e-3
+
 # Largest relative difference between the sample periods of a design and of an experiment that
 # belong together.
 PERIOD_TOLERANCE = 1e-6
@@ -158,7 +161,21 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Tr
             raise RecordingError(
                 f"{path}: array '{prefix}{key}' has shape {array.shape}, expected {wanted}"
             )
+    _require_equal_periods(path, f"{prefix}t", times)
     return Trajectory(**{key: arrays[prefix + key] for key in TRAJECTORY_ARRAYS})
+
+
+def _require_equal_periods(path: Path, name: str, times: np.ndarray) -> None:
+    """Raise RecordingError unless times: (N+1,) [s] increase by equal periods."""
+    periods = np.diff(times.astype(np.float64))
+    mean = float(periods.mean())
+    if mean > 0.0 and np.abs(periods - mean).max() <= SPACING_TOLERANCE * mean:
+        return
+
+    raise RecordingError(
+        f"{path}: array {name!r} must increase by equal periods; they are {periods.min():g} s to "
+        f"{periods.max():g} s"
+    )
 
 
 def check_fits(path: Path, trajectory: Trajectory, system: System) -> None:

@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Range = tuple[Annotated[float, Field(strict=True)], Annotated[float, Field(strict=True)]]
+# Sizes between which the squares and quotients of numbers neither vanish nor overflow. No physical
+# quantity in any unit is outside.
+SMALLEST_SIZE = 1e-100
+LARGEST_SIZE = 1e100
+
+
+def _usable_size(value: float) -> float:
+    """Return a number with whose square one can compute; ValueError for others, except 0 and inf.
+
+    Args:
+        value: The number.
+    """
+    is_ordinary = value == 0.0 or SMALLEST_SIZE <= abs(value) <= LARGEST_SIZE
+    if is_ordinary or not math.isfinite(value):
+        return value
+
+    raise ValueError(f"should be of a size from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}")
+
+
+# Types of numbers in the experiment file. A bound of a range may be infinite.
+UsableSize = AfterValidator(_usable_size)
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True), UsableSize]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True), UsableSize]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True), UsableSize]
+Bound = Annotated[float, Field(strict=True), UsableSize]
+Range = tuple[Bound, Bound]
 
 
 class Section(BaseModel):

@@ -95,6 +95,9 @@ BAD_MODELS = {
     "text.xml": "this is not XML",
     "schema.xml": "<mujoco><worldbdy/></mujoco>",
     "massless.xml": '<mujoco><worldbody><body name="thin"><joint/></body></worldbody></mujoco>',
+    "still.xml": f'<mujoco><option timestep="0"/><worldbody>{BAR}</worldbody></mujoco>',
+    "nan.xml": f'<mujoco><option timestep="nan"/><worldbody>{BAR}</worldbody></mujoco>',
+    "backward.xml": f'<mujoco><option timestep="-1"/><worldbody>{BAR}</worldbody></mujoco>',
     "passive.xml": f"<mujoco><worldbody>{BAR}</worldbody></mujoco>",
 }
 BAD_TABLES = {
@@ -574,7 +577,47 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         M,
         ["passive.xml", "no actuator", "at least one"],
     ),
+    "timestep zero": (
+        edited("cart_pendulum.xml", "still.xml"),
+        M,
+        ["still.xml", "option.timestep is 0 s", "positive"],
+    ),
+    "timestep not a number": (
+        edited("cart_pendulum.xml", "nan.xml"),
+        M,
+        ["nan.xml", "option.timestep is nan s", "positive"],
+    ),
+    "timestep negative": (
+        edited("cart_pendulum.xml", "backward.xml"),
+        M,
+        ["backward.xml", "option.timestep is -1 s", "positive"],
+    ),
     # time
+    "rate vanishing": (
+        edited("rate = 100.0", "rate = 5e-324"),
+        E,
+        [HOME, "rate", "should be of a size from 1e-100 to 1e+100", "5e-324"],
+    ),
+    "rate far too low": (
+        edited("rate = 100.0", "rate = 1e-6"),
+        E,
+        [HOME, "rate: at 1e-06 Hz", "1e+08 timesteps", "at most 100000", "0.001 Hz or more"],
+    ),
+    "horizon overflowing": (
+        edited("horizon = 1.0", "horizon = 1e308"),
+        E,
+        [HOME, "horizon", "should be of a size from", "1e+308"],
+    ),
+    "limit vanishing": (
+        SHORT + "[limits]\ncontrol_rate = 5e-324",
+        E,
+        [HOME, "limits.control_rate", "should be of a size from", "5e-324"],
+    ),
+    "limit overflowing": (
+        SHORT + "[limits]\nposition = { slide = [-1e308, 1.0] }",
+        E,
+        [HOME, "limits.position.slide.0", "should be of a size from", "-1e+308"],
+    ),
     "rate": (
         edited("rate = 100.0", "rate = 30.0"),
         E,

@@ -327,8 +327,11 @@ def test_a_design_without_an_initial_trajectory(folder: Path, tmp_path: Path) ->
         {"ctrl": np.zeros((0, NU))},
         {"ctrl": np.full((N, NU), np.nan)},
         {"qpos": np.zeros((5, NQ))},
+        {"t": np.zeros(N + 1)},
+        {"t": np.linspace(1.0, 0.0, N + 1)},
+        {"t": np.linspace(0.0, 1.0, N + 1) ** 2},
     ],
-    ids=["flat", "text", "no-rows", "nan", "too-short"],
+    ids=["flat", "text", "no-rows", "nan", "too-short", "standing", "backward", "uneven"],
 )
 def test_wrong_arrays_are_refused(
     folder: Path, tmp_path: Path, task: DesignTask, arrays: dict[str, Array]
