@@ -9,8 +9,8 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import NoiseSpec
 from mjfim.model.variants import ModelVariant
 
-# Largest number of engine steps of a sample, so that a mistyped rate or timestep does not exhaust the
-# memory.
+# Largest number of engine steps of a sample, so that a mistyped rate or timestep does not exhaust
+# the memory.
 MAX_SUBSTEPS = 100_000
 
 # A ratio of two rates counts as a whole number within this relative tolerance.
