@@ -37,6 +37,10 @@ class RecordingError(MjfimError):
     """A recording, a control table or a design archive cannot be used."""
 
 
+class OutputError(MjfimError):
+    """A result cannot be written where the user wants it without the loss of other files."""
+
+
 class UnidentifiableError(MjfimError):
     """A trajectory gives no information about a combination of parameters."""
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from mjfim.atomic_io import replacing
+
 # The tests run side by side on all cores, so one thread of BLAS per process is enough.
 # BLAS reads the variable when NumPy is imported, which is later than this line.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -29,7 +31,7 @@ def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """
 
     def touch(figure: object, path: Path, dpi: float = 0.0) -> Path:
-        path.touch()
-        return path
+        with replacing(path):
+            return path
 
     monkeypatch.setattr("mjfim.output.plots.save", touch)

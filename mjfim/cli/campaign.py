@@ -13,8 +13,10 @@ import mjfim
 from mjfim.cli.common import (
     ExperimentFile,
     Folder,
+    Force,
     Threads,
     UnfinishedError,
+    claim_folder,
     errors,
     out,
     raise_on_interrupt,
@@ -23,11 +25,11 @@ from mjfim.cli.common import (
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.target_accuracy import target_accuracies
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.input_files import input_files
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_recording
 from mjfim.output.campaign_folder import CampaignFolder, accuracy_sentence
-from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_campaign
 from mjfim.output.text import render
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
@@ -61,6 +63,7 @@ def campaign(
             help="Recording of the last design; may be given several times; implies --real.",
         ),
     ] = None,
+    force: Force = False,
     threads: Threads = None,
 ) -> None:
     """Repeat design, recording and estimate until every target accuracy is reached.
@@ -70,10 +73,14 @@ def campaign(
     DIR/round_K/. Then play its design.csv on the robot, and call again with --recordings.
     """
     stated = with_target_accuracies(mjfim.Experiment.from_file(experiment), wanted)
-    check_folder(output)
     run = CampaignRun(output, DesignTask.resolve(stated, threads=threads))
 
     simulated = not (real or recordings)
+    if simulated:
+        run.require_new()
+    names = run.folder.next_files(simulated=simulated)
+    claim_folder(output, names, input_files(stated, recordings or []), force=force)
+
     found = run.simulated(rounds, seed) if simulated else run.real(rounds, recordings or [])
 
     with raise_on_interrupt(UnfinishedError(str(output))):
@@ -116,12 +123,8 @@ class CampaignRun:
         self._wanted = target_accuracies(task)
         self._estimate: Estimate | None = None
 
-    def simulated(self, rounds: int, seed: int) -> Campaign:
-        """Run a campaign on a robot that is the model at its true values.
-
-        Args:
-            rounds: Largest number of rounds.
-            seed: Seed of the noise of the first round; each further round adds 1.
+    def require_new(self) -> None:
+        """Check that a simulated campaign can begin.
 
         Raises:
             ExperimentError: No parameter states a true value.
@@ -139,6 +142,14 @@ class CampaignRun:
                 "or continue the campaign with --real"
             )
 
+    def simulated(self, rounds: int, seed: int) -> Campaign:
+        """Run a campaign on a robot that is the model at its true values.
+
+        Args:
+            rounds: Largest number of rounds.
+            seed: Seed of the noise of the first round; each further round adds 1.
+        """
+
         def measure(design: Design, number: int) -> Recording:
             """Write the design of a round, and simulate its recording."""
             self._write_design(design, number)
@@ -148,7 +159,7 @@ class CampaignRun:
             return recording
 
         return mjfim.run_campaign(
-            experiment,
+            self.task.experiment,
             measure,
             rounds=rounds,
             threads=self.task.system.threads,

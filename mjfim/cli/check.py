@@ -11,16 +11,19 @@ import mjfim
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
+    Force,
     Threads,
+    claim_folder,
     errors,
     print_result,
     progress,
     verb,
     writing,
 )
+from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.output import archive
-from mjfim.output.folders import check_folder
+from mjfim.output.folders import CHECK_FILES
 from mjfim.output.summaries import describe_check
 from mjfim.output.text import render
 from mjfim.recordings.read import read_recording
@@ -46,6 +49,7 @@ def check(
         typer.Option("--output", "-o", metavar="DIR", help="Folder for check.json and check.png."),
     ] = None,
     as_json: AsJson = False,
+    force: Force = False,
     threads: Threads = None,
 ) -> None:
     """Say which parameters can be identified, how accurately, and which only in combination."""
@@ -57,7 +61,8 @@ def check(
         trajectory = archive.read_design(design_file)["final"]
         archive.check_fits(design_file, trajectory, system)
     if output is not None:
-        check_folder(output)
+        inputs = input_files(stated, [*(recordings or []), design_file])
+        claim_folder(output, CHECK_FILES, inputs, force=force)
 
     with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)

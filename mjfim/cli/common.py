@@ -6,8 +6,8 @@ import functools
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Annotated, Any
@@ -58,6 +58,63 @@ Folder = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads for MuJoCo; default: all cores.")]
+Force = Annotated[
+    bool,
+    typer.Option(
+        "--force",
+        help="Replace files that mjfim did not write, or that were changed since; inputs never.",
+    ),
+]
+
+# Folders that the running verb has claimed; they are given back at its end.
+_claims = ExitStack()
+
+
+def claim_folder(
+    folder: Path, names: Iterable[str], inputs: Sequence[Path], *, force: bool
+) -> None:
+    """Make sure before the work that results can be written, and keep other runs out.
+
+    The claim ends with the verb.
+
+    Args:
+        folder: Folder for the results; it is created if it does not exist.
+        names: Names of all files that may be written, relative to the folder.
+        inputs: Files that the verb reads.
+        force: Whether the user permits to replace files that mjfim did not write.
+
+    Raises:
+        RecordingError: The folder is a file, or writing is not permitted.
+        OutputError: A file may not be replaced, or another run writes into the folder.
+    """
+    from mjfim.output.folders import check_folder
+    from mjfim.output.manifest import OutputGuard, claimed
+
+    check_folder(folder)
+    guard = OutputGuard(inputs, force=force)
+    guard.check(folder / name for name in names)
+    _claims.enter_context(claimed(folder, guard, exclusive=True))
+
+
+def claim_file(file: Path, inputs: Sequence[Path], *, force: bool) -> None:
+    """Make sure before the work that a single file can be written.
+
+    Args:
+        file: The file.
+        inputs: Files that the verb reads.
+        force: Whether the user permits to replace a file that mjfim did not write.
+
+    Raises:
+        RecordingError: The file is a folder, or writing is not permitted.
+        OutputError: The file may not be replaced.
+    """
+    from mjfim.output.folders import check_file
+    from mjfim.output.manifest import OutputGuard, claimed
+
+    check_file(file)
+    guard = OutputGuard(inputs, force=force)
+    guard.check([file])
+    _claims.enter_context(claimed(file.parent, guard, exclusive=False))
 
 
 class UnfinishedError(Exception):
@@ -149,7 +206,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
     def wrapped(*args: Any, **kwargs: Any) -> None:
         """Call the verb; print one message and exit for each error."""
         try:
-            with raise_on_interrupt(NoResultError()):
+            with _claims, raise_on_interrupt(NoResultError()):
                 function(*args, **kwargs)
         except NoResultError:
             errors.print("mjfim: interrupted before there was a result; nothing was written")

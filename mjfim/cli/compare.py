@@ -11,7 +11,9 @@ from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
     Folder,
+    Force,
     Threads,
+    claim_folder,
     errors,
     print_result,
     progress,
@@ -20,11 +22,12 @@ from mjfim.cli.common import (
 )
 from mjfim.errors import NoResultError
 from mjfim.excitation.task import DesignTask
-from mjfim.output.folders import check_folder
+from mjfim.experiment.input_files import input_files
+from mjfim.output.folders import comparison_files
 from mjfim.output.summaries import describe_comparison
 from mjfim.output.text import render
 from mjfim.studies.baselines.methods import METHODS
-from mjfim.studies.compare import compare_task
+from mjfim.studies.compare import chosen_methods, compare_task
 
 
 @verb
@@ -44,6 +47,7 @@ def compare(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the baselines.")] = 0,
     as_json: AsJson = False,
+    force: Force = False,
     threads: Threads = None,
 ) -> None:
     """Compare the design with chirps, multisines, Fourier series and splines of equal budget.
@@ -54,7 +58,8 @@ def compare(
     chosen = (
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
     )
-    check_folder(output)
+    names = comparison_files(chosen_methods(task, chosen))
+    claim_folder(output, names, input_files(task.experiment), force=force)
     with progress("comparing") as show:
         result = compare_task(
             task, seconds=seconds, steps=steps, seed=seed, methods=chosen, callback=show

@@ -15,7 +15,9 @@ from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
     Folder,
+    Force,
     Threads,
+    claim_folder,
     errors,
     print_result,
     progress,
@@ -25,7 +27,8 @@ from mjfim.cli.common import (
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, ShortestExperiment
 from mjfim.excitation.task import DesignTask
-from mjfim.output.folders import check_folder
+from mjfim.experiment.input_files import input_files
+from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.summaries import describe_design
 from mjfim.output.text import render
 from mjfim.parallel import Pool
@@ -66,6 +69,7 @@ def design(
             "--shortest", help="Find the shortest horizon at which every `wanted` σ is reached."
         ),
     ] = False,
+    force: Force = False,
     threads: Threads = None,
 ) -> None:
     """Design the excitation that gives the most information about the parameters."""
@@ -73,7 +77,8 @@ def design(
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
     task = DesignTask.resolve(stated, threads=threads)
-    check_folder(output)
+    names = (*DESIGN_FILES, *(SHORTEST_FILES if shortest else ()))
+    claim_folder(output, names, input_files(stated), force=force)
 
     with (
         several(task) as executor,

@@ -11,14 +11,17 @@ import mjfim
 from mjfim.cli.common import (
     ExperimentFile,
     Folder,
+    Force,
     UnfinishedError,
+    claim_folder,
     errors,
     out,
     raise_on_interrupt,
     verb,
 )
+from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
-from mjfim.output.folders import check_folder
+from mjfim.output.folders import SYSID_FILES
 from mjfim.output.text import render
 from mjfim.recordings.read import read_recording
 
@@ -30,6 +33,7 @@ def export_sysid(
         list[Path], typer.Argument(metavar="RECORDING", help="Logs of any format that is read.")
     ],
     output: Folder,
+    force: Force = False,
 ) -> None:
     """Pass recordings and parameters to mujoco.sysid, and compare its estimates with mjfim's."""
     # MuJoCo's sysid takes a while to import; no other verb needs it.
@@ -37,8 +41,9 @@ def export_sysid(
     from mjfim.output.sysid.sequences import require_extra
 
     require_extra()
-    check_folder(output)
     system = System.resolve(mjfim.Experiment.from_file(experiment))
+    inputs = input_files(system.experiment, recordings)
+    claim_folder(output, SYSID_FILES, inputs, force=force)
     loaded = [read_recording(path, system.channels) for path in recordings]
 
     result = sysid_comparison.compare_with_sysid(system, loaded)

@@ -12,7 +12,9 @@ from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
     Folder,
+    Force,
     Threads,
+    claim_folder,
     errors,
     out,
     print_result,
@@ -21,9 +23,10 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import ExperimentError
+from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
-from mjfim.output.folders import check_folder
+from mjfim.output.folders import estimate_files
 from mjfim.output.summaries import describe_estimate, describe_logs
 from mjfim.output.text import render
 from mjfim.recordings.read import read_log
@@ -50,13 +53,15 @@ def identify(
         typer.Option(help="least_squares, which keeps bounds, or newton, the paper's method."),
     ] = "least_squares",
     as_json: AsJson = False,
+    force: Force = False,
     threads: Threads = None,
 ) -> None:
     """Estimate the parameters from recordings, with intervals, predictions and warnings."""
     if method not in ("least_squares", "newton"):
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
-    check_folder(output)
+    inputs = input_files(system.experiment, [*recordings, *(held_out or [])])
+    claim_folder(output, estimate_files(len(recordings)), inputs, force=force)
 
     with progress("reading") as show:
         fitted = [read_log(path, system.channels) for path in recordings]

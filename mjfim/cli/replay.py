@@ -11,11 +11,11 @@ import typer
 
 import mjfim
 from mjfim.atomic_io import replacing
-from mjfim.cli.common import errors, verb
+from mjfim.cli.common import Force, claim_file, errors, verb
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.output import archive
-from mjfim.output.folders import check_file, find_experiment_file, find_rerun_file
+from mjfim.output.folders import find_experiment_file, find_rerun_file
 from mjfim.output.labels import Labels
 
 
@@ -32,6 +32,7 @@ def replay(
         Path | None,
         typer.Option(help="Experiment of a DESIGN.npz that has no design.json beside it."),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Show a result in the Rerun viewer."""
     from mjfim.output import rerun as rerun_log
@@ -40,7 +41,8 @@ def replay(
         raise RecordingError(f"--save {save}: a Rerun file ends in .rrd")
     target = save or Path(tempfile.mkdtemp(prefix="mjfim-")) / "replay.rrd"
     if save is not None:
-        check_file(save)
+        inputs = sorted(source.iterdir()) if source.is_dir() else [source]
+        claim_file(save, inputs, force=force)
     if source.suffix == ".npz":
         system = System.resolve(
             mjfim.Experiment.from_file(experiment or find_experiment_file(source))

@@ -11,12 +11,22 @@ import typer
 
 import mjfim
 from mjfim.budget import stop_on_interrupt
-from mjfim.cli.common import ExperimentFile, errors, out, progress, verb, writing
+from mjfim.cli.common import (
+    ExperimentFile,
+    Force,
+    claim_folder,
+    errors,
+    out,
+    progress,
+    verb,
+    writing,
+)
 from mjfim.errors import ExperimentError, unknown
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.input_files import input_files
 from mjfim.output.archive import write_design
-from mjfim.output.folders import check_folder
+from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
 from mjfim.output.summaries import describe_robustness
 from mjfim.output.text import render
 from mjfim.parallel import Pool, cores
@@ -75,6 +85,7 @@ def robustness(
             ),
         ),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Play a design on simulated robots that differ from the model.
 
@@ -89,7 +100,12 @@ def robustness(
         loudness=noise,
         seed=seed,
     )
-    check_folder(output)
+
+    # A new design stands in a folder of its own, below that of the study.
+    new = [f"design/{name}" for name in DESIGN_ARCHIVE] if design_folder is None else []
+    inputs = input_files(stated, [design_folder])
+    claim_folder(output, (*ROBUSTNESS_FILES, *new), inputs, force=force)
+
     if design_folder is None:
         shares = parse_reserve(reserve or DEFAULT_RESERVE)
         design_folder = design_with_reserve(stated, shares, output / "design")

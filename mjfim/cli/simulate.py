@@ -13,6 +13,9 @@ from mjfim.cli.common import (
     DesignFile,
     ExperimentFile,
     Folder,
+    Force,
+    claim_file,
+    claim_folder,
     errors,
     print_result,
     progress,
@@ -20,10 +23,11 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import NoResultError
+from mjfim.experiment.input_files import input_files
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output import archive
-from mjfim.output.folders import check_file, check_folder
+from mjfim.output.folders import study_files
 from mjfim.output.summaries import describe_study
 from mjfim.output.text import render
 from mjfim.studies.monte_carlo import monte_carlo_system
@@ -37,10 +41,11 @@ def simulate(
         Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Recording to write.")
     ],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    force: Force = False,
 ) -> None:
     """Simulate a recording of a design at the `true` parameter values, with noise."""
     system = System.resolve(mjfim.Experiment.from_file(experiment))
-    check_file(output)
+    claim_file(output, input_files(system.experiment, [design_file]), force=force)
     trajectory = archive.read_design(design_file)["final"]
     archive.check_fits(design_file, trajectory, system)
     archive.write_recording(output, simulate_system(system, trajectory, seed), system)
@@ -59,6 +64,7 @@ def montecarlo(
         typer.Option(min=0.0, help="Rate of the measurements in Hz; overrides measure_rate."),
     ] = None,
     as_json: AsJson = False,
+    force: Force = False,
 ) -> None:
     """Compare estimates with the Cramér-Rao bound on the initial and on the designed trajectory."""
     stated = mjfim.Experiment.from_file(experiment)
@@ -68,7 +74,8 @@ def montecarlo(
     named = archive.read_design(design_file)
     for trajectory in named.values():
         archive.check_fits(design_file, trajectory, system)
-    check_folder(output)
+    inputs = input_files(system.experiment, [design_file])
+    claim_folder(output, study_files(system.parameters.names), inputs, force=force)
 
     with progress(f"{trials} trials") as show:
         study = monte_carlo_system(system, named, trials=trials, seed=seed, callback=show)

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.system import System
 from mjfim.output import plots
 from mjfim.output.archive import check_fits, write_design
+from mjfim.output.folders import DESIGN_ARCHIVE
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.plots.style import format_with_uncertainty
 from mjfim.recordings.read import read_recording
@@ -24,6 +26,12 @@ from mjfim.records.campaign import Campaign, EarlierRound, Round
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.serialization import write_json
+
+# Files of a campaign beside the folders of its rounds.
+CAMPAIGN_FILES = ("campaign.json", "campaign.npz", "campaign.png", "identified.xml")
+
+# Files of the estimate after a round.
+ESTIMATE_ARCHIVE = ("estimate.json", "estimate.npz")
 
 
 class CampaignFolder:
@@ -66,6 +74,32 @@ class CampaignFolder:
     def has_rounds(self) -> bool:
         """True where the folder holds a campaign."""
         return any(self.path.glob("round_*"))
+
+    def next_files(self, *, simulated: bool) -> list[str]:
+        """List the files that the next call may write; in the folders of rounds, existing ones.
+
+        Args:
+            simulated: Whether recordings are simulated, too.
+
+        Returns:
+            Names relative to the folder.
+        """
+        names = list(CAMPAIGN_FILES)
+        designed, recorded = self.designed, self.recorded
+        for number in self._numbers():
+            # Designs and recordings are kept, and all estimates are made again.
+            of_round = list(ESTIMATE_ARCHIVE)
+            if number > designed:
+                of_round += DESIGN_ARCHIVE
+            if simulated and number > recorded:
+                of_round.append("recording.csv")
+            names += [f"{self.round(number).name}/{name}" for name in of_round]
+        return names
+
+    def _numbers(self) -> list[int]:
+        """Numbers of the rounds that have a folder, ascending."""
+        numbers = [path.name.removeprefix("round_") for path in self.path.glob("round_*")]
+        return sorted(int(number) for number in numbers if number.isdecimal())
 
     @property
     def designed(self) -> int:
@@ -151,7 +185,8 @@ class CampaignFolder:
 
         for i, file in enumerate(new):
             name = "recording.csv" if len(new) == 1 else f"recording_{i + 1}.csv"
-            shutil.copyfile(file, self.round(waiting) / name)
+            with replacing(self.round(waiting) / name) as temporary:
+                shutil.copyfile(file, temporary)
 
     def write_design(self, design: Design, number: int, system: System) -> None:
         """Write the files of a round's design, which include those that the robot plays.

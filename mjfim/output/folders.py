@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from mjfim.atomic_io import remove_earlier_result
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import measured_trajectory
@@ -14,12 +16,64 @@ from mjfim.output import rerun as rerun_log
 from mjfim.output.labels import Labels
 from mjfim.output.mjcf.write import write_identified
 from mjfim.records.check import Check
-from mjfim.records.comparison import Comparison
+from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json, write_json
+
+# Files that a design consists of, without figures.
+DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
+
+# Files that `mjfim design` may write, and further ones with --shortest.
+DESIGN_FILES = (
+    *DESIGN_ARCHIVE,
+    "design.rrd",
+    "trajectories.png",
+    "sensitivity_phase.png",
+    "convergence.png",
+    "standard_deviations.png",
+    "table_eigenvalues.png",
+    "limits.png",
+)
+SHORTEST_FILES = ("shortest.json", "shortest.npz")
+
+# Files that `mjfim check`, `mjfim robustness` and `mjfim export-sysid` may write.
+CHECK_FILES = ("check.json", "check.npz", "check.png")
+ROBUSTNESS_FILES = ("playback.json", "playback.npz", "playback.png")
+SYSID_FILES = ("comparison.json", "sysid_report.html")
+
+
+def estimate_files(recordings: int) -> tuple[str, ...]:
+    """List the files that `mjfim identify` may write.
+
+    Args:
+        recordings: Number of recordings that are fitted.
+    """
+    figures = ("parameters.png", "spectra.png", "predictions.png")
+    fits = tuple(_fit_name(i, recordings) for i in range(recordings))
+    return ("estimate.json", "estimate.npz", "identified.xml", "estimate.rrd", *figures, *fits)
+
+
+def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
+    """List the files that `mjfim montecarlo` may write.
+
+    Args:
+        parameters: Names of the parameters.
+    """
+    histograms = tuple(_histogram_name(name) for name in parameters)
+    return ("montecarlo.json", "montecarlo.npz", "table_covariance.png", *histograms)
+
+
+def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
+    """List the files that `mjfim compare` may write.
+
+    Args:
+        methods: Keys of the baselines.
+    """
+    controls = tuple(_control_name(method) for method in dict.fromkeys((*methods, DESIGN)))
+    return ("compare.json", "compare.npz", "compare.png", *controls)
 
 
 def find_rerun_file(source: Path) -> Path:
@@ -158,7 +212,8 @@ def write_comparison_folder(folder: Path, comparison: Comparison, system: System
     An experiment can read each control as its `initial.control`.
 
     Args:
-        folder: Folder for the results; controls of an earlier comparison are removed.
+        folder: Folder for the results; the controls that an earlier comparison wrote
+            are removed.
         comparison: The comparison.
         system: The experiment that was compared.
     """
@@ -166,7 +221,7 @@ def write_comparison_folder(folder: Path, comparison: Comparison, system: System
     comparison.save(folder)
     for row in comparison.rows:
         if row.control is not None:
-            archive.write_control(folder / f"control_{row.method}.csv", row.control, system)
+            archive.write_control(folder / _control_name(row.method), row.control, system)
     plots.save(plots.compare_figure(comparison), folder / "compare.png")
 
 
@@ -174,8 +229,8 @@ def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> l
     """Write estimate.json, estimate.npz, identified.xml, estimate.rrd and figures.
 
     Args:
-        folder: Folder for the results; those of an earlier estimate that are not overwritten are
-            removed.
+        folder: Folder for the results; those that an earlier estimate wrote and that are not
+            replaced are removed.
         estimate: The estimate.
         system: The experiment that was identified.
 
@@ -207,9 +262,8 @@ def _write_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None
     sigma = list(estimate.sigma.values())
     count = len(estimate.recordings)
     for i in range(count):
-        name = "fit.png" if count == 1 else f"fit_{i + 1}.png"
         figure = plots.fit(estimate, i, labels, sigma)
-        plots.save(figure, folder / name)
+        plots.save(figure, folder / _fit_name(i, count))
 
     plots.save(plots.parameter_intervals(estimate, labels), folder / "parameters.png")
     plots.save(plots.residual_spectra(estimate, labels), folder / "spectra.png")
@@ -229,13 +283,31 @@ def write_study_folder(folder: Path, study: MonteCarloStudy, system: System) -> 
 
     labels = Labels.of_system(system)
     for i, name in enumerate(study.parameters):
-        safe_name = re.sub(r"[^\w.-]", "_", name)
-        plots.save(plots.histogram(study, i, labels), folder / f"histogram_{safe_name}.png")
+        plots.save(plots.histogram(study, i, labels), folder / _histogram_name(name))
     plots.save(plots.study_table(study, labels), folder / "table_covariance.png")
 
 
+def _fit_name(index: int, count: int) -> str:
+    """Name of the figure of the fit of one of `count` recordings."""
+    return "fit.png" if count == 1 else f"fit_{index + 1}.png"
+
+
+def _histogram_name(parameter: str) -> str:
+    """Name of the histogram of a parameter."""
+    safe_name = re.sub(r"[^\w.-]", "_", parameter)
+    return f"histogram_{safe_name}.png"
+
+
+def _control_name(method: str) -> str:
+    """Name of the table with the control of a method."""
+    return f"control_{method}.csv"
+
+
 def _clear(folder: Path, names: str) -> None:
-    """Remove the files that an earlier run may have written, by their exact names."""
+    """Remove the files that an earlier run wrote, by their exact names.
+
+    Files of the user that have such a name remain.
+    """
     for stale in list(folder.iterdir()):
         if re.fullmatch(names, stale.name):
-            stale.unlink()
+            remove_earlier_result(stale)

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.image import imread
 
 import mjfim
+from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots.check import check_figure
 from tests.support.cli import MODELS, loads, names, read, run
 
@@ -26,7 +27,7 @@ def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
     result = run("check", study, "--json", "-o", tmp_path / "out")
     found = loads(result.stdout)
     assert found == read(tmp_path / "out" / "check.json")
-    assert names(tmp_path / "out") == {"check.json", "check.npz", "check.png"}
+    assert names(tmp_path / "out") == {"check.json", "check.npz", "check.png", MANIFEST}
     assert imread(tmp_path / "out" / "check.png").shape[0] > 300
     assert found["ok"] is True
     assert [row["name"] for row in found["parameters"]] == ["m", "l", "c"]

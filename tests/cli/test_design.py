@@ -15,6 +15,7 @@ from typer.testing import Result
 import mjfim
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
+from mjfim.output.manifest import MANIFEST
 from tests.support.cli import (
     DESIGN,
     loads,
@@ -29,7 +30,7 @@ from tests.support.cli import (
 def test_design_leaves_its_files(home: Path, designed: Result) -> None:
     """The folder holds all promised files and nothing else."""
     assert designed.exit_code == 0
-    assert names(home / "out") == DESIGN
+    assert names(home / "out") == DESIGN | {MANIFEST}
     assert all(path.stat().st_size > 0 for path in (home / "out").iterdir())
     data = read(home / "out" / "design.json")
     assert (data["status"], data["limits"]["satisfied"]) == ("converged", True)
@@ -56,7 +57,7 @@ def test_second_run_into_the_same_folder(
 
     result = run("design", study, "-o", out, "--threads", 1)
     assert result.exit_code == 0
-    assert names(out) == DESIGN | {"notes.txt"}
+    assert names(out) == DESIGN | {"notes.txt", MANIFEST}
 
     second = read(out / "design.json")
     assert second["seconds"] != first["seconds"]

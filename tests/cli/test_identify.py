@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
+from mjfim.output.manifest import MANIFEST
 from tests.support.cli import (
     ESTIMATE,
     loads,
@@ -22,7 +23,7 @@ from tests.support.cli import (
 def test_identify_leaves_its_files(home: Path, identified: Result) -> None:
     """All promised files; the error is less than four standard deviations."""
     assert identified.exit_code == 0
-    assert names(home / "fit") == ESTIMATE
+    assert names(home / "fit") == ESTIMATE | {MANIFEST}
     data = read(home / "fit" / "estimate.json")
     assert loads(identified.stdout) == data
     assert np.all(np.abs(np.subtract(data["theta"], [2.0, 1.0, 1.0])) < 4 * np.array(data["std"]))
@@ -41,7 +42,10 @@ def test_identify_several_recordings(
     words = ("-o", tmp_path / "fit", "--method", "newton")
     result = run("identify", study, recorded, second, *words)
     assert result.exit_code == 0
-    assert names(tmp_path / "fit") == (ESTIMATE - {"fit.png"}) | {"fit_1.png", "fit_2.png"}
+    assert names(tmp_path / "fit") - {MANIFEST} == (ESTIMATE - {"fit.png"}) | {
+        "fit_1.png",
+        "fit_2.png",
+    }
     both, one = read(tmp_path / "fit" / "estimate.json"), loads(identified.stdout)
     assert np.all(np.array(both["std"]) < 0.85 * np.array(one["std"]))
     assert both["recordings"] == [str(recorded), str(second)]

@@ -14,6 +14,7 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.output import archive, plots
+from mjfim.output.manifest import MANIFEST
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 from tests.support.cli import (
@@ -97,7 +98,7 @@ def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
     assert "Traceback" not in rest
     assert "wrote" in rest
     out = tmp_path / "out"
-    assert names(out) == DESIGN
+    assert names(out) == DESIGN | {MANIFEST}
     data = read(out / "design.json")
     assert data["status"] == "interrupted"
     assert data["final"]["eigenvalues"][0] > 5 * data["initial"]["eigenvalues"][0]

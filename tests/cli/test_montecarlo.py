@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mjfim.output.manifest import MANIFEST
 from tests.support.cli import (
     STUDY,
     loads,
@@ -25,7 +26,7 @@ def test_montecarlo_leaves_its_files(study: Path, archived: Path, tmp_path: Path
     result = run("montecarlo", study, archived, "-o", out, *options)
 
     assert result.exit_code == 0
-    assert names(out) == STUDY
+    assert names(out) == STUDY | {MANIFEST}
     data = read(out / "montecarlo.json")
     assert loads(result.stdout) == data
     assert data["measure_rate"] == pytest.approx(25.0)

@@ -22,6 +22,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import verify
+from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots.compare import compare_figure
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, HistoryRow
@@ -323,13 +324,14 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     assert told["budget"] == {"seconds": 60.0, "steps": 60000.0}
     assert all(len(m["std"]) == 3 and m["limits"]["margins"] for m in told["methods"])
     controls = {f"control_{m}.csv" for m in ("chirp", "steps", DESIGN)}
-    assert names(out) == {"compare.json", "compare.npz", "compare.png", *controls}
+    assert names(out) - {MANIFEST} == {"compare.json", "compare.npz", "compare.png", *controls}
     assert imread(out / "compare.png").shape[0] > 300
     again = run(
         "compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"
     )
     assert again.exit_code == 0, again.stderr
     assert names(out) == {
+        MANIFEST,
         "compare.json",
         "compare.npz",
         "compare.png",

@@ -1,0 +1,124 @@
+"""Existing files: a verb replaces its own earlier results, and never files of the user."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from mjfim.output import folders
+from mjfim.output.file_lock import FileLock
+from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, OutputGuard, claimed
+from tests.support.cli import misused, names, run, write_experiment
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Contents of all files of a folder by name."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    "name", ["study.toml", "design.npz", "cart_pendulum.xml", "cart_pendulum.csv"]
+)
+def test_simulate_does_not_replace_what_it_reads(name: str, archived: Path, tmp_path: Path) -> None:
+    """Not even with --force; the message names both files."""
+    study = write_experiment(tmp_path)
+    shutil.copy(archived, tmp_path / "design.npz")
+    before = contents(tmp_path)
+    words = ("simulate", study, tmp_path / "design.npz", "-o", tmp_path / name)
+    for force in ((), ("--force",)):
+        misused(run(*words, *force), f"{tmp_path / name}: this result would replace", "an input")
+    assert contents(tmp_path) == before
+
+
+def test_identify_does_not_replace_the_model_of_the_experiment(
+    recorded: Path, tmp_path: Path
+) -> None:
+    """An experiment that goes on from an identified model, into the folder of this model."""
+    study = write_experiment(tmp_path, model='"fit/identified.xml"')
+    (tmp_path / "fit").mkdir()
+    (tmp_path / "cart_pendulum.xml").rename(tmp_path / "fit" / "identified.xml")
+    before = contents(tmp_path / "fit")
+    result = run("identify", study, recorded, "-o", tmp_path / "fit", "--force")
+    misused(result, "fit/identified.xml: this result would replace", "an input")
+    assert contents(tmp_path / "fit") == before
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_compare_keeps_controls_that_it_did_not_write(tmp_path: Path) -> None:
+    """In the folder of the experiment, whose own control has a name like a result."""
+    study = write_experiment(tmp_path, start='"control_mine.csv"')
+    (tmp_path / "cart_pendulum.csv").rename(tmp_path / "control_mine.csv")
+    (tmp_path / "control_other.csv").write_text("mine", encoding="utf-8")
+    before = contents(tmp_path)
+
+    words = ("compare", study, "-o", tmp_path, "--steps", 3000)
+    for methods in ("chirp", "steps"):
+        result = run(*words, "--methods", methods)
+        assert "wrote" in result.stderr, result.stderr
+
+    after = contents(tmp_path)
+    assert {name: after[name] for name in before} == before
+    assert "control_steps.csv" in after
+    assert "control_chirp.csv" not in after
+
+
+def test_compare_keeps_an_earlier_result_that_it_reads(study: Path, tmp_path: Path) -> None:
+    """A control of an earlier comparison is the initial control now."""
+    write_experiment(tmp_path, start='"control_chirp.csv"')
+    guard = OutputGuard([], force=False)
+    with claimed(tmp_path, guard, exclusive=True):
+        folders.archive.write_table(tmp_path / "control_chirp.csv", {"t": [0.0]})
+    shutil.copy(study.parent / "cart_pendulum.csv", tmp_path / "control_chirp.csv")
+    words = ("compare", tmp_path / "study.toml", "-o", tmp_path, "--methods", "chirp", "--force")
+    misused(run(*words), "control_chirp.csv: this result would replace", "an input")
+
+
+def test_an_edited_result_is_kept(study: Path, archived: Path, tmp_path: Path) -> None:
+    """--force replaces it; afterwards a run replaces its own result again."""
+    file = tmp_path / "run.csv"
+    words = ("simulate", study, archived, "-o", file)
+    assert run(*words).exit_code == 0
+    first = file.read_bytes()
+
+    file.write_text("edited", encoding="utf-8")
+    misused(run(*words), f"{file}: changed after mjfim wrote it", "--force")
+    assert file.read_text(encoding="utf-8") == "edited"
+
+    for force in (("--force",), ()):
+        assert run(*words, *force).exit_code == 0
+        assert file.read_bytes() == first
+
+
+@pytest.mark.parametrize("verb", ["design", "identify", "montecarlo", "check"])
+def test_a_folder_of_an_older_version_is_kept(
+    verb: str, study: Path, archived: Path, recorded: Path, tmp_path: Path
+) -> None:
+    """There is no manifest in it. The message comes before the work, and names --force."""
+    file = {"design": "limits.png", "identify": "fit.png"}.get(verb, f"{verb}.npz")
+    inputs = {"identify": [recorded], "montecarlo": [archived]}.get(verb, [])
+    (tmp_path / file).write_text("old", encoding="utf-8")
+    result = run(verb, study, *inputs, "-o", tmp_path)
+    misused(result, f"{tmp_path / file}: not listed", "older version", "--force")
+    assert contents(tmp_path) == {file: b"old"}
+
+
+def test_a_second_run_does_not_enter_the_folder_of_the_first(study: Path, tmp_path: Path) -> None:
+    """Exit code 2; the message names the folder and the process."""
+    lock = FileLock(tmp_path / FOLDER_LOCK)
+    assert lock.acquire()
+    result = run("design", study, "-o", tmp_path)
+    misused(result, f"{tmp_path}: another run of mjfim writes", f"process {os.getpid()}, since")
+    lock.release()
+    assert names(tmp_path) == set()
+
+
+def test_every_file_of_a_verb_is_checked_before_the_work(
+    home: Path, identified: object, recorded: Path
+) -> None:
+    """The lists with which verbs check hold all names that they write."""
+    assert names(home / "out") - {MANIFEST} <= set(folders.DESIGN_FILES)
+    assert names(home / "fit") - {MANIFEST} == set(folders.estimate_files(1))
+    assert set(folders.study_files(["m", "l", "c"])) >= {"histogram_m.png", "montecarlo.json"}

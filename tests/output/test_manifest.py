@@ -1,0 +1,175 @@
+"""Manifests of folders, the rule for existing files, and locks."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from mjfim.atomic_io import remove_earlier_result, replacing
+from mjfim.errors import OutputError
+from mjfim.output.file_lock import FileLock
+from mjfim.output.manifest import (
+    FOLDER_LOCK,
+    MANIFEST,
+    Manifest,
+    Origin,
+    OutputGuard,
+    claimed,
+)
+
+
+def write(path: Path, text: str, *inputs: Path, force: bool = False) -> None:
+    """Write a result as a run with these inputs does."""
+    guard = OutputGuard(inputs, force=force)
+    guard.check([path])
+    with claimed(path.parent, guard, exclusive=True), replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def test_a_result_is_replaced_until_the_user_edits_it(tmp_path: Path) -> None:
+    """After an edit it is the user's; --force makes it a result again."""
+    file = tmp_path / "out" / "a.txt"
+    write(file, "first")
+    write(file, "second")
+
+    file.write_text("edited", encoding="utf-8")
+    with pytest.raises(OutputError, match=r"a\.txt: changed after mjfim wrote it; .*--force"):
+        write(file, "third")
+    assert file.read_text(encoding="utf-8") == "edited"
+
+    write(file, "third", force=True)
+    write(file, "fourth")
+    assert file.read_text(encoding="utf-8") == "fourth"
+
+
+def test_files_that_are_not_listed_are_the_users(tmp_path: Path) -> None:
+    """The message lists them, and names --force; without a manifest and with a damaged one."""
+    files = [tmp_path / f"{i}.txt" for i in range(8)]
+    for file in files:
+        file.write_text("mine", encoding="utf-8")
+
+    for manifest in ("", "{", "[]", '{"files": 3}', '{"files": {"0.txt": [{"size": "x"}]}}'):
+        if manifest:
+            (tmp_path / MANIFEST).write_text(manifest, encoding="utf-8")
+        with pytest.raises(OutputError, match=r"0\.txt, 1.*4\.txt and 3 more: not listed.*--force"):
+            OutputGuard([], force=False).check(files)
+    OutputGuard([], force=True).check(files)
+
+
+@pytest.mark.parametrize("link", ["same", "symlink", "hardlink", "spelling"])
+def test_an_input_is_never_replaced(link: str, tmp_path: Path) -> None:
+    """Neither with --force nor under another name of the same file."""
+    source = tmp_path / "source.txt"
+    source.write_text("mine", encoding="utf-8")
+    target = {"same": source, "spelling": tmp_path / "x" / ".." / "source.txt"}.get(
+        link, tmp_path / "result.txt"
+    )
+    (tmp_path / "x").mkdir()
+    if link == "symlink":
+        target.symlink_to(source)
+    if link == "hardlink":
+        os.link(source, target)
+
+    for force in (False, True):
+        with pytest.raises(OutputError, match=r"would replace .*source\.txt, which is an input"):
+            write(target, "new", source, force=force)
+    assert source.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_file_that_appears_during_the_run_is_kept(tmp_path: Path) -> None:
+    guard = OutputGuard([], force=False)
+    guard.check([tmp_path / "a.txt"])
+    (tmp_path / "a.txt").write_text("mine", encoding="utf-8")
+    with (
+        claimed(tmp_path, guard, exclusive=True),
+        pytest.raises(OutputError, match="not listed"),
+        replacing(tmp_path / "a.txt"),
+    ):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "mine"
+
+
+def test_only_earlier_results_are_removed(tmp_path: Path) -> None:
+    """Neither the user's files, nor inputs, nor anything without a rule."""
+    for name in ("result", "changed", "input"):
+        write(tmp_path / name, "text")
+    (tmp_path / "changed").write_text("mine", encoding="utf-8")
+    (tmp_path / "unknown").write_text("mine", encoding="utf-8")
+
+    remove_earlier_result(tmp_path / "result")
+    assert (tmp_path / "result").exists()
+
+    guard = OutputGuard([tmp_path / "input"], force=True)
+    with claimed(tmp_path, guard, exclusive=True):
+        for name in ("result", "changed", "input", "unknown"):
+            remove_earlier_result(tmp_path / name)
+    assert {path.name for path in tmp_path.iterdir()} == {MANIFEST, "changed", "input", "unknown"}
+
+
+def test_a_run_that_is_killed_while_it_writes_leaves_no_strange_file(tmp_path: Path) -> None:
+    """Between the entry and the new file, the old file is still known; afterwards the new one."""
+    file, new = tmp_path / "a.txt", tmp_path / "new"
+    write(file, "old")
+    new.write_text("new", encoding="utf-8")
+    manifest = Manifest(tmp_path)
+    manifest.enter("a.txt", new)
+    assert manifest.origin(file) is Origin.WRITTEN_HERE
+
+    new.replace(file)
+    assert manifest.origin(file) is Origin.WRITTEN_HERE
+
+
+def test_the_manifest_has_one_entry_per_file(tmp_path: Path) -> None:
+    """Runs of several verbs keep each other's entries; no temporary file and no lock remains."""
+    for name in ("a.txt", "b.txt", "a.txt"):
+        write(tmp_path / name, name)
+    files = json.loads((tmp_path / MANIFEST).read_text(encoding="utf-8"))["files"]
+    assert {name: [entry["size"] for entry in entries] for name, entries in files.items()} == {
+        "a.txt": [5],
+        "b.txt": [5],
+    }
+    assert {path.name for path in tmp_path.iterdir()} == {MANIFEST, "a.txt", "b.txt"}
+
+
+def test_a_second_run_is_kept_out_of_a_folder(tmp_path: Path) -> None:
+    """The message names the folder and the process; the first run is not disturbed."""
+    guard, folder = OutputGuard([], force=True), tmp_path / "out"
+    said = rf"out: another run .*process {os.getpid()}, since 20\d\d-"
+    with claimed(folder, guard, exclusive=True):
+        for _ in range(2):
+            with (
+                pytest.raises(OutputError, match=said),
+                claimed(folder, guard, exclusive=True),
+            ):
+                pass
+        assert (folder / FOLDER_LOCK).is_file()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_lock_of_a_killed_run_is_taken_over(tmp_path: Path) -> None:
+    """Its file remains, but the operating system has given the lock back."""
+    (tmp_path / FOLDER_LOCK).write_text('{"pid": 1, "started": "2026-01-01"}', encoding="utf-8")
+    lock = FileLock(tmp_path / FOLDER_LOCK)
+    assert lock.acquire()
+    assert lock.holder().startswith(f"process {os.getpid()}, since ")
+    lock.release()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_file_without_a_holder_is_described(tmp_path: Path) -> None:
+    for text in ("", "{", "[1]", '{"pid": null, "started": 1}'):
+        (tmp_path / "lock").write_text(text, encoding="utf-8")
+        assert FileLock(tmp_path / "lock").holder() == "another process"
+
+
+def test_two_holders_take_turns(tmp_path: Path) -> None:
+    first, second = FileLock(tmp_path / "lock"), FileLock(tmp_path / "lock")
+    assert first.acquire()
+    assert not second.acquire(patience=0.05)
+    first.release()
+    assert second.acquire()
+    second.release()
