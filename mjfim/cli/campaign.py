@@ -63,6 +63,13 @@ def campaign(
             help="Recording of the last design; may be given several times; implies --real.",
         ),
     ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Continue a simulated campaign after its last complete round, with equal --seed.",
+        ),
+    ] = False,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -71,13 +78,15 @@ def campaign(
     Without --real, the robot is simulated at the `true` values. With --real, each call estimates
     the parameters from all recordings so far and writes the design of the next round into
     DIR/round_K/. Then play its design.csv on the robot, and call again with --recordings.
+
+    A simulated campaign that was stopped or killed is continued with --resume.
     """
     stated = with_target_accuracies(mjfim.Experiment.from_file(experiment), wanted)
     run = CampaignRun(output, DesignTask.resolve(stated, threads=threads))
 
     simulated = not (real or recordings)
     if simulated:
-        run.require_new()
+        run.require_simulation(resume=resume)
     names = run.folder.next_files(simulated=simulated)
     claim_folder(output, names, input_files(stated, recordings or []), force=force)
 
@@ -123,12 +132,16 @@ class CampaignRun:
         self._wanted = target_accuracies(task)
         self._estimate: Estimate | None = None
 
-    def require_new(self) -> None:
-        """Check that a simulated campaign can begin.
+    def require_simulation(self, *, resume: bool) -> None:
+        """Check that a simulated campaign can begin, or continue.
+
+        Args:
+            resume: Whether a campaign in the folder is continued.
 
         Raises:
             ExperimentError: No parameter states a true value.
-            RecordingError: The folder holds a campaign already.
+            RecordingError: The folder holds a campaign that is not continued, or one with
+                recordings of a real robot.
         """
         experiment = self.task.experiment
         if all(spec.true is None for spec in experiment.parameters.values()):
@@ -136,10 +149,16 @@ class CampaignRun:
                 f"{experiment.source}: no parameter states a `true` value, which the simulated "
                 "robot needs; state one, or use --real"
             )
-        if self.folder.has_rounds:
+        if self.folder.has_rounds and not resume:
             raise RecordingError(
                 f"{self.folder.path}: this folder holds a campaign already; choose another folder, "
-                "or continue the campaign with --real"
+                "or continue the campaign with --resume, or with --real if its recordings are "
+                "those of a real robot"
+            )
+        if resume and self.folder.has_real_recordings:
+            raise RecordingError(
+                f"{self.folder.path}: the recordings of this campaign are those of a real robot, "
+                "to which --resume would add simulated ones; continue it with --real"
             )
 
     def simulated(self, rounds: int, seed: int) -> Campaign:
@@ -150,13 +169,21 @@ class CampaignRun:
             seed: Seed of the noise of the first round; each further round adds 1.
         """
 
-        def measure(design: Design, number: int) -> Recording:
-            """Write the design of a round, and simulate its recording."""
-            self._write_design(design, number)
+        def record(design: Design, number: int) -> Recording:
+            """Simulate the recording of a round, and write it."""
             system = self.task.system
             recording = simulate_system(system, design.trajectory, seed + number - 1)
             write_recording(self.folder.round(number) / "recording.csv", recording, system)
             return recording
+
+        def measure(design: Design, number: int) -> Recording:
+            """Write the design of a round, and simulate its recording."""
+            self._write_design(design, number)
+            return record(design, number)
+
+        # The campaign in the folder may have ended between a design and its recording.
+        for number in self.folder.unrecorded_rounds():
+            record(Design.load(self.folder.round(number)), number)
 
         return mjfim.run_campaign(
             self.task.experiment,
@@ -164,6 +191,7 @@ class CampaignRun:
             rounds=rounds,
             threads=self.task.system.threads,
             callback=self._finish_round,
+            done=list(self.folder.recorded_rounds()),
         )
 
     def real(self, rounds: int, files: Sequence[Path]) -> Campaign:

@@ -25,7 +25,7 @@ from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound, Round
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.serialization import write_json
+from mjfim.records.serialization import read_json, write_json
 
 # Files of a campaign beside the folders of its rounds.
 CAMPAIGN_FILES = ("campaign.json", "campaign.npz", "campaign.png", "identified.xml")
@@ -74,6 +74,19 @@ class CampaignFolder:
     def has_rounds(self) -> bool:
         """True where the folder holds a campaign."""
         return any(self.path.glob("round_*"))
+
+    @property
+    def has_real_recordings(self) -> bool:
+        """True where campaign.json says that the recordings are not simulated."""
+        try:
+            return read_json(self.path / "campaign.json").get("simulated") is False
+        except RecordingError:
+            return False
+
+    def unrecorded_rounds(self) -> list[int]:
+        """Numbers of the rounds that have a design, but no recording."""
+        numbers = range(1, self.designed + 1)
+        return [number for number in numbers if not self.recordings(number)]
 
     def next_files(self, *, simulated: bool) -> list[str]:
         """List the files that the next call may write; in the folders of rounds, existing ones.

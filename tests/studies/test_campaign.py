@@ -5,6 +5,7 @@ can be continued.
 from __future__ import annotations
 
 import shutil
+import subprocess
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +24,13 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.identification.residual_tests import is_larger_than_noise
+from mjfim.output.manifest import MANIFEST
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.recording import Recording
 from mjfim.studies import campaign as campaign_module
 from mjfim.studies.redesign import restate_experiment
-from tests.support.cli import read, run
+from tests.support.cli import PROCESS, misused, read, run
 from tests.support.numerics import cart_task
 from tests.support.paths import MODELS
 
@@ -454,5 +456,73 @@ def test_round_by_round_is_the_simulated_campaign(tmp_path: Path) -> None:
         for key in ("theta", "std", "predicted", "designed_at"):
             np.testing.assert_allclose(one[key], other[key], rtol=1e-6)
 
-    assert "--real" in call("-o", together, *wanted, code=2).stderr
+    again = call("-o", together, *wanted, code=2).stderr
+    assert "--real" in again
+    assert "--resume" in again
+    assert "real robot" in call("-o", apart, *wanted, "--resume", code=2).stderr
     assert "wanted" in call("-o", tmp_path / "none", "--real", code=2).stderr
+
+
+def require_equal_rounds(folder: Path, other: Path) -> None:
+    """Assert that the campaigns of two folders have the same rounds."""
+    rounds = [read(place / "campaign.json")["rounds"] for place in (folder, other)]
+    for one, two in zip(*rounds, strict=True):
+        for key in ("theta", "std", "predicted", "designed_at"):
+            np.testing.assert_allclose(one[key], two[key], rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
+def test_a_killed_campaign_is_resumed(tmp_path: Path) -> None:
+    """Its result is that of a campaign that nobody stopped, wherever in a round it was killed."""
+    study = write_study(tmp_path)
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    words = ("campaign", study, "--wanted", 0.0055, "--seed", 5, "-o")
+    assert run(*words, whole).exit_code == 0
+    assert len(read(whole / "campaign.json")["rounds"]) >= 2
+
+    # A process that is killed as soon as its first round is complete.
+    command = [*PROCESS, *map(str, words), str(killed)]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    ) as process:
+        assert process.stderr is not None
+        try:
+            assert any(line.startswith("round 1:") for line in iter(process.stderr.readline, ""))
+        finally:
+            process.kill()
+
+    assert not (killed / "campaign.json").exists()
+    result = run(*words, killed, "--resume")
+    assert result.exit_code == 0, result.stderr
+    require_equal_rounds(killed, whole)
+
+    # What remains of the second round if the campaign is killed at several moments of it.
+    incomplete = {
+        "while-designing": [],
+        "while-writing": ["design.npz", "design.csv"],
+        "before-recording": ["design.npz", "design.csv", "reference.csv", "design.json"],
+    }
+    for name, kept in incomplete.items():
+        folder = tmp_path / name
+        shutil.copytree(whole, folder)
+        for path in (folder / "round_2").iterdir():
+            if path.name not in (*kept, MANIFEST):
+                path.unlink()
+        for number in range(3, 10):
+            shutil.rmtree(folder / f"round_{number}", ignore_errors=True)
+
+        result = run(*words, folder, "--resume")
+        assert result.exit_code == 0, result.stderr
+        require_equal_rounds(folder, whole)
+
+
+def test_a_campaign_is_not_continued_by_mistake(tmp_path: Path) -> None:
+    """The folder holds a round; simulated and real recordings do not mix."""
+    study, folder = write_study(tmp_path), tmp_path / "out"
+    (folder / "round_1").mkdir(parents=True)
+    words = ("campaign", study, "--wanted", 0.1, "-o", folder)
+    misused(run(*words), f"{folder}: this folder holds a campaign already", "--resume", "--real")
+
+    (folder / "campaign.json").write_text('{"simulated": false}', encoding="utf-8")
+    misused(run(*words, "--resume"), f"{folder}: the recordings", "real robot", "--real")
