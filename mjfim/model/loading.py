@@ -11,6 +11,7 @@ import mujoco
 
 from mjfim.errors import ModelError
 from mjfim.model.coordinates import ModelCoordinates
+from mjfim.model.finite_numbers import check_compiled_numbers, check_file_numbers
 
 
 def load_spec(path: Path) -> Any:
@@ -20,10 +21,12 @@ def load_spec(path: Path) -> Any:
         path: The file.
 
     Raises:
-        ModelError: The file is absent, or MuJoCo cannot read it; the message is MuJoCo's.
+        ModelError: The file is absent, holds NaN, or MuJoCo cannot read it; then the message is
+            MuJoCo's.
     """
     if not path.is_file():
         raise ModelError(f"{path}: no such model file")
+    check_file_numbers(path)
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
@@ -71,11 +74,13 @@ class ModelSource:
             spec: The parsed model, where there is one already.
 
         Raises:
-            ModelError: The file is absent, or MuJoCo cannot read or compile it.
+            ModelError: The file is absent, MuJoCo cannot read or compile it, or a number is not
+                finite.
         """
         self.path = path
         self.spec = load_spec(path) if spec is None else spec
         self.model = compile_spec(self.spec, path)
+        check_compiled_numbers(self.model, path)
         self._compiled: dict[frozenset[str] | None, Any] = {}
         self._edited: dict[tuple[frozenset[str] | None, bytes], Any] = {}
 
