@@ -1,0 +1,103 @@
+"""Run the fuzz suite by hand: `python -m tests.fuzz --problems 500 --inputs 1000 --kills 200`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+from mjfim.parallel import cores
+from tests.fuzz.outcome import KINDS, Case, Outcome
+from tests.fuzz.workers import run_cases
+
+
+def cases_of(counts: dict[str, int], seed: int) -> Iterator[Case]:
+    """Cases of every kind with successive seeds.
+
+    Args:
+        counts: Number of cases by kind.
+        seed: First seed.
+    """
+    for kind, count in counts.items():
+        for i in range(count):
+            yield Case(kind=kind, seed=seed + i)
+
+
+def report(outcome: Outcome, verbose: bool) -> None:
+    """Print a case that failed; with `verbose` every case."""
+    if outcome.complaint:
+        known = outcome.known
+        word = f"known failure ({known.reason})" if known else "FAILED"
+        print(f"{word}: --only {outcome.case}: {outcome.description}", flush=True)
+        print("    " + outcome.complaint.replace("\n", "\n    "), flush=True)
+    elif verbose:
+        about = f"{outcome.group}, {outcome.seconds:.1f} s, {outcome.description}"
+        print(f"{outcome.case}: {about}", flush=True)
+
+
+def summarize(outcomes: list[Outcome], seconds: float) -> None:
+    """Print how many cases of each kind ended how, and the seeds of what failed."""
+    print(f"\n{len(outcomes)} cases in {seconds:.0f} s on {cores()} cores")
+    for kind in KINDS:
+        own = [outcome for outcome in outcomes if outcome.case.kind == kind]
+        if not own:
+            continue
+        seeds = [outcome.case.seed for outcome in own]
+        groups = ", ".join(f"{n} {group}" for group, n in Counter(o.group for o in own).items())
+        print(f"{kind}: {len(own)} cases, seeds {min(seeds)} to {max(seeds)}: {groups}")
+
+        failed = [outcome for outcome in own if outcome.complaint]
+        for word, chosen in (
+            ("failed", [outcome for outcome in failed if outcome.known is None]),
+            ("known failures", [outcome for outcome in failed if outcome.known is not None]),
+        ):
+            listed = " ".join(str(outcome.case) for outcome in chosen)
+            print(f"  {word}: {len(chosen)} {listed}".rstrip())
+
+
+def main() -> int:
+    """Run the cases that the command line asks for; exit code 1 if a case failed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    for kind in KINDS:
+        parser.add_argument(f"--{kind}s", type=int, default=0, help=f"number of {kind}s")
+    parser.add_argument("--seed", type=int, default=0, help="first seed of every kind")
+    parser.add_argument("--workers", type=int, default=cores(), help="processes side by side")
+    parser.add_argument(
+        "--seconds", type=float, default=float("inf"), help="no case begins after this time"
+    )
+    parser.add_argument(
+        "--only", type=Case.parse, action="append", metavar="KIND:SEED", help="run this case alone"
+    )
+    parser.add_argument("--here", action="store_true", help="with --only: in this process")
+    parser.add_argument("--verbose", action="store_true", help="print every case")
+    args = parser.parse_args()
+
+    counts = {kind: getattr(args, f"{kind}s") for kind in KINDS}
+    cases = args.only or list(cases_of(counts, args.seed))
+    begin = time.monotonic()
+    outcomes = []
+    found = _here(cases) if args.here else run_cases(cases, args.workers, args.seconds)
+    for outcome in found:
+        report(outcome, args.verbose or args.only is not None)
+        outcomes.append(outcome)
+
+    summarize(outcomes, time.monotonic() - begin)
+    return int(any(outcome.complaint and not outcome.known for outcome in outcomes))
+
+
+def _here(cases: list[Case]) -> Iterator[Outcome]:
+    """Run cases in this process, for a debugger; their files stay."""
+    from tests.fuzz.workers import run_case
+
+    for case in cases:
+        folder = Path(tempfile.mkdtemp(prefix="mjfim-fuzz-"))
+        print(f"{case}: files in {folder}")
+        yield run_case(case, folder)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,664 @@
+"""Bad inputs: a valid study of which one thing is spoiled at random."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+
+Rng = np.random.Generator
+Key = tuple[Any, ...]
+
+# Numbers that no key expects.
+EXTREMES: tuple[Any, ...] = (
+    1e300,
+    -1e300,
+    5e-324,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+    0,
+    -1,
+    -1e-9,
+    1e18,
+    10**18,
+    10**30,
+    -(10**18),
+    1e-300,
+)
+
+# Values of a type that a number does not have.
+WRONG_TYPES: tuple[Any, ...] = ("text", "", "1.0", True, [], [1.0], ["x"], {}, {"x": 1.0})
+
+# Tables whose keys are names that the user or the model chooses.
+TABLES_BY_NAME = ("parameters", "noise", "position", "velocity", "control", "tracking", "columns")
+
+# Tables that the study of the paper does not state, so that their keys are spoiled too.
+FURTHER_TABLES: dict[str, dict[str, Any]] = {
+    "limits": {
+        "position": {"slide": [-2.0, 2.0]},
+        "velocity": 30.0,
+        "control": {"force": [-5.0, 5.0]},
+        "control_rate": 1000.0,
+        "enforce": True,
+    },
+    "boundary": {"start": "given", "end": "free", "position": 0.01, "velocity": 0.02},
+    "fit": {
+        "segments": 0.5,
+        "start": "stated",
+        "loss": "huber",
+        "loss_scale": 3.0,
+        "noise": "stated",
+        "starts": 1,
+        "max_iterations": 10,
+        "bootstrap": 20,
+        "blocks": 0.1,
+        "seed": 0,
+    },
+    "nuisance": {"initial": 0.01, "bias": 0.01, "delay": 0.01},
+    "recording": {"time": "t", "time_unit": "s", "gap": 0.1, "window": [0.0, 0.9]},
+    "robust": {"over": "mean", "samples": 2, "seed": 0},
+}
+
+
+@dataclass(kw_only=True)
+class Call:
+    """A call of the command line.
+
+    Attributes:
+        words: Its words.
+        spoiled: What was spoiled, in words.
+        refused: True if nothing but a refusal (exit code 2) is right.
+        inputs: Names of the files that the call reads, which it must not change.
+    """
+
+    words: list[str]
+    spoiled: str
+    refused: bool = False
+    inputs: list[str] = field(default_factory=list)
+
+
+def toml_of(value: Any) -> str:
+    """A value as TOML, tables inline."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, Mapping):
+        inside = ", ".join(f"{json.dumps(k)} = {toml_of(v)}" for k, v in value.items())
+        return f"{{ {inside} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(toml_of(item) for item in value)}]"
+    return repr(value)
+
+
+def write_toml(path: Path, tables: Mapping[str, Any]) -> None:
+    """Write an experiment file, one line per key of the top level."""
+    lines = [f"{json.dumps(key)} = {toml_of(value)}\n" for key, value in tables.items()]
+    path.write_text("".join(lines), encoding="utf-8")
+
+
+def leaves(value: Any, path: Key = ()) -> list[Key]:
+    """Paths of everything inside a value: tables, items of lists and leaves."""
+    if isinstance(value, dict):
+        items = list(value.items())
+    elif isinstance(value, list):
+        items = list(enumerate(value))
+    else:
+        items = []
+    found = [(*path, key) for key, _ in items]
+    for key, inner in items:
+        found += leaves(inner, (*path, key))
+    return found
+
+
+def at(value: Any, path: Key) -> Any:
+    """The part of a value at a path."""
+    for key in path:
+        value = value[key]
+    return value
+
+
+def pick(rng: Rng, choices: Any) -> Any:
+    """One of several things of any type."""
+    return choices[int(rng.integers(len(choices)))]
+
+
+def spoil_bytes(rng: Rng, content: bytes) -> tuple[bytes, str]:
+    """Spoil the content of a file without a look at what it says."""
+    name = pick(rng, ("cut", "flipped", "empty", "not UTF-8", "NUL", "repeated", "random"))
+    place = int(rng.integers(max(len(content), 1)))
+    flipped = bytearray(content)
+    for i in rng.integers(len(content), size=5).tolist():
+        flipped[i] ^= int(rng.integers(1, 256))
+    results = {
+        "cut": content[:place],
+        "flipped": bytes(flipped),
+        "empty": b"",
+        "not UTF-8": content[:place] + b"\xff\xfe\x80" + content[place:],
+        "NUL": content[:place] + b"\x00" + content[place:],
+        "repeated": content + content,
+        "random": rng.bytes(2000),
+    }
+    return results[name], f"bytes {name}"
+
+
+# The experiment file.
+
+
+def spoiled_experiment(rng: Rng, folder: Path) -> Call:
+    """Spoil the experiment file, and give it to a verb."""
+    file = folder / "study.toml"
+    tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    for name, table in FURTHER_TABLES.items():
+        if rng.random() < 0.4:
+            tables[name] = json.loads(json.dumps(table))
+    write_toml(file, tables)
+
+    if rng.random() < 0.12:
+        content, spoiled = spoil_bytes(rng, file.read_bytes())
+        file.write_bytes(content)
+        refused = False
+    else:
+        spoil = pick(rng, (_remove, _rename, _double, _extreme, _extreme, _retype, _retype, _inflate))
+        spoiled, refused = spoil(rng, tables, file)
+
+    call = _any_verb(rng)
+    call.spoiled = f"experiment: {spoiled}"
+    call.refused = refused
+    return call
+
+
+def _any_verb(rng: Rng) -> Call:
+    """A call of a verb that reads the experiment file."""
+    words = pick(
+        rng,
+        (
+            ["check", "study.toml", "--threads", "1"],
+            ["design", "study.toml", "-o", "out", "--threads", "1"],
+            ["simulate", "study.toml", "design.npz", "-o", "new.csv"],
+            ["simulate", "study.toml", "design.npz", "-o", "new.csv"],
+            ["identify", "study.toml", "run.csv", "-o", "out", "--threads", "1"],
+        ),
+    )
+    return Call(words=list(words), spoiled="")
+
+
+def _numbers(tables: dict[str, Any]) -> list[Key]:
+    """Paths of all numbers."""
+    return [p for p in leaves(tables) if type(at(tables, p)) in (int, float)]
+
+
+def _remove(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
+    """Remove a key."""
+    path = pick(rng, leaves(tables))
+    del at(tables, path[:-1])[path[-1]]
+    write_toml(file, tables)
+    return f"{path} removed", path in (("model",), ("rate",), ("parameters",))
+
+
+def _rename(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
+    """Rename a key."""
+    path = pick(rng, [p for p in leaves(tables) if isinstance(p[-1], str)])
+    table = at(tables, path[:-1])
+    new = pick(rng, (f"{path[-1]}s", path[-1].upper(), "", " ", "ü", "x" * 2000))
+    table[new] = table.pop(path[-1])
+    write_toml(file, tables)
+    by_name = len(path) > 1 and path[-2] in TABLES_BY_NAME
+    return f"{path} renamed to {new[:20]!r}", not by_name and new != path[-1]
+
+
+def _double(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
+    """State a key twice."""
+    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    line = pick(rng, lines)
+    file.write_text("".join([*lines, line]), encoding="utf-8")
+    return f"{line.split(' =')[0]} stated twice", True
+
+
+def _extreme(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
+    """Replace a number by an extreme one."""
+    path, value = pick(rng, _numbers(tables)), pick(rng, EXTREMES)
+    at(tables, path[:-1])[path[-1]] = value
+    write_toml(file, tables)
+    return f"{path} = {value!r}", value != value
+
+
+def _retype(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
+    """Replace a value by one of another type."""
+    path, value = pick(rng, leaves(tables)), pick(rng, WRONG_TYPES)
+    before = at(tables, path)
+    is_number = type(before) in (int, float)
+    at(tables, path[:-1])[path[-1]] = value
+    write_toml(file, tables)
+    return f"{path} = {value!r}", is_number and isinstance(value, str | bool)
+
+
+def _inflate(rng: Rng, tables: dict[str, Any], file: Path) -> tuple[str, bool]:
+    """Replace a value by a huge one."""
+    path = pick(rng, leaves(tables))
+    name, value = pick(
+        rng,
+        (
+            ("a long text", "x" * 100_000),
+            ("a long list", [0.5] * 20_000),
+            ("a deep list", _nested(200)),
+            ("a large table", {f"k{i}": 1.0 for i in range(5000)}),
+        ),
+    )
+    at(tables, path[:-1])[path[-1]] = value
+    write_toml(file, tables)
+    return f"{path} = {name}", False
+
+
+def _nested(depth: int) -> list[Any]:
+    """A list inside a list, and so on."""
+    value: list[Any] = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+# The model.
+
+MODEL_VALUES = (
+    "nan",
+    "inf",
+    "1e300",
+    "-1e300",
+    "5e-324",
+    "0",
+    "-1",
+    "",
+    "text",
+    "1 2 3 4 5 6 7 8 9",
+    "99999999999999999999",
+    "../../x",
+)
+
+# Attributes of the model that take part in its motion.
+MOVING = ("mass", "timestep", "damping", "gravity", "qpos", "diaginertia")
+
+
+def spoiled_model(rng: Rng, folder: Path) -> Call:
+    """Spoil the MJCF."""
+    file = folder / "cart_pendulum.xml"
+    refused = False
+    if rng.random() < 0.2:
+        content, spoiled = spoil_bytes(rng, file.read_bytes())
+        file.write_bytes(content)
+    else:
+        tree = ElementTree.fromstring(file.read_text(encoding="utf-8"))
+        spoil = pick(rng, (_set_attribute, _set_attribute, _set_attribute, _change_element))
+        spoiled, refused = spoil(rng, tree)
+        file.write_bytes(ElementTree.tostring(tree))
+
+    call = _any_verb(rng)
+    call.spoiled = f"model: {spoiled}"
+    call.refused = refused
+    return call
+
+
+def _set_attribute(rng: Rng, tree: ElementTree.Element) -> tuple[str, bool]:
+    """Give an attribute a bad value, or remove it."""
+    element = pick(rng, [e for e in tree.iter() if e.attrib])
+    name = pick(rng, sorted(element.attrib))
+    if rng.random() < 0.15:
+        del element.attrib[name]
+        return f"{element.tag} without {name}", False
+    value = pick(rng, MODEL_VALUES)
+    element.set(name, value)
+    return f"{element.tag} {name}={value!r}", value == "nan" and name in MOVING
+
+
+def _change_element(rng: Rng, tree: ElementTree.Element) -> tuple[str, bool]:
+    """Remove, double, rename or multiply an element, or nest it deeply."""
+    parents = [e for e in tree.iter() if len(e)]
+    parent = pick(rng, parents)
+    child = pick(rng, list(parent))
+    name = pick(rng, ("removed", "doubled", "renamed", "emptied", "nested", "included"))
+    if name == "removed":
+        parent.remove(child)
+    elif name == "doubled":
+        parent.append(child)
+    elif name == "renamed":
+        child.tag = "nonsense"
+    elif name == "emptied":
+        child.clear()
+    elif name == "nested":
+        for _ in range(300):
+            inner = ElementTree.Element(child.tag)
+            inner.append(child)
+            child = inner
+        parent.append(child)
+    else:
+        parent.append(ElementTree.Element("include", {"file": "cart_pendulum.xml"}))
+    return f"{child.tag} {name}", False
+
+
+# Recordings.
+
+
+def spoiled_recording(rng: Rng, folder: Path) -> Call:
+    """Spoil the recording, in one of the formats that are read."""
+    rows = [line.split(",") for line in (folder / "run.csv").read_text("utf-8").splitlines()]
+    rows = [[cell.strip('"') for cell in row] for row in rows]
+    spoil = pick(
+        rng,
+        (_ragged, _bad_cell, _bad_cell, _columns, _columns, _times, _no_rows, _booleans, _bytes),
+    )
+    spoiled, refused = spoil(rng, rows)
+
+    if spoil is _bytes:
+        name = pick(rng, ("log.csv", "log.csv.gz", "log.npz", "log.parquet", "log.json"))
+        content, how = spoil_bytes(rng, _in_format(name, rows))
+        (folder / name).write_bytes(content)
+        spoiled, refused = f"{how}", how in ("bytes empty", "bytes random")
+    else:
+        is_table = len({len(row) for row in rows}) == 1 and len(set(rows[0])) == len(rows[0])
+        names = ("log.csv", "log.csv", "log.csv.gz")
+        name = pick(rng, (*names, "log.npz", "log.parquet", "log.json") if is_table else names)
+        (folder / name).write_bytes(_in_format(name, rows))
+
+    words = ["identify", "study.toml", name, "-o", "out", "--threads", "1"]
+    if spoil is not _bytes and rng.random() < 0.08:
+        words, spoiled, refused = [*words[:2], "run.csv", "run.csv", *words[3:]], "twice", True
+    elif rng.random() < 0.1:
+        words = ["check", "study.toml", name, "--threads", "1"]
+    return Call(words=words, spoiled=f"recording {name}: {spoiled}", refused=refused)
+
+
+def _in_format(name: str, rows: list[list[str]]) -> bytes:
+    """A table in the format of a file name."""
+    text = "\n".join(",".join(row) for row in rows) + "\n"
+    if name.endswith(".csv"):
+        return text.encode()
+    if name.endswith(".gz"):
+        return gzip.compress(text.encode())
+
+    columns = {key: _column([row[i] for row in rows[1:]]) for i, key in enumerate(rows[0])}
+    stream = io.BytesIO()
+    if name.endswith(".npz"):
+        np.savez(stream, **{key or "x": np.array(column) for key, column in columns.items()})
+    elif name.endswith(".parquet"):
+        pyarrow.parquet.write_table(pyarrow.table(columns), stream)
+    else:
+        return json.dumps([dict(zip(rows[0], row, strict=False)) for row in rows[1:]]).encode()
+    return stream.getvalue()
+
+
+def _column(cells: list[str]) -> list[Any]:
+    """Cells as numbers, booleans or text; an empty cell is NaN."""
+    if set(cells) <= {"true", "false"}:
+        return [cell == "true" for cell in cells]
+    try:
+        return [float(cell or "nan") for cell in cells]
+    except ValueError:
+        return cells
+
+
+def _ragged(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    """Make a row longer or shorter."""
+    i = int(rng.integers(1, len(rows)))
+    if rng.random() < 0.5:
+        rows[i].append("1.0")
+    else:
+        rows[i].pop()
+    return f"row {i} has {len(rows[i])} fields", True
+
+
+def _bad_cell(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    """Spoil one field."""
+    i, j = int(rng.integers(1, len(rows))), int(rng.integers(len(rows[0])))
+    values = ("nan", "", "text", "1e300", "-1e300", "inf", "1,5", "1 2", "=1+1", "9" * 5000)
+    rows[i][j] = pick(rng, values)
+    refused = rows[i][j] in ("text", "1 2", "=1+1")
+    return f"row {i}, column {rows[0][j]}: {rows[i][j][:20]!r}", refused
+
+
+def _columns(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    """Remove, double, rename or swap columns."""
+    j = int(rng.integers(len(rows[0])))
+    title = rows[0][j]
+    name = pick(rng, ("removed", "doubled", "renamed", "emptied", "unnamed", "many"))
+    for i, row in enumerate(rows):
+        if name == "removed":
+            del row[j]
+        elif name == "doubled":
+            row.append(row[j])
+        elif name == "emptied" and i:
+            row[j] = ""
+        elif name == "many":
+            row += [f"c{k}" if i == 0 else "0.0" for k in range(2000)]
+    if name == "renamed":
+        rows[0][j] = "nonsense"
+    elif name == "unnamed":
+        rows[0][j] = ""
+    necessary = title == "t" or title.startswith("ctrl:")
+    refused = name == "doubled" or (name in ("removed", "renamed", "unnamed") and necessary)
+    return f"column {title} {name}", refused
+
+
+def _times(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    """Spoil the times."""
+    name = pick(rng, ("shuffled", "equal", "reversed", "negative", "huge", "a gap", "text", "tiny"))
+    times = [float(row[0]) for row in rows[1:]]
+    changed: dict[str, Callable[[], list[Any]]] = {
+        "shuffled": lambda: rng.permutation(times).tolist(),
+        "equal": lambda: [1.0] * len(times),
+        "reversed": lambda: times[::-1],
+        "negative": lambda: [-t for t in times],
+        "huge": lambda: [1e300 * t for t in times],
+        "a gap": lambda: [t + 100.0 * (t > 0.5) for t in times],
+        "text": lambda: [f"12:00:{t}" for t in times],
+        "tiny": lambda: [5e-324 * k for k in range(len(times))],
+    }
+    for row, value in zip(rows[1:], changed[name](), strict=True):
+        row[0] = str(value)
+    return f"times {name}", name in ("equal", "text")
+
+
+def _no_rows(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    """Keep few rows."""
+    count = int(rng.integers(0, 4))
+    del rows[1 + count :]
+    return f"{count} rows", count < 2
+
+
+def _booleans(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    """Make a column one of truth values."""
+    j = int(rng.integers(1, len(rows[0])))
+    for row in rows[1:]:
+        row[j] = str(bool(rng.random() < 0.5)).lower()
+    return f"column {rows[0][j]} of truth values", True
+
+
+def _bytes(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
+    """Leave the table alone; the bytes of the file are spoiled."""
+    return "", False
+
+
+# Designs.
+
+
+def spoiled_design(rng: Rng, folder: Path) -> Call:
+    """Spoil the design.npz."""
+    file = folder / "design.npz"
+    if rng.random() < 0.3:
+        content, spoiled = spoil_bytes(rng, file.read_bytes())
+        file.write_bytes(content)
+        refused = spoiled in ("bytes empty", "bytes random")
+    else:
+        spoiled, refused = _spoil_array(rng, file)
+
+    words = pick(
+        rng,
+        (
+            ["simulate", "study.toml", "design.npz", "-o", "new.csv"],
+            ["check", "study.toml", "--design", "design.npz", "--threads", "1"],
+            ["montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2"],
+            ["replay", "design.npz", "--experiment", "study.toml", "--save", "new.rrd"],
+        ),
+    )
+    return Call(words=list(words), spoiled=f"design: {spoiled}", refused=refused)
+
+
+def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
+    """Spoil one array of an npz file."""
+    with np.load(file, allow_pickle=False) as loaded:
+        arrays = {name: loaded[name] for name in loaded.files}
+    name = pick(rng, ["t", "qpos", "qvel", "ctrl", *sorted(arrays)])
+    array = arrays[name]
+    how = pick(
+        rng,
+        ("removed", "shorter", "flat", "NaN", "infinite", "text", "pickle", "equal", "reversed", "npy"),
+    )
+    changes: dict[str, Callable[[], Any]] = {
+        "shorter": lambda: array[:-1] if array.ndim else array,
+        "flat": lambda: array.ravel()[:1],
+        "NaN": lambda: np.full(array.shape, np.nan),
+        "infinite": lambda: np.full(array.shape, np.inf),
+        "text": lambda: np.full(array.shape, "text"),
+        "pickle": lambda: np.array([{"a": 1}], dtype=object),
+        "equal": lambda: np.zeros(array.shape),
+        "reversed": lambda: array[::-1] if array.ndim else array,
+    }
+    if how == "npy":
+        with file.open("wb") as stream:
+            np.save(stream, np.zeros(3))
+        return "npy under the name npz", True
+    if how == "removed":
+        del arrays[name]
+    else:
+        arrays[name] = changes[how]()
+    np.savez(file, **arrays)
+
+    necessary = name in ("t", "qpos", "ctrl")
+    always = ("removed", "shorter", "flat", "NaN", "infinite", "text", "pickle")
+    refused = necessary and (how in always or (name == "t" and how in ("equal", "reversed")))
+    return f"array {name} {how}", refused
+
+
+# Output folders and options.
+
+
+def spoiled_output(rng: Rng, folder: Path) -> Call:
+    """Give a bad or an unusual output folder or file."""
+    (folder / "file").write_text("a file of the user\n", encoding="utf-8")
+    (folder / "locked").mkdir()
+    (folder / "locked").chmod(0o500)
+    place = pick(
+        rng,
+        (
+            "file",
+            "file/below",
+            "study.toml",
+            "design.npz",
+            "cart_pendulum.xml",
+            "run.csv",
+            ".",
+            "",
+            " ",
+            "[bold]x[/bold]",
+            "[/]",
+            "ünïcode/ö",
+            "x" * 300,
+            "a/b/c/d",
+            "/dev/null/x",
+            "/dev/full",
+            "locked/x",
+            "-",
+            "--",
+            "~",
+            "a\nb",
+            "%s{0}",
+        ),
+    )
+    words = pick(
+        rng,
+        (
+            ["simulate", "study.toml", "design.npz", "-o"],
+            ["simulate", "study.toml", "design.npz", "-o"],
+            ["check", "study.toml", "--threads", "1", "-o"],
+            ["identify", "study.toml", "run.csv", "--threads", "1", "-o"],
+            ["replay", "design.npz", "--experiment", "study.toml", "--save"],
+            ["montecarlo", "study.toml", "design.npz", "--trials", "2", "-o"],
+        ),
+    )
+    return Call(words=[*words, place], spoiled=f"output: {place[:30]!r}")
+
+
+OPTION_VALUES = ("-1", "0", "1", "nan", "inf", "1e300", "abc", "", "1.5", "99999999999999999999")
+
+OPTIONS: tuple[tuple[list[str], tuple[str, ...]], ...] = (
+    (["check", "study.toml"], ("--threads", "--design", "--nonsense")),
+    (["design", "study.toml", "-o", "out"], ("--threads", "--starts", "--shortest", "-x")),
+    (["simulate", "study.toml", "design.npz", "-o", "new.csv"], ("--seed", "--rate")),
+    (
+        ["identify", "study.toml", "run.csv", "-o", "out", "--threads", "1"],
+        ("--method", "--held-out", "--starts"),
+    ),
+    (
+        ["montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "2"],
+        ("--measure-rate", "--seed", "--trials"),
+    ),
+    (["compare", "study.toml", "-o", "out", "--seconds", "0.1"], ("--methods", "--seconds")),
+    (["export-sysid", "study.toml", "run.csv", "-o", "out"], ("--nonsense", "--threads")),
+)
+
+# Files that no verb can read.
+PLACES = ("missing.toml", ".", "", "design.npz", "run.csv", "/dev/null", "study.toml/x", "x" * 5000)
+
+
+def spoiled_options(rng: Rng, folder: Path) -> Call:
+    """Give a bad value of an option, a bad file, or too few or too many words."""
+    verb, options = pick(rng, OPTIONS)
+    words = list(verb)
+    how = pick(rng, ("option", "option", "file", "dropped", "further"))
+    if how == "option":
+        words += [pick(rng, options), pick(rng, OPTION_VALUES)]
+    elif how == "file":
+        files = [i for i in range(1, len(words)) if "." in words[i]]
+        words[pick(rng, files)] = pick(rng, PLACES)
+    elif how == "dropped":
+        del words[int(rng.integers(len(words)))]
+    else:
+        words.append(pick(rng, ("study.toml", "", "-", "--", "--json=1")))
+    listed = " ".join(repr(word[:30]) for word in words)
+    return Call(words=words, spoiled=f"options: {listed}", refused=how == "dropped")
+
+
+# What is spoiled, with the share of the cases.
+SPOILERS: tuple[tuple[Callable[[Rng, Path], Call], float], ...] = (
+    (spoiled_experiment, 0.35),
+    (spoiled_model, 0.18),
+    (spoiled_recording, 0.22),
+    (spoiled_design, 0.12),
+    (spoiled_output, 0.06),
+    (spoiled_options, 0.07),
+)
+
+
+def bad_input(rng: Rng, folder: Path) -> Call:
+    """Spoil one thing of the valid study in a folder.
+
+    Args:
+        rng: Random numbers.
+        folder: Folder with the files of the study; one of them is changed.
+
+    Returns:
+        The call that has to cope with it.
+    """
+    shares = [share for _, share in SPOILERS]
+    spoiler = SPOILERS[int(rng.choice(len(SPOILERS), p=shares))][0]
+    return spoiler(rng, folder)

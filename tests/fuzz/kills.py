@@ -1,0 +1,1 @@
+def run(case, folder): raise NotImplementedError

@@ -1,0 +1,93 @@
+"""One case of the fuzz suite, its outcome, and the failures that are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
+KINDS = ("problem", "input", "kill")
+
+# Time after which a case has failed [s]. It includes the time that a busy machine takes from it.
+TIME_LIMITS = {"problem": 180.0, "input": 60.0, "kill": 180.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A case that can be run alone.
+
+    Attributes:
+        kind: "problem", "input" or "kill".
+        seed: Seed of everything that is random in it.
+    """
+
+    kind: str
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.kind}:{self.seed}"
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """The random numbers of this case."""
+        return np.random.default_rng([KINDS.index(self.kind), self.seed])
+
+    @staticmethod
+    def parse(text: str) -> Case:
+        """Read a case as it is printed, KIND:SEED."""
+        kind, _, seed = text.partition(":")
+        if kind not in KINDS or not seed.isdecimal():
+            raise ValueError(f"{text}: a case is KIND:SEED with a kind of {', '.join(KINDS)}")
+        return Case(kind=kind, seed=int(seed))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What became of a case.
+
+    Attributes:
+        case: The case.
+        group: How it ended, for the counts: "claimed", "refused", "exit 2", ...
+        description: What was random in it, in words.
+        complaint: What is wrong; empty where all is well.
+        seconds: Duration [s].
+    """
+
+    case: Case
+    group: str
+    description: str
+    complaint: str = ""
+    seconds: float = 0.0
+
+    @property
+    def known(self) -> KnownFailure | None:
+        """The known failure that this one is; None for new failures and where all is well."""
+        fitting = (known for known in KNOWN_FAILURES if known.fits(self))
+        return next(fitting, None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownFailure:
+    """A failure that is known and not mended yet.
+
+    Attributes:
+        kind: Kind of the cases that show it.
+        description: Part of the description of these cases.
+        complaint: Part of the complaint.
+        reason: Why it is not mended yet.
+    """
+
+    kind: str
+    description: str
+    complaint: str
+    reason: str
+
+    def fits(self, outcome: Outcome) -> bool:
+        """True if an outcome is this failure."""
+        is_place = outcome.case.kind == self.kind and self.description in outcome.description
+        return bool(outcome.complaint) and is_place and self.complaint in outcome.complaint
+
+
+# Failures that are reported, but do not make the suite fail.
+KNOWN_FAILURES: tuple[KnownFailure, ...] = ()

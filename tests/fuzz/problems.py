@@ -1,0 +1,193 @@
+"""Random design problems under hard limits: what a design claims is judged by plain MuJoCo."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+import mjfim
+from mjfim.errors import MjfimError
+from mjfim.experiment.system import System
+from mjfim.output.archive import write_design
+from tests.fuzz.outcome import Case, Outcome
+from tests.fuzz.plants import Plant, Range, Rng, about_zero, random_plant
+from tests.fuzz.player import ROUNDING, ROUNDING_WITH_FEEDBACK, play, read_rows
+from tests.fuzz.workers import announce
+
+# Time of one design [s]; the iterations end most of them before.
+SECONDS = 15.0
+
+
+def run(case: Case, folder: Path) -> Outcome:
+    """Design an experiment for a random problem, and judge what the design claims."""
+    rng = case.rng
+    plant = random_plant(rng)
+    tables = random_tables(rng, plant)
+    description = describe(plant, tables)
+    announce(description)
+
+    (folder / "plant.xml").write_text(plant.xml, encoding="utf-8")
+    try:
+        experiment = mjfim.Experiment(**tables, directory=folder, source=str(folder / "fuzz.toml"))
+        design = mjfim.design(experiment, threads=1)
+    except MjfimError as error:
+        text = str(error)
+        complaint = "" if text.strip() else "the message of the refusal is empty"
+        return Outcome(
+            case=case, group="refused", description=f"{description}; {text}", complaint=complaint
+        )
+
+    # Without a design inside the limits nothing is claimed, but a limit has to be named.
+    if not design.within_limits:
+        return Outcome(case=case, group="infeasible", description=description)
+
+    system = System.resolve(experiment, threads=1)
+    write_design(folder, design, system)
+    complaint = "; ".join(violations(plant, tables, folder))
+    return Outcome(case=case, group="claimed", description=description, complaint=complaint)
+
+
+def violations(plant: Plant, tables: dict[str, Any], folder: Path) -> list[str]:
+    """Play design.csv of a folder with and without feedback, and describe what is violated."""
+    model = mujoco.MjModel.from_xml_path(str(folder / "plant.xml"))
+    rows = read_rows(folder / "design.csv")
+    ranges = all_ranges(plant, tables)
+    sample = 1.0 / tables["rate"]
+
+    found = play(model, rows, ranges, sample).sentences(ROUNDING)
+    with_feedback = play(model, rows, ranges, sample, feedback=True)
+    found += [f"with gains: {text}" for text in with_feedback.sentences(ROUNDING_WITH_FEEDBACK)]
+    return found
+
+
+def all_ranges(plant: Plant, tables: dict[str, Any]) -> dict[tuple[str, str], Range]:
+    """Range of every limit by kind and name: where MJCF and file state one, both hold."""
+    ranges = dict(plant.ranges)
+    for kind, stated in tables["limits"].items():
+        if kind == "bandwidth":
+            continue
+        for name, value in stated.items():
+            low, high = value if isinstance(value, tuple) else (-value, value)
+            lower, upper = ranges.get((kind, name), (-np.inf, np.inf))
+            ranges[kind, name] = (max(low, lower), min(high, upper))
+
+    boundary = tables["boundary"]
+    if boundary.get("end", "free") != "free":
+        for joint in plant.joints:
+            for kind in ("position", "velocity"):
+                ranges[f"end_{kind}", joint.name] = (-boundary[kind], boundary[kind])
+    return ranges
+
+
+def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
+    """Tables of a random experiment file for a plant."""
+    substeps = int(rng.choice([1, 2, 4, 5]))
+    sample = substeps * plant.timestep
+    samples = int(rng.integers(20, 60))
+    horizon = samples * sample
+
+    targets = [f"body/link{i}:mass" for i in range(len(plant.joints))]
+    targets += [
+        f"joint/{joint.name}:damping"
+        for joint in plant.joints
+        if float(joint.attributes["damping"]) > 0.0
+    ]
+    count = min(int(rng.integers(1, 4)), len(targets))
+    chosen = rng.choice(targets, count, replace=False).tolist()
+    tables: dict[str, Any] = {
+        "model": "plant.xml",
+        "rate": 1.0 / sample,
+        "horizon": horizon,
+        "parameters": {f"p{i}": {"target": target} for i, target in enumerate(chosen)},
+        "noise": {"state": 0.01},
+        "cost": {"control": 0.0, "criterion": str(rng.choice(["E", "A", "D"]))},
+        "limits": _limits(rng, plant, horizon),
+        "boundary": _boundary(rng),
+        "initial": {"control": _control(rng, plant, horizon)},
+        "descent": {
+            "max_iterations": int(rng.integers(3, 16)),
+            "seconds": SECONDS,
+            "starts": int(rng.choice([1, 1, 1, 2])),
+        },
+    }
+
+    # The rate of a control is limited from sample to sample, not from row to row.
+    if substeps > 1 and "control_rate" not in tables["limits"] and rng.random() < 0.3:
+        tables["playback_rate"] = 1.0 / plant.timestep
+    return tables
+
+
+def _limits(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
+    """Random limits; each joint and each actuator states some of them."""
+    limits: dict[str, Any] = {}
+
+    for joint in plant.joints:
+        speed = joint.reach / horizon * rng.uniform(0.5, 5.0)
+        wanted = {
+            "position": about_zero(rng, joint.reach * rng.choice([1.0, 0.3, 0.05]), 0.05),
+            "velocity": speed,
+            "acceleration": speed / horizon * rng.uniform(3.0, 30.0),
+        }
+        _state_some(rng, limits, joint.name, wanted, (0.5, 0.4, 0.3))
+
+    for drive in plant.drives:
+        effort = drive.joint.effort / abs(float(drive.attributes["gear"]))
+        wanted = {
+            "control": about_zero(rng, drive.control),
+            "control_rate": drive.control / horizon * rng.uniform(2.0, 40.0),
+            "force": about_zero(rng, effort),
+        }
+        _state_some(rng, limits, drive.name, wanted, (0.4, 0.3, 0.3))
+
+    if rng.random() < 0.15:
+        limits["bandwidth"] = float(rng.uniform(2.0, 6.0)) / horizon
+    return limits
+
+
+def _state_some(
+    rng: Rng,
+    limits: dict[str, Any],
+    name: str,
+    wanted: dict[str, Any],
+    chances: tuple[float, ...],
+) -> None:
+    """State each limit of a joint or an actuator with a chance."""
+    for (kind, value), chance in zip(wanted.items(), chances, strict=True):
+        if rng.random() < chance:
+            stated = value if isinstance(value, tuple) else float(value)
+            limits.setdefault(kind, {})[name] = stated
+
+
+def _boundary(rng: Rng) -> dict[str, Any]:
+    """A random boundary; most problems state none."""
+    boundary: dict[str, Any] = {"position": 0.01, "velocity": 0.02}
+    if rng.random() < 0.3:
+        boundary["start"] = "rest"
+    end = str(rng.choice(["free", "free", "free", "rest", "periodic"]))
+    return {**boundary, "end": end}
+
+
+def _control(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
+    """A random initial control, small or of the size of the range."""
+    size = float(rng.choice([0.01, 0.1, 0.5]))
+    return {
+        "kind": str(rng.choice(["sine", "chirp", "multisine"])),
+        "amplitude": {drive.name: size * drive.control for drive in plant.drives},
+        "frequency": float(rng.uniform(0.5, 3.0)) / horizon,
+    }
+
+
+def describe(plant: Plant, tables: dict[str, Any]) -> str:
+    """Describe a problem in a line."""
+    joints = ", ".join(joint.kind for joint in plant.joints)
+    drives = ", ".join(drive.tag for drive in plant.drives)
+    limits = ", ".join(sorted({kind for kind, _ in all_ranges(plant, tables)}))
+    boundary = tables["boundary"]
+    ends = f"{boundary.get('start', 'given')} to {boundary['end']}"
+    return (
+        f"{joints}; {drives}; {plant.integrator} {plant.timestep:g} s; gravity "
+        f"{plant.gravity:g}; {ends}; limits on {limits}"
+    )
