@@ -170,7 +170,9 @@ def spoiled_experiment(rng: Rng, folder: Path) -> Call:
         file.write_bytes(content)
         refused = False
     else:
-        spoil = pick(rng, (_remove, _rename, _double, _extreme, _extreme, _retype, _retype, _inflate))
+        spoil = pick(
+            rng, (_remove, _rename, _double, _extreme, _extreme, _retype, _retype, _inflate)
+        )
         spoiled, refused = spoil(rng, tables, file)
 
     call = _any_verb(rng)
@@ -521,7 +523,18 @@ def _spoil_array(rng: Rng, file: Path) -> tuple[str, bool]:
     array = arrays[name]
     how = pick(
         rng,
-        ("removed", "shorter", "flat", "NaN", "infinite", "text", "pickle", "equal", "reversed", "npy"),
+        (
+            "removed",
+            "shorter",
+            "flat",
+            "NaN",
+            "infinite",
+            "text",
+            "pickle",
+            "equal",
+            "reversed",
+            "npy",
+        ),
     )
     changes: dict[str, Callable[[], Any]] = {
         "shorter": lambda: array[:-1] if array.ndim else array,

@@ -19,8 +19,8 @@ from tests.fuzz.bad_inputs import Call, bad_input
 from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
 from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
 from tests.fuzz.workers import announce
-from tests.support.cli import PROCESS, run as run_here
-from tests.support.cli import write_experiment
+from tests.support.cli import PROCESS, write_experiment
+from tests.support.cli import run as run_here
 
 # Share of the calls that run in a new process; the others run in the process of the suite.
 NEW_PROCESS = 0.04
@@ -103,7 +103,9 @@ def in_this_process(call: Call, folder: Path) -> Ending:
         plots.save = save
         os.chdir(home)
 
-    fault = "; ".join(f"{w.category.__name__}: {w.message} ({w.filename}:{w.lineno})" for w in warned)
+    fault = "; ".join(
+        f"{w.category.__name__}: {w.message} ({w.filename}:{w.lineno})" for w in warned
+    )
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         lines = traceback.format_exception(result.exception)
         fault = "Traceback: " + "".join(lines[-5:]).strip()
@@ -141,7 +143,7 @@ def judge(call: Call, ending: Ending) -> list[str]:
     if found:
         return found
 
-    if ending.code and not errors:
+    if ending.code == 1 and not errors:
         found.append(f"exit code {ending.code} without a message")
     if ending.code == 2:
         found += _judge_refusal(errors)
@@ -153,7 +155,7 @@ def judge(call: Call, ending: Ending) -> list[str]:
 def _judge_refusal(errors: str) -> list[str]:
     """Describe what is wrong with the message of a refusal."""
     own = re.findall(r"^mjfim: ", errors, flags=re.MULTILINE)
-    is_usage = "Usage:" in errors
+    is_usage = "Usage:" in errors or "─ Error ─" in errors
     if len(own) + is_usage != 1:
         return [f"{len(own)} messages: {errors[:300]}"]
     if len(errors) > LONGEST_MESSAGE and not is_usage:

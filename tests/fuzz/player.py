@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import mujoco
@@ -90,10 +91,12 @@ def play(
     data.qpos[:], data.qvel[:], data.act[:] = np.split(first, [model.nq, model.nq + model.nv])
     before: np.ndarray | None = None
 
-    for row, following in zip(rows[:-1], rows[1:], strict=True):
+    for row, following in pairwise(rows):
         ctrl = np.array([row[name] for name in controls])
         if feedback:
-            ctrl += _feedback(row, drives, columns, np.concatenate([data.qpos, data.qvel, data.act]))
+            ctrl += _feedback(
+                row, drives, columns, np.concatenate([data.qpos, data.qvel, data.act])
+            )
         for i, name in enumerate(drives):
             excess.see("control", name, float(ctrl[i]))
             if before is not None:

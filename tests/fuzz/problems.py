@@ -105,7 +105,7 @@ def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
         "noise": {"state": 0.01},
         "cost": {"control": 0.0, "criterion": str(rng.choice(["E", "A", "D"]))},
         "limits": _limits(rng, plant, horizon),
-        "boundary": _boundary(rng),
+        "boundary": _boundary(rng, plant),
         "initial": {"control": _control(rng, plant, horizon)},
         "descent": {
             "max_iterations": int(rng.integers(3, 16)),
@@ -161,9 +161,14 @@ def _state_some(
             limits.setdefault(kind, {})[name] = stated
 
 
-def _boundary(rng: Rng) -> dict[str, Any]:
+def _boundary(rng: Rng, plant: Plant) -> dict[str, Any]:
     """A random boundary; most problems state none."""
     boundary: dict[str, Any] = {"position": 0.01, "velocity": 0.02}
+
+    # Joints that fall and have no drive cannot stand still: most of such problems are refused.
+    can_rest = plant.gravity == 0.0 or len(plant.drives) == len(plant.joints)
+    if not can_rest and rng.random() < 0.9:
+        return boundary
     if rng.random() < 0.3:
         boundary["start"] = "rest"
     end = str(rng.choice(["free", "free", "free", "rest", "periodic"]))
@@ -186,7 +191,7 @@ def describe(plant: Plant, tables: dict[str, Any]) -> str:
     drives = ", ".join(drive.tag for drive in plant.drives)
     limits = ", ".join(sorted({kind for kind, _ in all_ranges(plant, tables)}))
     boundary = tables["boundary"]
-    ends = f"{boundary.get('start', 'given')} to {boundary['end']}"
+    ends = f"{boundary.get('start', 'given')} to {boundary.get('end', 'free')}"
     return (
         f"{joints}; {drives}; {plant.integrator} {plant.timestep:g} s; gravity "
         f"{plant.gravity:g}; {ends}; limits on {limits}"

@@ -33,7 +33,7 @@ def _json(path: Path) -> None:
 
 def _npz(path: Path) -> None:
     """Read every array of an npz file."""
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
         for name in file.files:
             _ = file[name]
 

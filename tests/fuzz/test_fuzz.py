@@ -1,0 +1,211 @@
+"""The fuzz suite for some seconds of each kind, and tests that it would notice what it looks for."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from tests.fuzz import bad_inputs, inputs
+from tests.fuzz.inputs import Ending
+from tests.fuzz.outcome import Case, KnownFailure, Outcome
+from tests.fuzz.plants import random_plant
+from tests.fuzz.player import ROUNDING, play
+from tests.fuzz.problems import random_tables
+from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
+from tests.fuzz.workers import run_cases
+
+# Time of each kind in these tests [s]; no case begins later.
+SECONDS = {"problem": 20.0, "input": 25.0, "kill": 35.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SECONDS)
+def test_random_cases(kind: str) -> None:
+    """All cases end well, from seed 0 on; the message has the words that replay a failed one."""
+    cases = (Case(kind=kind, seed=seed) for seed in range(1000))
+    outcomes = list(run_cases(cases, workers=1, seconds=SECONDS[kind]))
+    failed = [o for o in outcomes if o.complaint and not o.known]
+    replay = [f"python -m tests.fuzz --only {o.case}: {o.complaint}" for o in failed]
+    assert len(outcomes) > 0
+    assert replay == []
+
+
+def test_a_case_is_read_as_it_is_printed() -> None:
+    case = Case(kind="input", seed=17)
+    assert Case.parse(str(case)) == case
+    for text in ("input", "nonsense:1", "input:-1", "input:x"):
+        with pytest.raises(ValueError, match="a case is KIND:SEED"):
+            Case.parse(text)
+
+
+def test_a_seed_gives_the_same_problem() -> None:
+    case = Case(kind="problem", seed=3)
+    first, second = case.rng, case.rng
+    plants = random_plant(first), random_plant(second)
+    assert plants[0].xml == plants[1].xml
+    assert random_tables(first, plants[0]) == random_tables(second, plants[1])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_random_plants_compile_with_their_ranges(seed: int) -> None:
+    plant = random_plant(np.random.default_rng(seed))
+    model = mujoco.MjModel.from_xml_string(plant.xml)
+    assert (model.njnt, model.nu) == (len(plant.joints), len(plant.drives))
+    for (kind, name), bounds in plant.ranges.items():
+        if kind == "position":
+            assert tuple(model.joint(name).range) == bounds
+        if kind == "control":
+            assert tuple(model.actuator(name).ctrlrange) == bounds
+
+
+# A mass of 1 kg on a slide, driven by a motor.
+MASS = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
+<joint name="slide" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body></worldbody>
+<actuator><motor name="motor" joint="slide"/></actuator></mujoco>"""
+
+# Largest values when a force of 2 N acts for 0.1 s and then -2 N for 0.1 s, by Euler's method: the
+# velocity reaches 0.2 m/s.
+LARGEST = {
+    ("velocity", "slide"): 0.2,
+    ("acceleration", "slide"): 2.0,
+    ("control", "motor"): 2.0,
+    ("control_rate", "motor"): 40.0,
+    ("force", "motor"): 2.0,
+    ("joint_force", "slide"): 2.0,
+    ("position", "slide"): 0.02,
+    ("end_position", "slide"): 0.02,
+}
+
+
+@pytest.mark.parametrize("limit", LARGEST)
+@pytest.mark.parametrize("feedback", [False, True])
+def test_the_player_notices_every_kind_of_violation(limit: tuple[str, str], feedback: bool) -> None:
+    """A limit just above the largest value holds; just below it is violated."""
+    model = mujoco.MjModel.from_xml_string(MASS)
+    state = {"qpos:slide": 0.0, "qvel:slide": 0.0}
+    gains = {f"gain:motor:{name}": 0.0 for name in state}
+    controls = (2.0, -2.0, np.nan)
+    rows = [{"t": 0.1 * i, "ctrl:motor": c, **state, **gains} for i, c in enumerate(controls)]
+
+    for factor, is_violated in ((1.001, False), (0.999, True)):
+        bound = factor * LARGEST[limit]
+        found = play(model, rows, {limit: (-bound, bound)}, sample=0.1, feedback=feedback)
+        assert bool(found.sentences(ROUNDING)) is is_violated
+
+
+def test_feedback_is_played() -> None:
+    """With a gain on the position, the control follows the deviation from the planned state."""
+    model = mujoco.MjModel.from_xml_string(MASS)
+    row = {"ctrl:motor": 0.0, "gain:motor:qpos:slide": 3.0, "gain:motor:qvel:slide": 0.0}
+    rows = [
+        {"t": 0.0, "qpos:slide": 0.0, "qvel:slide": 0.0, **row},
+        {"t": 0.1, "qpos:slide": 1.0, "qvel:slide": 0.0, **row},
+        {"t": 0.2, "qpos:slide": 1.0, "qvel:slide": 0.0, **row},
+    ]
+    limit = {("control", "motor"): (-2.9, 2.9)}
+    assert not play(model, rows, limit, sample=0.1).sentences(ROUNDING)
+    assert play(model, rows, limit, sample=0.1, feedback=True).sentences(ROUNDING)
+
+
+def test_a_state_that_is_not_a_number_is_a_violation() -> None:
+    model = mujoco.MjModel.from_xml_string(MASS)
+    first = {"t": 0.0, "ctrl:motor": np.nan, "qpos:slide": 0.0, "qvel:slide": 0.0}
+    limit = {("control", "motor"): (-1.0, 1.0)}
+    assert play(model, [first, {**first, "t": 0.1}], limit, sample=0.1).sentences(ROUNDING)
+
+
+def test_the_toml_of_the_suite_is_read_back() -> None:
+    value = {"a b": [1.0, True, "x\n\"'"], "n": 5e-324, "t": {"k": -3}, "i": float("inf")}
+    text = f"value = {bad_inputs.toml_of(value)}"
+    assert tomllib.loads(text) == {"value": value}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.json", b'{"a": 1'),
+        ("a.json", b'{"a": NaN}'),
+        ("a.npz", b"PK\x03\x04"),
+        ("a.csv", b"a,b\n1,2\n1"),
+        ("a.csv", b""),
+        ("a.png", PIXEL[:-3]),
+        ("a.rrd", b"RRF2"),
+        ("a.xml", b"<mujoco>"),
+    ],
+)
+def test_half_files_are_noticed(name: str, content: bytes, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert len(faults_of(tmp_path / name)) == 1
+
+
+def test_whole_files_are_accepted(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", t=np.zeros(3))
+    for name, content in (
+        ("a.json", b'{"a": null}'),
+        ("a.csv", b"a,b\n1,2\n"),
+        ("a.png", PIXEL),
+        ("a.xml", MASS.encode()),
+    ):
+        (tmp_path / name).write_bytes(content)
+    assert [fault for path in tmp_path.iterdir() for fault in faults_of(path)] == []
+
+
+def test_temporary_files_are_recognised() -> None:
+    assert is_temporary(Path("out/.histogram_m-abcd12_x.png"))
+    assert is_temporary(Path("out/.design-k3j2h1g0.npz"))
+    assert not is_temporary(Path("out/design.npz"))
+    assert not is_temporary(Path("out/.hidden"))
+
+
+@pytest.mark.parametrize(
+    ("ending", "refused", "complaint"),
+    [
+        (Ending(code=2, errors="mjfim: x.toml: rate: should be larger"), True, ""),
+        (Ending(code=2, errors="Usage: mjfim design\nNo such option"), True, ""),
+        (Ending(code=0, errors="wrote out/"), False, ""),
+        (Ending(code=0, errors="wrote out/"), True, "accepted"),
+        (Ending(code=1, errors=""), False, "without a message"),
+        (Ending(code=2, errors=""), False, "0 messages"),
+        (Ending(code=2, errors="mjfim: a\nmjfim: b"), False, "2 messages"),
+        (Ending(code=2, errors="mjfim: " + "x" * 700), False, "long message"),
+        (Ending(code=-6, errors="free(): invalid pointer"), False, "exit code -6"),
+        (Ending(code=1, errors="Traceback (most recent call last)\nKeyError"), False, "KeyError"),
+        (Ending(code=1, errors="x", fault="RuntimeWarning: overflow"), False, "RuntimeWarning"),
+    ],
+)
+def test_bad_endings_are_noticed(ending: Ending, refused: bool, complaint: str) -> None:
+    call = bad_inputs.Call(words=[], spoiled="", refused=refused)
+    found = inputs.judge(call, ending)
+    assert len(found) == (1 if complaint else 0)
+    assert complaint in "".join(found)
+
+
+def test_changed_inputs_and_half_written_results_are_noticed(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_bytes(b"t\n0\n")
+    (tmp_path / "gone.csv").write_bytes(b"t\n0\n")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert inputs.changes(tmp_path, before) == []
+
+    (tmp_path / "run.csv").write_bytes(b"t\n1\n")
+    (tmp_path / "gone.csv").unlink()
+    (tmp_path / ".design-k3j2h1g0.npz").touch()
+    (tmp_path / "design.json").write_bytes(b"{")
+    told = "; ".join(inputs.changes(tmp_path, before))
+    for fragment in ("run.csv of the user was changed", "gone.csv of the user was removed"):
+        assert fragment in told
+    assert "design.json is not whole" in told
+    assert "is a temporary file that stayed" in told
+
+
+def test_a_known_failure_is_known_by_kind_description_and_complaint() -> None:
+    known = KnownFailure(kind="input", description="twice", complaint="accepted", reason="")
+    case = Case(kind="input", seed=0)
+    twice = Outcome(case=case, group="", description="log twice", complaint="accepted: exit 0")
+    assert known.fits(twice)
+    assert not known.fits(Outcome(case=case, group="", description="log twice"))
+    other = Outcome(case=case, group="", description="log", complaint="accepted")
+    assert not known.fits(other)
