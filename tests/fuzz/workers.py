@@ -134,9 +134,9 @@ class Worker:
 
     def stop(self) -> None:
         """End the process and what it has started."""
-        if hasattr(os, "killpg"):
+        if hasattr(os, "killpg") and self._process.pid is not None:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(self._process.pid or 0, signal.SIGKILL)
+                os.killpg(self._process.pid, signal.SIGKILL)
         self._process.kill()
         self._process.join()
         self._connection.close()
