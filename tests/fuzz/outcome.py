@@ -96,13 +96,10 @@ def _known(kind: str, description: str, complaint: str, reason: str) -> KnownFai
 
 # Failures that are reported, but do not make the suite fail. This list must be empty in the end.
 KNOWN_FAILURES: tuple[KnownFailure, ...] = (
-    _known("input", "of truth values", "accepted", "truth values pass as numbers"),
     _known("input", ": twice", "accepted", "the same log counts twice"),
-    _known("input", "output: ", "of the user was", "an output may be an input"),
     _known("input", "output: ", "MarkupError", "square brackets in a folder are taken for markup"),
     _known("input", "", "long message", "messages repeat long names, and every fault of a file"),
     _known("input", "1e300", "RuntimeWarning", "a huge number in a log is not named"),
-    _known("input", "_rate", "OverflowError", "rates that are almost 0"),
     _known("kill", "SIGTERM", "exit code -15", "SIGTERM ends without results"),
     _known("kill", "SIGINT", "exit code -2", "Ctrl-C at start-up or at the end has no message"),
     _known("kill", "", "processes alive", "workers outlive a killed parent"),
