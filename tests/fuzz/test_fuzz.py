@@ -1,4 +1,4 @@
-"""The fuzz suite for some seconds of each kind, and tests that it would notice what it looks for."""
+"""The fuzz suite for some seconds of each kind, and tests that it notices what it looks for."""
 
 from __future__ import annotations
 
