@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar
 
@@ -19,6 +20,15 @@ RENAMED_ARGUMENTS = {
     "report": ("callback", "which is called with one event"),
     "start": ("initial_control", "an (N, nu) array"),
 }
+
+
+# Longest text of the user that a message repeats as it is, and how much it shows of a longer one
+# [characters].
+REPEATED_TEXT = 60
+SHOWN_TEXT = 40
+
+# Longest list of names in a message [characters].
+LISTED_TEXT = 240
 
 
 class MjfimError(Exception):
@@ -66,10 +76,41 @@ def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
     """
     names = sorted(str(v) for v in valid)
 
-    near = get_close_matches(str(name), names, n=1)
+    # A comparison with a very long name takes minutes, and such a name is no misspelling.
+    text = str(name)
+    near = get_close_matches(text, names, n=1) if len(text) <= REPEATED_TEXT else []
     hint = f" (did you mean {near[0]!r}?)" if near else ""
-    listing = ", ".join(names) if names else "none"
-    return f"unknown {kind} {name!r}{hint}; valid: {listing}"
+    return f"unknown {kind} {shortened(repr(name))}{hint}; valid: {listed(names)}"
+
+
+def shortened(text: str) -> str:
+    """Return a text of the user for a message: its beginning and its length if it is very long.
+
+    Args:
+        text: The text.
+    """
+    if len(text) <= REPEATED_TEXT:
+        return text
+    return f"{text[:SHOWN_TEXT]} (the beginning of {len(text)} characters)"
+
+
+def listed(names: Sequence[str]) -> str:
+    """List names for a message; of a long list the beginning and the number of the others.
+
+    Args:
+        names: The names.
+
+    Returns:
+        The names with commas between them; `none` if there are none.
+    """
+    if not names:
+        return "none"
+
+    texts = [shortened(name) for name in names]
+    lengths = itertools.accumulate(len(text) + 2 for text in texts)
+    count = max(1, sum(length <= LISTED_TEXT for length in lengths))
+    further = len(names) - count
+    return ", ".join(texts[:count]) + (f" and {further} more" if further else "")
 
 
 def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

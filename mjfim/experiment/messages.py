@@ -11,10 +11,13 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from mjfim.errors import unknown
+from mjfim.errors import shortened, unknown
 
 # pydantic's names of faults end so if a value has the wrong type or is none of the allowed words.
 WRONG_TYPE = ("_type", "literal_error")
+
+# Length of a message after which further faults are only counted [characters].
+LONG_MESSAGE = 400
 
 
 def explain(
@@ -29,7 +32,7 @@ def explain(
         hidden: Keys that are never suggested, because a file cannot state them.
 
     Returns:
-        One line per fault.
+        One line per fault; of many faults the first ones and the number of the others.
     """
     faults_by_key: dict[str, list[Any]] = {}
 
@@ -45,10 +48,16 @@ def explain(
         if not any(other.startswith(f"{key}.") for other in faults_by_key)
     ]
 
-    return "\n".join(
-        f"{source}: {key or 'experiment'}: {_sentence(faults_by_key[key], table, hidden)}"
-        for key in innermost
-    )
+    lines: list[str] = []
+    for key in innermost:
+        length = sum(len(line) for line in lines)
+        if lines and length > LONG_MESSAGE:
+            lines.append(f"{source}: and {len(innermost) - len(lines)} further faults")
+            break
+
+        place = shortened(key) if key else "experiment"
+        lines.append(f"{source}: {place}: {_sentence(faults_by_key[key], table, hidden)}")
+    return "\n".join(lines)
 
 
 def valid_keys(table: Any, hidden: Sequence[str] = ()) -> list[str]:
@@ -91,7 +100,7 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
     alternatives = [first, *(message.removeprefix("should be ") for message in others)]
 
     given = fault.get("input")
-    shown = f" (got {given!r})" if isinstance(given, (str, int, float, bool)) else ""
+    shown = f" (got {shortened(repr(given))})" if isinstance(given, (str, int, float, bool)) else ""
 
     return " or ".join(alternatives) + shown
 

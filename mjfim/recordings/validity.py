@@ -132,11 +132,12 @@ def _likely_unit(median: float, unit: str) -> str:
         median: Median step, read with the stated unit [s].
         unit: The stated unit.
     """
-    raw = median / SECONDS[unit]
+    # Logarithms neither vanish nor overflow where a step is extremely short or long.
+    typical = float(np.log(median) - np.log(SECONDS[unit]) - np.log(TYPICAL_STEP))
 
     def distance(other: str) -> float:
         """Logarithmic distance from a typical step if the raw step has another unit."""
-        return abs(float(np.log(raw * SECONDS[other] / TYPICAL_STEP)))
+        return abs(typical + float(np.log(SECONDS[other])))
 
     return min(SECONDS, key=distance)
 

@@ -987,6 +987,32 @@ def test_all_faults_at_once(resolve: Callable[[str], DesignTask]) -> None:
     assert {"rate", "noise.state", "cst"} == {line.split(": ")[1] for line in lines}
 
 
+@pytest.mark.parametrize(
+    ("text", "fragments"),
+    [
+        (
+            SHORT + "[limits]\n" + "".join(f"k{i} = 1.0\n" for i in range(5000)),
+            ["limits.k0: unknown key 'k0'; valid: acceleration, bandwidth", "further faults"],
+        ),
+        (SHORT + f"[limits]\n{'x' * 2000} = 1.0\n", ["limits.xxx", "the beginning of 2002 char"]),
+        (
+            edited("rate = 100.0", f"rate = '{'x' * 100_000}'"),
+            ["rate: should be a number", "the beginning of 100002 characters"],
+        ),
+    ],
+    ids=["many faults", "long key", "long value"],
+)
+def test_messages_stay_short(
+    text: str, fragments: list[str], resolve: Callable[[str], DesignTask]
+) -> None:
+    """Long texts of the user are shortened, and of many faults the first ones are described."""
+    with pytest.raises(ExperimentError) as caught:
+        resolve(text)
+    message = str(caught.value)
+    assert len(message.replace(HOME, "")) < 1000
+    assert [fragment for fragment in fragments if fragment not in message] == []
+
+
 ONE_LINE: dict[str, str] = {
     "signal kind": control('{ kind = "noise" }'),
     "signal key": control('{ kind = "sine", amp = 1 }'),
