@@ -320,7 +320,10 @@ def test_faults_outside_the_window_do_not_matter(read: Read) -> None:
         (lambda t: 1e3 * t, r'median step is 5 s, .* should it be recording\.time_unit = "ms"\?'),
         (lambda t: 1e6 * t, r'recording\.time_unit = "us"\?'),
         (lambda t: 1e9 * t, r'recording\.time_unit = "ns"\?'),
-        (lambda t: 5e-324 * np.arange(len(t)), r'median step is 4\.94066e-324 s.*time_unit = "s"\?'),
+        (
+            lambda t: 5e-324 * np.arange(len(t)),
+            r'median step is 4\.94066e-324 s.*time_unit = "s"\?',
+        ),
         (
             lambda t: t + 0.2 * (t > t[99]),
             r"a gap of 0\.205 s after data row 100 \(0\.495 s .*longer than 0\.1 s",
