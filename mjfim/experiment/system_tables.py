@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SkipValidation, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from mjfim.recordings.spec import Finite, Positive, Range, Section
+from mjfim.recordings.spec import Boolean, Finite, Integer, Positive, Range, Section
 
 Matrix = tuple[tuple[Finite, ...], ...]
 PriorOrUnknown = Positive | Literal[True]
@@ -53,8 +53,8 @@ class Signal(Section):
         default=None,
         description="Last frequency of a chirp [Hz]. Default: five times `frequency`.",
     )
-    harmonics: int = Field(default=5, ge=1, description="Number of harmonics of a multisine.")
-    seed: int = Field(
+    harmonics: Integer = Field(default=5, ge=1, description="Number of harmonics of a multisine.")
+    seed: Integer = Field(
         default=0, ge=0, description="Seed of the random phases and weights of a multisine."
     )
 
@@ -200,13 +200,13 @@ class ParameterSpec(Section):
             "Unit that is shown in tables and figures. Default: the unit of the first target."
         ),
     )
-    nuisance: bool = Field(
+    nuisance: Boolean = Field(
         default=False,
         description=(
             "The parameter is unknown and is fitted, but the design does not optimise its accuracy."
         ),
     )
-    per_recording: bool = Field(
+    per_recording: Boolean = Field(
         default=False,
         description=(
             "Each recording has a separate value of this parameter. It needs `nuisance = true`."
@@ -363,7 +363,7 @@ class Nuisance(Section):
     delay: PriorOrUnknown | None = Field(
         default=None, description="Delay of all outputs [s]. Default: none."
     )
-    per_recording: bool = Field(
+    per_recording: Boolean = Field(
         default=False,
         description=(
             "Each recording has a separate bias and a separate delay. The initial states of "

@@ -9,7 +9,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from mjfim.recordings.spec import Finite, NonNegative, Positive, Range, Section
+from mjfim.recordings.spec import (
+    Boolean,
+    Finite,
+    Integer,
+    NonNegative,
+    Positive,
+    Range,
+    Section,
+)
 
 
 class Cost(Section):
@@ -106,10 +114,10 @@ class Robust(Section):
         default="mean",
         description="mean: the mean of the criterion over the samples. worst: its worst value.",
     )
-    samples: int = Field(
+    samples: Integer = Field(
         default=6, ge=2, description="Number of parameter samples, including the guess."
     )
-    seed: int = Field(default=0, ge=0, description="Seed of the samples.")
+    seed: Integer = Field(default=0, ge=0, description="Seed of the samples.")
 
 
 class Descent(Section):
@@ -128,7 +136,7 @@ class Descent(Section):
             "The descent has converged when its slope is at most this number times the cost."
         ),
     )
-    max_iterations: int = Field(
+    max_iterations: Integer = Field(
         default=200, ge=0, description="Largest number of iterations from one initial control."
     )
     seconds: Positive | None = Field(
@@ -141,7 +149,7 @@ class Descent(Section):
             'Weight of the sensitivities in the metric. It applies to `method = "metric"` only.'
         ),
     )
-    starts: int = Field(
+    starts: Integer = Field(
         default=1,
         ge=1,
         description=(
@@ -163,14 +171,14 @@ class Descent(Section):
             "coefficients of each series are optimised first."
         ),
     )
-    repeats: tuple[Annotated[int, Field(ge=2)], ...] = Field(
+    repeats: tuple[Annotated[Integer, Field(ge=2)], ...] = Field(
         default=(),
         description=(
             "Further initial controls under hard limits: for each number n, a design for the n-th "
             "part of the horizon, repeated n times. This is quick for long horizons."
         ),
     )
-    coarse: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
+    coarse: Annotated[Integer, Field(ge=1)] | Literal["auto"] = Field(
         default="auto",
         description=(
             "Factor by which the time step is longer in the first iterations, which makes them "
@@ -178,7 +186,7 @@ class Descent(Section):
             "of the initial control."
         ),
     )
-    seed: int = Field(default=0, ge=0, description="Seed of the random initial controls.")
+    seed: Integer = Field(default=0, ge=0, description="Seed of the random initial controls.")
 
     @model_validator(mode="after")
     def _method_with_metric(self) -> Descent:
@@ -232,7 +240,7 @@ class Limits(Section):
             "bandwidth) s. Default: the control is free at every sample."
         ),
     )
-    enforce: bool = Field(
+    enforce: Boolean = Field(
         default=True,
         description=(
             "true: the design respects the limits. false: it ignores them, and the report says "
@@ -317,7 +325,7 @@ class FitSpec(Section):
             "are estimated from the residuals by iterated reweighting."
         ),
     )
-    starts: int = Field(
+    starts: Integer = Field(
         default=1,
         ge=1,
         description=(
@@ -325,10 +333,10 @@ class FitSpec(Section):
             "bounds and priors. The best fit is kept."
         ),
     )
-    seed: int = Field(
+    seed: Integer = Field(
         default=0, ge=0, description="Seed of the random initial guesses and of the bootstrap."
     )
-    max_iterations: int = Field(
+    max_iterations: Integer = Field(
         default=60, ge=1, description="Largest number of iterations from one initial guess."
     )
     blocks: Positive | None = Field(
@@ -339,6 +347,6 @@ class FitSpec(Section):
             "autocorrelation of the residuals."
         ),
     )
-    bootstrap: int = Field(
+    bootstrap: Integer = Field(
         default=1000, ge=0, description="Number of bootstrap replicates. 0: no bootstrap."
     )

@@ -32,6 +32,8 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True), Usabl
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True), UsableSize]
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True), UsableSize]
 Bound = Annotated[float, Field(strict=True), UsableSize]
+Integer = Annotated[int, Field(strict=True)]
+Boolean = Annotated[bool, Field(strict=True)]
 Range = tuple[Bound, Bound]
 
 
@@ -82,7 +84,7 @@ class ColumnSpec(Section):
             "the column is not a counter."
         ),
     )
-    unwrap: bool = Field(
+    unwrap: Boolean = Field(
         default=False, description="true: jumps of an angle by a whole turn are removed."
     )
     multiply_by: tuple[str, ...] = Field(

@@ -988,6 +988,27 @@ def test_all_faults_at_once(resolve: Callable[[str], DesignTask]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("key", "value", "fragment"),
+    [
+        ("descent.starts", "true", "integer"),
+        ("descent.starts", '"3"', "integer"),
+        ("descent.repeats", "[true]", "integer"),
+        ("descent.coarse", "true", "integer"),
+        ("fit.bootstrap", "10.0", "integer"),
+        ("limits.enforce", "1", "true or false"),
+        ("limits.enforce", '"no"', "true or false"),
+    ],
+)
+def test_integers_and_truth_values_are_not_converted(
+    key: str, value: str, fragment: str, resolve: Callable[[str], DesignTask]
+) -> None:
+    """A number of starts is no truth value and no text, and a truth value is neither 1 nor "no"."""
+    table, _, name = key.partition(".")
+    with pytest.raises(ExperimentError, match=rf"{key}(\.0)?: .*{fragment}"):
+        resolve(f"{SHORT}\n[{table}]\n{name} = {value}\n")
+
+
+@pytest.mark.parametrize(
     ("text", "fragments"),
     [
         (
