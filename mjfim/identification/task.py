@@ -14,6 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.residuals import FitProblem
+from mjfim.identification.same_data import refuse_same_data
 from mjfim.records.recording import Recording
 
 # Method of the search. `least_squares` is Levenberg-Marquardt inside the bounds; `newton` is the
@@ -72,6 +73,7 @@ class FitTask:
             ExperimentError: Something is wrong in the experiment or in the arguments; the message
                 names it.
             ModelError: The model cannot be used.
+            RecordingError: Two recordings hold the same data.
         """
         system = System.resolve(experiment, threads=threads)
         return cls.of(system, recordings, method=method, start=start, held_out=held_out)
@@ -100,6 +102,7 @@ class FitTask:
 
         Raises:
             ExperimentError: Something is wrong in the arguments; the message names it.
+            RecordingError: Two recordings hold the same data.
         """
         if method not in get_args(Method):
             raise ExperimentError(unknown("method", method, get_args(Method)))
@@ -111,6 +114,7 @@ class FitTask:
                 "outputs; remove `correlated`"
             )
 
+        refuse_same_data(recordings, held_out)
         return cls(
             system=system,
             recordings=tuple(recordings),

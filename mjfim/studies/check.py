@@ -18,6 +18,7 @@ from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.residuals import FitProblem
+from mjfim.identification.same_data import refuse_same_data
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability
 from mjfim.information.marginal import shared
@@ -111,6 +112,7 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
 
     See `check`.
     """
+    refuse_same_data(recordings, ())
     fit = FitProblem.of(system, recordings, data_only=True)
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     task = DesignTask.along(system, longest.ctrl[:MAX_TESTED_SAMPLES])

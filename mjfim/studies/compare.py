@@ -173,7 +173,8 @@ def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str
         Keys of the baselines, without the design.
 
     Raises:
-        ExperimentError: A key is unknown, or its method is not applicable.
+        ExperimentError: No baseline is requested, a key is unknown, or its method is not
+            applicable.
     """
     if methods is None:
         return tuple(
@@ -187,7 +188,14 @@ def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str
             raise ExperimentError(
                 f"methods: {key} needs hard limits; {task.experiment.source} enforces none"
             )
-    return tuple(key for key in dict.fromkeys(methods) if key != DESIGN)
+
+    chosen = tuple(key for key in dict.fromkeys(methods) if key != DESIGN)
+    if not chosen:
+        raise ExperimentError(
+            "methods: no baseline is named, so that the design would be compared with nothing; "
+            f"valid: {', '.join(METHODS)}"
+        )
+    return chosen
 
 
 def _identifiable_combinations(task: DesignTask) -> Array | None:

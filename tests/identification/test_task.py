@@ -7,7 +7,7 @@ import pytest
 
 import mjfim
 from mjfim.budget import StopToken
-from mjfim.errors import ExperimentError
+from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_task
 from mjfim.identification.task import FitTask
@@ -128,3 +128,15 @@ def test_variants_of_a_problem_leave_the_problem_unchanged(
 
     assert problem.cost(begin) == cost
     np.testing.assert_array_equal(problem.lower, lower)
+
+
+def test_recordings_that_count_twice_are_refused(
+    experiment: mjfim.Experiment, recording: Recording
+) -> None:
+    """The same data twice, or fitted and predicted."""
+    with pytest.raises(RecordingError, match="log is given twice: it would count twice"):
+        mjfim.identify(experiment, [recording, recording])
+    with pytest.raises(RecordingError, match="log is given twice: a fitted recording"):
+        mjfim.identify(experiment, [recording], held_out=[recording])
+    with pytest.raises(RecordingError, match="log is given twice"):
+        mjfim.check(experiment, recordings=[recording, recording])

@@ -409,6 +409,8 @@ def test_misuse(study: Path, tmp_path: Path) -> None:
     for words, said in (
         ((tmp_path / "no.toml", "-o", tmp_path / "o"), "no.toml"),
         ((study, "-o", tmp_path / "o", "--methods", "chirp,sweep"), "unknown method 'sweep'"),
+        ((study, "-o", tmp_path / "o", "--methods", " , "), "no baseline is named"),
+        ((study, "-o", tmp_path / "o", "--methods", "design"), "no baseline is named"),
         ((study, "-o", tmp_path / "o", "--seconds", 0), "positive"),
         ((study, "-o", study), study.name),
         ((study,), "--output"),
