@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import signal
 import sys
 import threading
@@ -17,7 +18,7 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 import mjfim
-from mjfim.errors import MjfimError, NoResultError
+from mjfim.errors import MjfimError, NoResultError, RecordingError
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.serialization import as_json as records_as_json
 
@@ -29,14 +30,19 @@ app = typer.Typer(
 )
 
 
-# Console for messages and progress.
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
+# Console for messages and progress. Brackets and colons in file names are no markup and no emoji.
+errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 # Width of the lines of results that do not go to a terminal [characters]; tables fit into it.
 FILE_WIDTH = 110
 
 # Console for results.
-out = Console(highlight=False, width=None if sys.stdout.isatty() else FILE_WIDTH)
+out = Console(
+    highlight=False,
+    width=None if sys.stdout.isatty() else FILE_WIDTH,
+    markup=False,
+    emoji=False,
+)
 
 # Number of iterations from one line of progress to the next, for a design and for an estimation,
 # if stderr is not a terminal.
@@ -151,6 +157,16 @@ def raise_on_interrupt(error: Exception) -> Iterator[None]:
         signal.signal(signal.SIGINT, previous)
 
 
+def replace_unencodable_characters() -> None:
+    """Let stdout and stderr write "?" for characters that their encoding does not have.
+
+    Windows consoles, redirected output and some locales are not UTF-8. Files are always UTF-8.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
 @contextmanager
 def writing(folder: Path) -> Iterator[ModuleType]:
     """Create a folder for results, and import the module that writes them.
@@ -189,6 +205,26 @@ def root(
     """Design the experiment that identifies a MuJoCo model's parameters, then identify them."""
 
 
+def _require_utf8_paths(values: Iterable[Any]) -> None:
+    """Refuse paths that libraries cannot open, before the work.
+
+    Args:
+        values: Arguments of a verb; only paths and lists of paths are looked at.
+
+    Raises:
+        RecordingError: A path has characters that are not UTF-8 in the present locale.
+    """
+    for value in values:
+        for path in value if isinstance(value, list) else [value]:
+            try:
+                str(path).encode("utf-8")
+            except UnicodeEncodeError:
+                raise RecordingError(
+                    f"{path}: this path has characters that are not UTF-8 in the present locale; "
+                    "rename it, or set a UTF-8 locale, for example LC_ALL=C.UTF-8"
+                ) from None
+
+
 def verb(function: Callable[..., None]) -> Callable[..., None]:
     """Register a function as a verb, and turn its errors into messages and exit codes.
 
@@ -207,6 +243,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         """Call the verb; print one message and exit for each error."""
         try:
             with _claims, raise_on_interrupt(NoResultError()):
+                _require_utf8_paths([*args, *kwargs.values()])
                 function(*args, **kwargs)
         except NoResultError:
             errors.print("mjfim: interrupted before there was a result; nothing was written")
@@ -318,7 +355,8 @@ def progress(description: str) -> Iterator[ProgressDisplay]:
     Yields:
         The display, which is called with every event.
     """
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    description_column = TextColumn("{task.description}", markup=False)
+    columns = (SpinnerColumn(), description_column, BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         yield ProgressDisplay(bar, description)
 

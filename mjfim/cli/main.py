@@ -20,7 +20,7 @@ from mjfim.cli import (  # noqa: F401 - each registers its verbs
     robustness,
     simulate,
 )
-from mjfim.cli.common import app
+from mjfim.cli.common import app, replace_unencodable_characters
 
 # Verbs in the order in which the help lists them, which is the order of an experiment.
 ORDER = (
@@ -47,5 +47,6 @@ app.registered_commands.sort(key=lambda command: _place(command.name))
 
 def main() -> NoReturn:
     """Run the command line, the entry point of `mjfim`."""
+    replace_unencodable_characters()
     app(prog_name="mjfim")
     sys.exit(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -28,9 +29,22 @@ def load_spec(path: Path) -> Any:
         raise ModelError(f"{path}: no such model file")
     check_file_numbers(path)
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        return mujoco.MjSpec.from_file(_engine_path(path))
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot read the model: {str(error).strip()}") from None
+
+
+def _engine_path(path: Path) -> str:
+    """Return a path as MuJoCo needs it, in UTF-8 whatever the locale is.
+
+    Raises ModelError if the path is not UTF-8.
+    """
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError:
+        raise ModelError(
+            f"{path}: MuJoCo reads only files whose path is UTF-8; rename the file or its folders"
+        ) from None
 
 
 def compile_spec(spec: Any, path: Path) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from rich.console import Group, RenderableType
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -56,18 +55,18 @@ def _rendered(part: Part) -> RenderableType:
 
 def _table(table: SummaryTable) -> Table:
     """Render a table."""
-    rendered = Table(title=escape(table.title), title_justify="left")
+    rendered = Table(title=Text(table.title, style="table.title"), title_justify="left")
     for column in table.columns:
         rendered.add_column(
-            escape(str(column.heading)),
+            Text(str(column.heading)),
             justify="left" if column.left else "right",
             no_wrap=table.unbroken and not column.left,
         )
     for row in table.rows:
-        cells = [escape(str(cell)) for cell in row.cells]
+        cells = [Text(str(cell)) for cell in row.cells]
         rendered.add_row(*cells, style=STYLES[row.emphasis])
 
     if table.note:
-        rendered.caption = escape(table.note)
+        rendered.caption = Text(table.note, style="table.caption")
         rendered.caption_justify = "left"
     return rendered

@@ -1,0 +1,91 @@
+"""File names with brackets, and terminals and locales that are not UTF-8."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mjfim.cli.common import errors, out, replace_unencodable_characters
+from mjfim.output.summary_parts import Row, Summary, SummaryTable, columns
+from mjfim.output.text import render
+from tests.support.cli import PROCESS, loads, misused, run, write_experiment
+from tests.support.paths import ROOT
+
+# Name that a terminal library would take for markup, a closing tag without a begin, and an emoji.
+NAME = "run [bold]1[/] [/red] :smile:"
+
+
+def test_brackets_in_messages(tmp_path: Path) -> None:
+    """A message shows the path of a missing file as it is."""
+    misused(run("check", tmp_path / f"{NAME}.toml"), f"{NAME}.toml: cannot read")
+
+
+def test_brackets_in_the_path_of_results(study: Path, archived: Path, tmp_path: Path) -> None:
+    """The last line of a verb shows the path of the file that was written."""
+    target = tmp_path / NAME / "run.csv"
+    result = run("simulate", study, archived, "-o", target)
+    assert (result.exit_code, result.stderr.strip()) == (0, f"wrote {target}")
+    assert target.is_file()
+
+
+def test_brackets_in_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    """Titles, headings, cells and notes of a table show brackets as they are."""
+    table = SummaryTable(
+        key="t",
+        title="title [/a]",
+        columns=columns("heading [b]"),
+        rows=(Row(cells=(NAME,)),),
+        note="note [/c]",
+    )
+    out.print(render(Summary(title="", outcome="", parts=(table,))))
+    printed = capsys.readouterr().out
+    shown = ("title [/a]", "heading [b]", NAME, "note [/c]")
+    assert [text for text in shown if text not in printed] == []
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252", "latin-1"])
+def test_streams_that_are_not_utf8(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A character that the encoding does not have is printed as a question mark."""
+    stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stderr", stream)
+    replace_unencodable_characters()
+    errors.print("σ of [/é]: λ_min", highlight=False)
+    stream.flush()
+    printed = stream.buffer.getvalue().decode(encoding)
+    assert printed == ("? of [/?]: ?_min\n" if encoding == "ascii" else "? of [/é]: ?_min\n")
+
+
+def test_paths_that_are_not_utf8(tmp_path: Path) -> None:
+    """A path that libraries cannot open is refused before the work."""
+    result = run("check", write_experiment(tmp_path), "-o", tmp_path / "caf\udce9")
+    misused(result, "not UTF-8 in the present locale", "LC_ALL=C.UTF-8")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"PYTHONIOENCODING": "ascii"},
+        {"PYTHONIOENCODING": "cp1252"},
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ],
+    ids=["ascii", "cp1252", "locale-C"],
+)
+def test_processes_that_are_not_utf8(tmp_path: Path, settings: dict[str, str]) -> None:
+    """Results are printed, and the files are UTF-8."""
+    experiment = write_experiment(tmp_path)
+    text = experiment.read_text(encoding="utf-8")
+    experiment.write_text(text.replace("[parameters.m]", '[parameters."µ"]'), encoding="utf-8")
+
+    words = [*PROCESS, "check", experiment, "-o", tmp_path / "out"]
+    environment = {**os.environ, **settings, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, capture_output=True, env=environment, check=False, timeout=120)
+
+    assert (done.returncode, b"Traceback" in done.stderr) == (0, False), done.stderr
+    written = (tmp_path / "out" / "check.json").read_text(encoding="utf-8")
+    assert "µ" in str(loads(written))
