@@ -482,7 +482,8 @@ def _booleans(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:
     j = int(rng.integers(1, len(rows[0])))
     for row in rows[1:]:
         row[j] = str(bool(rng.random() < 0.5)).lower()
-    return f"column {rows[0][j]} of truth values", True
+    # A control may be switched on and off; a measurement is a number.
+    return f"column {rows[0][j]} of truth values", not rows[0][j].startswith("ctrl:")
 
 
 def _bytes(rng: Rng, rows: list[list[str]]) -> tuple[str, bool]:

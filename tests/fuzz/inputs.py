@@ -39,11 +39,13 @@ class Ending:
     Attributes:
         code: Exit code.
         errors: What it wrote to stderr.
+        results: What it wrote to stdout.
         fault: Traceback or Python warning, which no user should see; empty without one.
     """
 
     code: int
     errors: str
+    results: str = ""
     fault: str = ""
 
 
@@ -109,7 +111,7 @@ def in_this_process(call: Call, folder: Path) -> Ending:
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         lines = traceback.format_exception(result.exception)
         fault = "Traceback: " + "".join(lines[-5:]).strip()
-    return Ending(code=result.exit_code, errors=result.stderr, fault=fault)
+    return Ending(code=result.exit_code, errors=result.stderr, results=result.stdout, fault=fault)
 
 
 def in_new_process(call: Call, folder: Path) -> Ending:
@@ -118,18 +120,18 @@ def in_new_process(call: Call, folder: Path) -> Ending:
         [*PROCESS, *call.words],
         cwd=folder,
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         errors="replace",
     ) as process:
         try:
-            _, errors = process.communicate(timeout=TIME_LIMITS["input"] - 5.0)
+            results, errors = process.communicate(timeout=TIME_LIMITS["input"] - 5.0)
         except subprocess.TimeoutExpired:
             process.kill()
-            _, errors = process.communicate()
+            results, errors = process.communicate()
             return Ending(code=process.returncode, errors=errors, fault="no end within the limit")
-    return Ending(code=process.returncode, errors=errors)
+    return Ending(code=process.returncode, errors=errors, results=results)
 
 
 def judge(call: Call, ending: Ending) -> list[str]:
@@ -143,7 +145,7 @@ def judge(call: Call, ending: Ending) -> list[str]:
     if found:
         return found
 
-    if ending.code == 1 and not errors:
+    if ending.code == 1 and not (errors or ending.results.strip()):
         found.append(f"exit code {ending.code} without a message")
     if ending.code == 2:
         found += _judge_refusal(errors)
