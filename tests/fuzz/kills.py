@@ -26,6 +26,9 @@ ORPHAN_TIME = 5.0
 # pictures on a busy machine.
 END_TIME = 30.0
 
+# Time in which Python starts, before the first line of the package can handle a signal [s].
+START_OF_PYTHON = 1.0
+
 # Longest time before the kill [s], about the time that each call takes or longer.
 LONGEST = {"design": 15.0, "design in a pool": 20.0, "identify": 8.0, "montecarlo": 14.0}
 
@@ -67,12 +70,12 @@ def run(case: Case, folder: Path) -> Outcome:
         )
     try:
         is_killed = _send(process, kill, seconds)
-        complaints = [*_ending(process, kill), *_orphans(process.pid)]
+        complaints = [*_ending(process, kill, seconds), *_orphans(process.pid)]
     finally:
         _end(process)
 
     text = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
-    if "Traceback" in text:
+    if "Traceback" in text and seconds >= START_OF_PYTHON:
         complaints.append("Traceback: " + "\n".join(text.splitlines()[-4:]))
     complaints += _files(folder / "out", kill)
     return Outcome(
@@ -93,13 +96,14 @@ def _send(process: subprocess.Popen[bytes], kill: str, seconds: float) -> bool:
     return False
 
 
-def _ending(process: subprocess.Popen[bytes], kill: str) -> list[str]:
-    """Describe what is wrong with the end of a process that got a signal."""
+def _ending(process: subprocess.Popen[bytes], kill: str, seconds: float) -> list[str]:
+    """Describe what is wrong with the end of a process that got a signal after some seconds."""
     try:
         code = process.wait(END_TIME)
     except subprocess.TimeoutExpired:
         return [f"no end {END_TIME:g} s after {kill}"]
-    allowed = (0, 1) if kill != "SIGKILL" else (0, 1, -signal.SIGKILL)
+    is_fatal = kill == "SIGKILL" or seconds < START_OF_PYTHON
+    allowed = (0, 1, -signal.Signals[kill]) if is_fatal else (0, 1)
     return [] if code in allowed else [f"exit code {code} after {kill}"]
 
 
