@@ -42,11 +42,8 @@ def explain(
 
     # pydantic repeats a fault inside a table for the table itself. Only the innermost key, which
     # is the most specific one, is reported.
-    innermost = [
-        key
-        for key in faults_by_key
-        if not any(other.startswith(f"{key}.") for other in faults_by_key)
-    ]
+    outer = {key[:i] for key in faults_by_key for i, letter in enumerate(key) if letter == "."}
+    innermost = [key for key in faults_by_key if key not in outer]
 
     lines: list[str] = []
     for key in innermost:
