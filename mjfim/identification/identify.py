@@ -19,6 +19,7 @@ from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError, explain_renamed_arguments
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.extreme_values import describe_extreme_value
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.residuals import FitProblem
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
@@ -283,10 +284,14 @@ def _require_finite_cost(
     task: FitTask, problem: FitProblem, subset: np.ndarray, begin: UnknownValues
 ) -> None:
     """Raise SimulationDivergedError where the model diverges at the start of the search."""
-    cost = problem.of_segments(subset).cost(_of_subset(begin, subset))
+    # The square of an extreme measured value is infinite, which the message below explains.
+    with np.errstate(over="ignore"):
+        cost = problem.of_segments(subset).cost(_of_subset(begin, subset))
     if not np.isfinite(cost):
         values = dict(zip(task.system.parameters.names, task.start, strict=True))
-        raise SimulationDivergedError(f"the simulation diverges at the start {values}")
+        extreme = describe_extreme_value(task.recordings, task.system.channels.control_columns)
+        cause = f"; {extreme}; is it a fault of the log?" if extreme else ""
+        raise SimulationDivergedError(f"the simulation diverges at the start {values}{cause}")
 
 
 def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:

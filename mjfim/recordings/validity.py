@@ -31,6 +31,9 @@ DEAD_CHANNEL_ROWS = 10
 # smaller jump back, the rows are out of order.
 RESTART_SHARE = 0.1
 
+# Largest number whose square is finite in float64.
+LARGEST_VALUE = float(np.sqrt(np.finfo(np.float64).max))
+
 # Seconds per unit of time.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
@@ -143,7 +146,7 @@ def _likely_unit(median: float, unit: str) -> str:
 
 
 def check_finite(where: str, values: Array, first: int) -> None:
-    """Refuse a column with an infinite value.
+    """Refuse a column with a value that is infinite or whose square is.
 
     Args:
         where: File and column, for messages.
@@ -151,13 +154,22 @@ def check_finite(where: str, values: Array, first: int) -> None:
         first: Row of the file in which they begin, counted from 0.
 
     Raises:
-        RecordingError: A value is infinite.
+        RecordingError: A value is infinite, or too large to be a measurement.
     """
     infinite = np.isinf(values)
     if infinite.any():
         row = first + int(np.argmax(infinite)) + 1
         raise RecordingError(
             f"{where} is infinite in data row {row}; leave the field empty if there is no number"
+        )
+
+    # Sums of squares would be infinite. A comparison with NaN is False.
+    too_large = np.abs(values) > LARGEST_VALUE
+    if too_large.any():
+        at = int(np.argmax(too_large))
+        raise RecordingError(
+            f"{where} is {values[at]:g} in data row {first + at + 1}, which is too large to be a "
+            "measured number; leave the field empty if there is no number"
         )
 
 

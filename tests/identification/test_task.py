@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import mjfim
 from mjfim.budget import StopToken
-from mjfim.errors import ExperimentError, RecordingError
+from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_task
 from mjfim.identification.task import FitTask
@@ -140,3 +142,20 @@ def test_recordings_that_count_twice_are_refused(
         mjfim.identify(experiment, [recording], held_out=[recording])
     with pytest.raises(RecordingError, match="log is given twice"):
         mjfim.check(experiment, recordings=[recording, recording])
+
+
+@pytest.mark.parametrize(("name", "row"), [("ctrl:force", 57), ("qvel:slide", 301)])
+def test_one_extreme_value_is_named_where_the_simulation_diverges(
+    experiment: mjfim.Experiment, recording: Recording, name: str, row: int
+) -> None:
+    """A fault of the log is the likely cause, so the message says where it is."""
+    ctrl, y = recording.ctrl.copy(), recording.y.copy()
+    if name.startswith("ctrl"):
+        ctrl[row - 1, 0] = 1e200
+    else:
+        y[row - 1, recording.outputs.index(name)] = 1e200
+    faulty = dataclasses.replace(recording, ctrl=ctrl, y=y)
+
+    message = rf"diverges at the start .*; log: column '{name}' holds 1e\+200 in row {row} of"
+    with pytest.raises(SimulationDivergedError, match=message):
+        mjfim.identify(experiment, [faulty], threads=1)

@@ -124,6 +124,17 @@ def test_formula(read: Read) -> None:
     assert logged.recording.outputs == ("qpos:pin",)
 
 
+@pytest.mark.parametrize("name", ["qpos:pin", "ctrl:push"])
+def test_numbers_that_are_too_large_to_be_measured(name: str, read: Read) -> None:
+    """Their squares are infinite; the message names file, column and row."""
+    values = wave()
+    values[56] = -1e300
+    with pytest.raises(
+        RecordingError, match=rf"lab\.csv: column '{name}' is -1e\+300 in data row 57"
+    ):
+        read({"qpos:pin": wave(), name: values})
+
+
 def test_truth_values(read: Read) -> None:
     """They may switch a control on and off, but they are no measured position."""
     on = np.where(T < 1.0, "true", "false")
