@@ -194,7 +194,10 @@ def _limit_warnings(found: Verification) -> Iterator[str]:
                 "they are checked, not enforced; raise cost.control or cost.tracking until they "
                 "hold before running this on hardware"
             )
-        yield f"{kind} limits are exceeded by {-margin:.3g}: {advice}"
+        where = ""
+        if kind in found.by_stated_solver:
+            where = " with the solver settings of the MJCF (tolerance, iterations, warm start) only"
+        yield f"{kind} limits are exceeded by {-margin:.3g}{where}: {advice}"
 
 
 def open_boundary_warnings(task: DesignTask) -> Iterator[str]:

@@ -1,12 +1,15 @@
 """Verification of a design at every engine step of the unmodified model.
 
-The unmodified model has all clamps, stops and contacts that the user's MJCF states.
+The unmodified model has all clamps, stops and contacts that the user's MJCF states. It is played
+with the exact constraint solver of the design and with the solver settings of the MJCF; the worse
+of both counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,6 +21,7 @@ from mjfim.excitation.constraint_kinds import ClearanceConstraint
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
+from mjfim.model.variants import unconstrained
 from mjfim.optimize.barrier import Bounds
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage
@@ -39,9 +43,10 @@ class Verification:
             kind].
         relative_margins: These margins over half of each range, or over the clearance.
         deviation: Largest difference of a state at the samples from the designed trajectory [unit
-            of the state].
+            of the state], with the exact solver; infinite where either simulation diverges.
         unenforced: Kinds that are checked, but not enforced.
         usage: Position of every limited quantity in its range over time.
+        by_stated_solver: Kinds that are violated only with the solver settings of the MJCF.
     """
 
     margins: dict[str, float]
@@ -49,6 +54,7 @@ class Verification:
     deviation: float
     unenforced: frozenset[str] = frozenset()
     usage: tuple[LimitUsage, ...] = ()
+    by_stated_solver: frozenset[str] = frozenset()
 
     @property
     def is_feasible(self) -> bool:
@@ -82,10 +88,24 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
         Margins and usage of all limits; infinitely negative margins where the simulation diverges.
     """
     constraints = constraint_set_of(task, every=True)
+    model = task.system.model_at(task.theta)
+    exact = _verify_on(task, constraints, trajectory, model)
+
+    # Without constraint forces, the settings of their solver do not matter.
+    if unconstrained(model) or not np.isfinite(exact.deviation):
+        return exact
+
+    stated = task.system.model_with_stated_solver(task.theta)
+    return _worse_of(exact, _verify_on(task, constraints, trajectory, stated))
+
+
+def _verify_on(
+    task: DesignTask, constraints: ConstraintSet, trajectory: Trajectory, model: Any
+) -> Verification:
+    """Play the control of a trajectory on one model; all limits are checked."""
     unenforced = _unenforced_kinds(task)
 
-    # Simulate the unmodified model and observe the limited quantities at every engine step.
-    model = task.system.model_at(task.theta)
+    # Simulate the model and observe the limited quantities at every engine step.
     simulator = BatchSimulator(model, substeps=task.system.grid.substeps)
     out = simulator.rollout(
         [model],
@@ -124,6 +144,32 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
         unenforced=unenforced,
         usage=tuple(usage),
     )
+
+
+def _worse_of(exact: Verification, stated: Verification) -> Verification:
+    """Join the verifications with the exact solver and with the solver settings of the MJCF."""
+    if not np.isfinite(stated.deviation):
+        return stated
+
+    by_stated_solver = frozenset(
+        kind for kind, margin in stated.margins.items() if margin < 0.0 <= exact.margins[kind]
+    )
+    usage = [
+        max(pair, key=lambda used: float(np.abs(used.share).max(initial=0.0)))
+        for pair in zip(exact.usage, stated.usage, strict=True)
+    ]
+    return replace(
+        exact,
+        margins=_smaller_of(exact.margins, stated.margins),
+        relative_margins=_smaller_of(exact.relative_margins, stated.relative_margins),
+        usage=tuple(usage),
+        by_stated_solver=by_stated_solver,
+    )
+
+
+def _smaller_of(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
+    """The smaller margin of each kind."""
+    return {kind: min(margin, second[kind]) for kind, margin in first.items()}
 
 
 def _unenforced_kinds(task: DesignTask) -> frozenset[str]:

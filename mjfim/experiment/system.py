@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
@@ -330,6 +331,25 @@ class System:
         model = self.parameters.writer.model(self._whole_model, theta)
         if self.mocap is not None and not at_keyframe:
             self.mocap.put(model, self.mocap.compiled)
+        return model
+
+    def model_with_stated_solver(self, theta: Array) -> Any:
+        """The user's model with parameters and with the solver settings of the MJCF.
+
+        Other models solve for constraint forces to a private tolerance and without a warm start.
+
+        Args:
+            theta: (p,) parameter values.
+
+        Returns:
+            A new MjModel, which the caller may change.
+        """
+        model = self.model_at(theta)
+        model.opt.tolerance = self.model.opt.tolerance
+
+        warm_start = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+        stated = self.model.opt.disableflags & warm_start
+        model.opt.disableflags = (model.opt.disableflags & ~warm_start) | stated
         return model
 
     def impossible(self, theta: Array) -> list[int]:

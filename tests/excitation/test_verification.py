@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -163,6 +164,79 @@ def test_violated_limits_that_are_only_checked_leave_a_design_feasible(tmp_path:
         assert found.margins["position"] < 0.0
         assert found.margins["clearance"] < 0.0
         assert found.is_feasible is kept
+
+
+# An arm with dry friction whose solver is stopped long before it has converged.
+COARSE_SOLVER = """
+<mujoco model="arm">
+  <option timestep="0.005" solver="{solver}" iterations="{iterations}" tolerance="{tolerance}">
+    <flag contact="disable"/>
+  </option>
+  <default>
+    <joint type="hinge" axis="0 1 0" frictionloss="0.3"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" mass="1"/>
+  </default>
+  <worldbody>
+    <body>
+      <joint name="shoulder"/>
+      <geom/>
+      <body name="lower" pos="0 0 -0.4">
+        <joint name="elbow"/>
+        <geom/>
+        <body pos="0 0 -0.4"><joint name="wrist"/><geom/></body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="drive" joint="shoulder" gear="5"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        {"solver": "PGS", "iterations": 1, "tolerance": 1e-8},
+        {"solver": "Newton", "iterations": 100, "tolerance": 0.3},
+    ],
+)
+def test_limits_hold_with_the_solver_settings_of_the_model_too(
+    solver: dict[str, Any], tmp_path: Path
+) -> None:
+    """The limit is between the speeds with the exact solver and with that of the model."""
+    tables: dict[str, Any] = {"parameters": {"m": {"target": "body/lower:mass"}}}
+    tables["noise"] = {"state": 0.01}
+    text = COARSE_SOLVER.format(**solver)
+    task = make_task(text, tmp_path, **tables)
+
+    # A plain loop over the user's file, and one with the solver settings of the design.
+    stated = fastest_elbow(mujoco.MjModel.from_xml_string(text), task)
+    exact = fastest_elbow(task.system.model_at(task.theta), task)
+    assert abs(stated - exact) > 1e-3 * exact
+
+    # The limit holds with one of both only.
+    between = {"velocity": {"elbow": 0.5 * (stated + exact)}}
+    found = verify(make_task(text, tmp_path, limits=between, **tables), task.initial)
+    assert not found.is_feasible
+    assert found.margins["velocity"] == pytest.approx(-0.5 * abs(stated - exact), rel=1e-6)
+    assert found.by_stated_solver == ({"velocity"} if stated > exact else set())
+
+    (usage,) = found.usage
+    limit = 0.5 * (stated + exact)
+    assert np.abs(usage.share).max() == pytest.approx(max(stated, exact) / limit)
+    assert found.deviation < SAME_STATE_TOLERANCE
+
+
+def fastest_elbow(model: Any, task: DesignTask) -> float:
+    """Largest speed of the elbow after any engine step under the control of a task [rad/s]."""
+    data = mujoco.MjData(model)
+    elbow = model.joint("elbow").dofadr[0]
+    fastest = 0.0
+    for control in task.control:
+        data.ctrl[:] = control
+        for _ in range(task.system.grid.substeps):
+            mujoco.mj_step(model, data)
+            fastest = max(fastest, abs(data.qvel[elbow]))
+    return float(fastest)
 
 
 def test_a_control_that_makes_the_model_diverge_violates_every_limit(tmp_path: Path) -> None:
