@@ -173,8 +173,8 @@ class OutputGuard:
         existing = [file for file in files if os.path.lexists(file)]
         for file in existing:
             self._refuse_input(file)
-            if file.is_dir():
-                raise OutputError(f"{file}: is a folder; a result of this name cannot be written")
+            if file.exists() and not file.is_file():
+                raise OutputError(f"{file}: is not a file; a result of this name cannot be written")
 
         if self._force:
             return

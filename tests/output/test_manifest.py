@@ -59,6 +59,13 @@ def test_files_that_are_not_listed_are_the_users(tmp_path: Path) -> None:
     OutputGuard([], force=True).check(files)
 
 
+def test_folders_and_devices_are_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").mkdir()
+    for place in (tmp_path / "a.txt", Path(os.devnull)):
+        with pytest.raises(OutputError, match=f"{place.name}: is not a file"):
+            OutputGuard([], force=True).check([place])
+
+
 @pytest.mark.parametrize("link", ["same", "symlink", "hardlink", "spelling"])
 def test_an_input_is_never_replaced(link: str, tmp_path: Path) -> None:
     """Neither with --force nor under another name of the same file."""
