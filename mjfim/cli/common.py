@@ -44,6 +44,9 @@ out = Console(
     emoji=False,
 )
 
+# Largest number of threads that can be asked for; more would only use memory.
+MAX_THREADS = 1024
+
 # Number of iterations from one line of progress to the next, for a design and for an estimation,
 # if stderr is not a terminal.
 DESIGN_LINES = 10
@@ -63,7 +66,10 @@ Folder = Annotated[
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
-Threads = Annotated[int | None, typer.Option(min=1, help="Threads for MuJoCo; default: all cores.")]
+Threads = Annotated[
+    int | None,
+    typer.Option(min=1, max=MAX_THREADS, help="Threads for MuJoCo; default: all cores."),
+]
 Force = Annotated[
     bool,
     typer.Option(

@@ -28,6 +28,7 @@ from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, ShortestExperiment
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.input_files import input_files
+from mjfim.experiment.task_tables import MAX_STARTS
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.summaries import describe_design
 from mjfim.output.text import render
@@ -61,7 +62,9 @@ def design(
     as_json: AsJson = False,
     starts: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of initial controls; overrides descent.starts."),
+        typer.Option(
+            min=1, max=MAX_STARTS, help="Number of initial controls; overrides descent.starts."
+        ),
     ] = None,
     shortest: Annotated[
         bool,

@@ -36,6 +36,9 @@ from mjfim.studies.robustness import assess_robustness, default_latency
 # Kinds of limits from which a design can keep a reserve.
 KINDS = ("position", "velocity", "acceleration", "control", "control_rate", "force", "clearance")
 
+# Largest number of robots; more would take days.
+MAX_RUNS = 100_000
+
 # Default reserve of a design, as fractions of half ranges. The servo arm needs these for parameters
 # that are wrong by 20 %.
 DEFAULT_RESERVE = ("position=0.05", "velocity=0.3", "force=0.25")
@@ -53,7 +56,7 @@ def robustness(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.")
     ] = Path("out/robustness"),
-    runs: Annotated[int, typer.Option(min=1, help="Number of robots.")] = 100,
+    runs: Annotated[int, typer.Option(min=1, max=MAX_RUNS, help="Number of robots.")] = 100,
     wrong: Annotated[
         float, typer.Option(min=0.0, help="Relative error of the guess of every parameter.")
     ] = 0.2,

@@ -14,6 +14,10 @@ from pydantic.json_schema import SkipJsonSchema
 from mjfim.recordings.spec import Boolean, Finite, Integer, Positive, Range, Section
 
 Matrix = tuple[tuple[Finite, ...], ...]
+
+# Largest number of harmonics of a multisine.
+MAX_HARMONICS = 10_000
+
 PriorOrUnknown = Positive | Literal[True]
 
 
@@ -53,7 +57,9 @@ class Signal(Section):
         default=None,
         description="Last frequency of a chirp [Hz]. Default: five times `frequency`.",
     )
-    harmonics: Integer = Field(default=5, ge=1, description="Number of harmonics of a multisine.")
+    harmonics: Integer = Field(
+        default=5, ge=1, le=MAX_HARMONICS, description="Number of harmonics of a multisine."
+    )
     seed: Integer = Field(
         default=0, ge=0, description="Seed of the random phases and weights of a multisine."
     )

@@ -19,6 +19,12 @@ from mjfim.recordings.spec import (
     Section,
 )
 
+# Largest numbers of repeated work; larger ones are mistyped and would not end.
+MAX_STARTS = 10_000
+MAX_ITERATIONS = 1_000_000
+MAX_REPLICATES = 100_000
+MAX_SAMPLES = 10_000
+
 
 class Cost(Section):
     """The cost that a design minimises (eq. 3).
@@ -115,7 +121,10 @@ class Robust(Section):
         description="mean: the mean of the criterion over the samples. worst: its worst value.",
     )
     samples: Integer = Field(
-        default=6, ge=2, description="Number of parameter samples, including the guess."
+        default=6,
+        ge=2,
+        le=MAX_SAMPLES,
+        description="Number of parameter samples, including the guess.",
     )
     seed: Integer = Field(default=0, ge=0, description="Seed of the samples.")
 
@@ -137,7 +146,10 @@ class Descent(Section):
         ),
     )
     max_iterations: Integer = Field(
-        default=200, ge=0, description="Largest number of iterations from one initial control."
+        default=200,
+        ge=0,
+        le=MAX_ITERATIONS,
+        description="Largest number of iterations from one initial control.",
     )
     seconds: Positive | None = Field(
         default=None,
@@ -152,6 +164,7 @@ class Descent(Section):
     starts: Integer = Field(
         default=1,
         ge=1,
+        le=MAX_STARTS,
         description=(
             "Number of initial controls: the stated one, and random multisines for the others. The "
             "best result is kept."
@@ -328,6 +341,7 @@ class FitSpec(Section):
     starts: Integer = Field(
         default=1,
         ge=1,
+        le=MAX_STARTS,
         description=(
             "Number of initial guesses: the stated one, and for the others random values within "
             "bounds and priors. The best fit is kept."
@@ -337,7 +351,10 @@ class FitSpec(Section):
         default=0, ge=0, description="Seed of the random initial guesses and of the bootstrap."
     )
     max_iterations: Integer = Field(
-        default=60, ge=1, description="Largest number of iterations from one initial guess."
+        default=60,
+        ge=1,
+        le=MAX_ITERATIONS,
+        description="Largest number of iterations from one initial guess.",
     )
     blocks: Positive | None = Field(
         default=None,
@@ -348,5 +365,8 @@ class FitSpec(Section):
         ),
     )
     bootstrap: Integer = Field(
-        default=1000, ge=0, description="Number of bootstrap replicates. 0: no bootstrap."
+        default=1000,
+        ge=0,
+        le=MAX_REPLICATES,
+        description="Number of bootstrap replicates. 0: no bootstrap.",
     )

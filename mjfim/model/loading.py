@@ -12,6 +12,7 @@ import mujoco
 
 from mjfim.errors import ModelError
 from mjfim.model.coordinates import ModelCoordinates
+from mjfim.model.expanded_size import check_expanded_size
 from mjfim.model.finite_numbers import check_compiled_numbers, check_file_numbers
 
 
@@ -22,12 +23,13 @@ def load_spec(path: Path) -> Any:
         path: The file.
 
     Raises:
-        ModelError: The file is absent, holds NaN, or MuJoCo cannot read it; then the message is
-            MuJoCo's.
+        ModelError: The file is absent, holds NaN, expands to a model that would fill the memory, or
+            MuJoCo cannot read it; then the message is MuJoCo's.
     """
     if not path.is_file():
         raise ModelError(f"{path}: no such model file")
     check_file_numbers(path)
+    check_expanded_size(path)
     try:
         return mujoco.MjSpec.from_file(_engine_path(path))
     except ValueError as error:

@@ -28,6 +28,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.identify import least_squares, newton_raphson
 from mjfim.identification.residuals import FitProblem
 from mjfim.information.identifiability import require_visible
+from mjfim.memory import require_memory
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
@@ -45,6 +46,10 @@ INDIVIDUAL_STEPS = 12
 
 # Largest size of the Jacobians of all trials that are stepped together [bytes].
 CHUNK_BYTES = 1e8
+
+# Copies of all estimates that exist at the same time: of both trajectories, for their statistics
+# and for the files.
+ESTIMATE_COPIES = 6
 
 # Smallest number of trials that are stepped together.
 MIN_CHUNK = 64
@@ -84,7 +89,7 @@ def monte_carlo(
         stop: Ends the study early, as Ctrl-C does; the trajectories that are finished are returned.
 
     Raises:
-        ExperimentError: Fewer than two trials.
+        ExperimentError: Fewer than two trials, or more than fit into memory.
         SimulationDivergedError: The model diverges at the true values.
         UnidentifiableError: A parameter has no effect on the data.
     """
@@ -109,6 +114,7 @@ def monte_carlo_system(
     """Study the estimator on a resolved system. See `monte_carlo`."""
     if trials < 2:
         raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
+    _require_memory_for(trials, len(system.parameters.names))
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
 
     # Fail before the first trial where a trajectory cannot be simulated.
@@ -139,6 +145,11 @@ def monte_carlo_system(
         sets=sets,
         information=information,
     )
+
+
+def _require_memory_for(trials: int, count: int) -> None:
+    """Raise ExperimentError if the estimates of `count` parameters of all trials do not fit."""
+    require_memory(ESTIMATE_COPIES * float(trials) * count, f"trials: {trials}")
 
 
 @dataclass(frozen=True, kw_only=True)

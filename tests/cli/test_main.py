@@ -148,3 +148,19 @@ def test_version() -> None:
     """The version is that of the package."""
     result = run("--version")
     assert (result.exit_code, result.stdout) == (0, f"{mjfim.__version__}\n")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("check", "study.toml", "--threads", "1000000"),
+        ("design", "study.toml", "-o", "out", "--starts", "1000000000"),
+        ("robustness", "study.toml", "--runs", "1000000000"),
+    ],
+    ids=["threads", "starts", "runs"],
+)
+def test_amounts_beyond_a_bound_are_refused(words: tuple[str, ...]) -> None:
+    """The message states the bound."""
+    result = run(*words)
+    assert result.exit_code == 2
+    assert "less than or equal to" in " ".join(result.stderr.replace("│", " ").split())

@@ -585,7 +585,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "timestep not a number": (
         edited("cart_pendulum.xml", "nan.xml"),
         M,
-        ["nan.xml", "option.timestep is nan s", "positive"],
+        ["nan.xml", "timestep", "finite"],
     ),
     "timestep negative": (
         edited("cart_pendulum.xml", "backward.xml"),
@@ -657,6 +657,22 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         edited("horizon = 1.0", "horizon = inf"),
         E,
         [HOME, "horizon", "finite", "inf"],
+    ),
+    # amounts
+    "starts": (
+        edited("[cost]", "[descent]\nstarts = 1e100\n[cost]"),
+        E,
+        [HOME, "descent.starts", "1e+100"],
+    ),
+    "many starts": (
+        edited("[cost]", "[descent]\nstarts = 1000000000\n[cost]"),
+        E,
+        [HOME, "descent.starts", "less than or equal to 10000", "1000000000"],
+    ),
+    "bootstrap": (
+        edited("[cost]", "[fit]\nbootstrap = 1000000000\n[cost]"),
+        E,
+        [HOME, "fit.bootstrap", "less than or equal to 100000"],
     ),
     # parameter values
     "bounds inverted": (
