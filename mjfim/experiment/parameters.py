@@ -15,8 +15,15 @@ from mjfim.model.coordinates import ModelCoordinates, unknown_coordinate
 from mjfim.model.elements import identifier, names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource
-from mjfim.model.parameters import Parameter, Target
+from mjfim.model.parameters import Parameter, ParameterSet, Target
 from mjfim.model.paths import resolve, unit_of
+from mjfim.model.targets import (
+    InertiaField,
+    InitialStateField,
+    OutputBiasField,
+    OutputDelayField,
+)
+from mjfim.model.variants import MocapPlacement
 
 # Prefix of the names of parameters that are nuisance deviations of the initial state.
 INITIAL_STATE_PREFIX = "initial "
@@ -36,8 +43,11 @@ DELAY_MAGNITUDE = 0.01
 
 
 def resolve_parameters(
-    experiment: Experiment, source: ModelSource, outputs: Sequence[str]
-) -> list[Parameter]:
+    experiment: Experiment,
+    source: ModelSource,
+    outputs: Sequence[str],
+    mocap: MocapPlacement | None,
+) -> ParameterSet:
     """Resolve all parameters in the order of theta.
 
     Those of the table `parameters` come first, then those of the table `nuisance`.
@@ -46,6 +56,7 @@ def resolve_parameters(
         experiment: The experiment.
         source: Its model.
         outputs: Names of the measured columns.
+        mocap: Where mocap bodies start; None where they start as compiled.
 
     Returns:
         The p parameters.
@@ -53,15 +64,14 @@ def resolve_parameters(
     Raises:
         ExperimentError: A parameter cannot be resolved; the message names its key.
     """
-    model = source.model
     nuisance = list(_nuisance_parameters(experiment.nuisance, source.coordinates, outputs))
 
     resolved: list[Parameter] = []
     for name, spec in experiment.parameters.items():
         if spec.inertial is None:
-            resolved.append(_single_parameter(name, spec, model, outputs))
+            resolved.append(_single_parameter(name, spec, source, outputs))
         else:
-            resolved += _inertia_parameters(name, spec, model)
+            resolved += _inertia_parameters(name, spec, source.model)
     resolved += nuisance
 
     names = [parameter.name for parameter in resolved]
@@ -73,33 +83,42 @@ def resolve_parameters(
         raise ExperimentError(
             "parameters: all are nuisance parameters; at least one must be of interest"
         )
-    return resolved
+    return ParameterSet.build(resolved, source.model, mocap)
 
 
 def _single_parameter(
-    name: str, spec: ParameterSpec, model: Any, outputs: Sequence[str]
+    name: str, spec: ParameterSpec, source: ModelSource, outputs: Sequence[str]
 ) -> Parameter:
     """A parameter with targets or a function.
 
     Its guess, magnitude and unit default to those of its first target.
     """
-    targets = tuple(Target(t.path, t.scale, t.offset) for t in spec.all_targets)
+    model = source.model
     guess = spec.guess
     magnitude = 0.0
     unit = spec.unit
 
-    if targets:
-        first = targets[0]
-        try:
-            field = resolve(model, first.path, outputs)
+    try:
+        targets = tuple(
+            Target(
+                path=stated.path,
+                field=resolve(model, stated.path, outputs, source.decoration),
+                scale=stated.scale,
+                offset=stated.offset,
+            )
+            for stated in spec.all_targets
+        )
+        if targets:
+            first = targets[0]
             if guess is None:
-                guess = (field.read(model) - first.offset) / first.scale
-            magnitude = field.magnitude(model) / abs(first.scale)
-        except ExperimentError as error:
-            raise ExperimentError(f"parameters.{name}: {error}") from None
-        # A parameter whose factor is not 1 may have another unit than its target.
-        if not unit and first.scale == 1.0:
-            unit = unit_of(model, first.path)
+                guess = (first.field.read(model) - first.offset) / first.scale
+            magnitude = first.field.magnitude(model) / abs(first.scale)
+    except ExperimentError as error:
+        raise ExperimentError(f"parameters.{name}: {error}") from None
+
+    # A parameter whose factor is not 1 may have another unit than its target.
+    if targets and not unit and targets[0].scale == 1.0:
+        unit = unit_of(model, targets[0].path)
 
     if guess is None:
         raise ExperimentError(f"parameters.{name}.guess: a function needs a guess")
@@ -157,7 +176,7 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
     key = f"parameters.{name}.inertial"
     kind = spec.coordinates or "logcholesky"
     parametrisation = INERTIA_PARAMETRISATIONS[kind]
-    values, magnitudes = _inertia_coordinates(key, spec.inertial or "", kind, model)
+    body, values, magnitudes = _inertia_coordinates(key, spec.inertial or "", kind, model)
     fields = BARYCENTRIC_FIELDS if kind == "barycentric" else LOGCHOLESKY_FIELDS
 
     for i, coordinate in enumerate(parametrisation.names):
@@ -171,7 +190,9 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
 
         yield Parameter(
             name=f"{name}.{coordinate}",
-            targets=(Target(f"body/{spec.inertial}:{fields[i]}"),),
+            targets=(
+                Target(path=f"body/{spec.inertial}:{fields[i]}", field=InertiaField(body, kind, i)),
+            ),
             guess=value,
             scale=scale,
             prior=None if spec.prior is None else spec.prior * magnitude,
@@ -183,8 +204,8 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
         )
 
 
-def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[Array, Array]:
-    """(10,) coordinates of a body's inertia in a parametrisation, and their (10,) magnitudes.
+def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[int, Array, Array]:
+    """Number of a body, and the (10,) coordinates of its inertia with their (10,) magnitudes.
 
     Args:
         key: Key that names the body, for messages.
@@ -201,7 +222,7 @@ def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[Ar
     inertia = body_inertia(model, body)
     parametrisation = INERTIA_PARAMETRISATIONS[kind]
     try:
-        return parametrisation.coordinates(inertia), parametrisation.magnitudes(inertia)
+        return body, parametrisation.coordinates(inertia), parametrisation.magnitudes(inertia)
     except ValueError as error:
         raise ExperimentError(
             f'{key}: body {name!r}: {error}; use coordinates = "barycentric"'
@@ -226,19 +247,20 @@ def _nuisance_parameters(
         )
     for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(deviations)):
         deviation = deviations[name]
+        target = Target(path=deviation.path, field=InitialStateField(deviation.address))
         yield _nuisance_parameter(
-            f"{INITIAL_STATE_PREFIX}{name}", deviation.path, prior, unit=deviation.unit
+            f"{INITIAL_STATE_PREFIX}{name}", target, prior, unit=deviation.unit
         )
 
     for name, prior in _priors_by_name("nuisance.bias", stated.bias, outputs):
-        yield _nuisance_parameter(
-            f"bias {name}", f"output/{name}:bias", prior, per_recording=stated.per_recording
-        )
+        bias = OutputBiasField(list(outputs).index(name))
+        target = Target(path=f"output/{name}:bias", field=bias)
+        yield _nuisance_parameter(f"bias {name}", target, prior, per_recording=stated.per_recording)
 
     if stated.delay is not None:
         yield _nuisance_parameter(
             "delay",
-            "output:delay",
+            Target(path="output:delay", field=OutputDelayField()),
             stated.delay,
             unit="s",
             magnitude=DELAY_MAGNITUDE,
@@ -260,7 +282,7 @@ def _priors_by_name(key: str, stated: Any, names: Sequence[str]) -> Iterator[tup
 
 def _nuisance_parameter(
     name: str,
-    path: str,
+    target: Target,
     prior: Any,
     *,
     unit: str = "",
@@ -273,7 +295,7 @@ def _nuisance_parameter(
     """
     return Parameter(
         name=name,
-        targets=(Target(path),),
+        targets=(target,),
         guess=0.0,
         scale=magnitude,
         prior=None if prior is True else float(prior),

@@ -110,11 +110,10 @@ class System:
         )
         key = keyframe(model, "initial.keyframe", experiment.initial.keyframe)
         start = initial_state(experiment.initial, model, key)
-        unknowns = resolve_parameters(experiment, source, outputs.names)
-
-        # The numbers of the model that the parameters set, and the plant that they act on.
         mocap = MocapPlacement.of(model, key)
-        parameters = ParameterSet.build(unknowns, model, outputs.names, source.decoration, mocap)
+        parameters = resolve_parameters(experiment, source, outputs.names, mocap)
+
+        # The plant that the parameters act on.
         private = PlantModel(
             source,
             moved_bodies=parameters.moved_bodies,

@@ -112,8 +112,9 @@ class ParameterWriter:
             ModelError: MuJoCo refuses to compile the values.
         """
         columns_of_body: dict[int, list[int]] = {}
-        for j, fields in enumerate(self._parameters.fields):
-            for field in fields:
+        for j, parameter in enumerate(self._parameters.parameters):
+            for target in parameter.targets:
+                field = target.field
                 if isinstance(field, InertiaField):
                     columns_of_body.setdefault(field.body, []).append(j)
                 elif isinstance(field, ModelField) and field.array in ("body_mass", "body_inertia"):
@@ -158,8 +159,9 @@ class ParameterWriter:
         p = self._parameters
         whole: dict[tuple[str, int], Array] = {}
 
-        for parameter, fields, value in zip(p.parameters, p.fields, theta, strict=True):
-            for target, field in zip(parameter.targets, fields, strict=True):
+        for parameter, value in zip(p.parameters, theta, strict=True):
+            for target in parameter.targets:
+                field = target.field
                 number = target.scale * float(value) + target.offset
                 if isinstance(field, ModelField):
                     field.write(model, number)
@@ -194,8 +196,8 @@ class ParameterWriter:
                         f"parameters.{parameter.name}: its function failed: {error}"
                     ) from error
 
-            for target, field in zip(parameter.targets, p.fields[j], strict=True):
-                if isinstance(field, SpecField):
+            for target in parameter.targets:
+                if isinstance(target.field, SpecField):
                     number = target.scale * float(theta[j]) + target.offset
                     write_element(spec, source.model, source.model, target.path, number)
 

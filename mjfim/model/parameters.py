@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.parameter_writer import ParameterWriter
-from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath, resolve
+from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath
 from mjfim.model.targets import (
     InertiaField,
     InitialStateField,
@@ -45,17 +45,19 @@ ARRAYS_BESIDE_INERTIA = {
 SpecEdit = Callable[[Any, float], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Target:
     """One number inside a model, which becomes `scale * theta_j + offset`.
 
     Attributes:
         path: Parameter path of the number.
+        field: The field that the path leads to.
         scale: Factor of the parameter.
         offset: Constant that is added [unit of the number].
     """
 
     path: str
+    field: TargetField
     scale: float = 1.0
     offset: float = 0.0
 
@@ -119,14 +121,12 @@ class ParameterSet:
 
     Attributes:
         parameters: The parameters.
-        fields: For each parameter, the fields that its targets lead to.
         nominal: Values in the model of quantities that are written as a whole: (10,) coordinates of
             an inertia by (parametrisation, body), (4,) quaternions by (array, row).
         mocap: Where mocap bodies start; None where they start as compiled.
     """
 
     parameters: tuple[Parameter, ...]
-    fields: tuple[tuple[TargetField, ...], ...]
     nominal: dict[tuple[str, int], Array] = field(default_factory=dict)
     mocap: MocapPlacement | None = None
 
@@ -134,40 +134,23 @@ class ParameterSet:
     def build(
         parameters: Sequence[Parameter],
         model: Any,
-        outputs: Sequence[str] = (),
-        decoration: Collection[str] = frozenset(),
         mocap: MocapPlacement | None = None,
     ) -> ParameterSet:
-        """Resolve the targets of all parameters.
+        """Check that parameters can be varied together, and read their nominal values.
 
         Args:
             parameters: The parameters, in the order of theta.
             model: The compiled model (`mujoco.MjModel`).
-            outputs: Names of the measured columns.
-            decoration: Names of geoms whose place and size can be changed without a compile.
             mocap: Where mocap bodies start; None where they start as compiled.
 
         Raises:
-            ExperimentError: A target does not exist, or two parameters contradict each other; the
-                message names them.
+            ExperimentError: Two parameters contradict each other, or a keyframe contradicts one;
+                the message names them.
         """
-        resolved: list[tuple[TargetField, ...]] = []
-        for parameter in parameters:
-            try:
-                resolved.append(
-                    tuple(resolve(model, t.path, outputs, decoration) for t in parameter.targets)
-                )
-            except ExperimentError as error:
-                raise _parameter_error(parameter, str(error)) from None
-
-        fields = _in_one_parametrisation(parameters, resolved)
-        _require_one_owner(parameters, fields)
-        for parameter, row in zip(parameters, fields, strict=True):
-            for target_field in row:
-                _require_movable(model, parameter, target_field, mocap)
-
-        nominal = _nominal_values(parameters, fields, model)
-        return ParameterSet(tuple(parameters), tuple(fields), nominal, mocap)
+        compatible = _in_one_parametrisation(parameters)
+        _require_one_owner(compatible)
+        _require_movable(compatible, model, mocap)
+        return ParameterSet(compatible, _nominal_values(compatible, model), mocap)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -226,25 +209,25 @@ class ParameterSet:
     def initial_state_derivative(self, nx: int) -> Array:
         """(nx, p) derivative of the initial state, in the tangent space."""
         matrix = np.zeros((nx, len(self)))
-        for j, target, target_field in self._targets():
-            if isinstance(target_field, InitialStateField):
-                matrix[target_field.tangent, j] += target.scale
+        for j, target in self._targets():
+            if isinstance(target.field, InitialStateField):
+                matrix[target.field.tangent, j] += target.scale
         return matrix
 
     def bias_derivative(self, ny: int) -> Array:
         """(ny, p) derivative of every output by constant biases."""
         matrix = np.zeros((ny, len(self)))
-        for j, target, target_field in self._targets():
-            if isinstance(target_field, OutputBiasField):
-                matrix[target_field.output, j] += target.scale
+        for j, target in self._targets():
+            if isinstance(target.field, OutputBiasField):
+                matrix[target.field.output, j] += target.scale
         return matrix
 
     @cached_property
     def delay_derivative(self) -> Array:
         """(p,) derivative of the time by which outputs lag [s / theta-unit]."""
         derivative = np.zeros(len(self))
-        for j, target, target_field in self._targets():
-            if isinstance(target_field, OutputDelayField):
+        for j, target in self._targets():
+            if isinstance(target.field, OutputDelayField):
                 derivative[j] += target.scale
         return derivative
 
@@ -292,7 +275,7 @@ class ParameterSet:
     @property
     def changes_friction(self) -> bool:
         """True where a parameter may change dry friction, even one that is nominally zero."""
-        paths = [target.path for _, target, _ in self._targets()]
+        paths = [target.path for _, target in self._targets()]
         return bool(self._is_function.any()) or any("frictionloss" in path for path in paths)
 
     @property
@@ -307,16 +290,15 @@ class ParameterSet:
     def _has_field(self, kinds: type | tuple[type, ...]) -> np.ndarray:
         """(p,) True where a parameter has a field of one of these kinds."""
         found = np.zeros(len(self), dtype=bool)
-        for j, _, target_field in self._targets():
-            found[j] |= isinstance(target_field, kinds)
+        for j, target in self._targets():
+            found[j] |= isinstance(target.field, kinds)
         return found
 
-    def _targets(self) -> Iterator[tuple[int, Target, TargetField]]:
-        """Every target with the index of its parameter and the field that it leads to."""
+    def _targets(self) -> Iterator[tuple[int, Target]]:
+        """Every target with the index of its parameter."""
         for j, parameter in enumerate(self.parameters):
-            fields = self.fields[j]
-            for target, target_field in zip(parameter.targets, fields, strict=True):
-                yield j, target, target_field
+            for target in parameter.targets:
+                yield j, target
 
 
 def _parameter_error(parameter: Parameter, fault: str) -> ExperimentError:
@@ -324,10 +306,8 @@ def _parameter_error(parameter: Parameter, fault: str) -> ExperimentError:
     return ExperimentError(f"parameters.{parameter.name}: {fault}")
 
 
-def _in_one_parametrisation(
-    parameters: Sequence[Parameter], fields: Sequence[tuple[TargetField, ...]]
-) -> list[tuple[TargetField, ...]]:
-    """The fields with one parametrisation for the inertia of every body.
+def _in_one_parametrisation(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """The parameters with one parametrisation for the inertia of every body.
 
     `mass` beside first moments becomes the mass of the barycentric parametrisation.
 
@@ -339,29 +319,32 @@ def _in_one_parametrisation(
     arrays: dict[int, set[str]] = {}
     inertial_arrays = ("body_mass", "body_ipos", "body_inertia")
 
-    for row in fields:
-        for target_field in row:
-            if isinstance(target_field, InertiaField):
-                used = parametrisations.setdefault(target_field.body, set())
-                used.add(target_field.parametrisation)
-            elif isinstance(target_field, ModelField) and target_field.array in inertial_arrays:
-                arrays.setdefault(target_field.rows[0], set()).add(target_field.array)
+    for parameter in parameters:
+        for target in parameter.targets:
+            place = target.field
+            if isinstance(place, InertiaField):
+                parametrisations.setdefault(place.body, set()).add(place.parametrisation)
+            elif isinstance(place, ModelField) and place.array in inertial_arrays:
+                arrays.setdefault(place.rows[0], set()).add(place.array)
 
-    for parameter, row in zip(parameters, fields, strict=True):
-        for target_field in row:
-            body = _body_of(target_field)
+    for parameter in parameters:
+        for target in parameter.targets:
+            body = _body_of(target.field)
             if body in parametrisations:
                 _require_compatible(parameter, parametrisations[body], arrays.get(body, set()))
 
-    def converted(target_field: TargetField) -> TargetField:
-        """The field, or the barycentric mass where first moments of the body are varied."""
-        body = _body_of(target_field)
-        is_mass = isinstance(target_field, ModelField) and target_field.array == "body_mass"
+    def converted(target: Target) -> Target:
+        """The target; its field is the barycentric mass where first moments are varied."""
+        body = _body_of(target.field)
+        is_mass = isinstance(target.field, ModelField) and target.field.array == "body_mass"
         if is_mass and parametrisations.get(body) == {"barycentric"}:
-            return InertiaField(body, "barycentric", 0)
-        return target_field
+            return replace(target, field=InertiaField(body, "barycentric", 0))
+        return target
 
-    return [tuple(converted(target_field) for target_field in row) for row in fields]
+    return tuple(
+        replace(parameter, targets=tuple(converted(target) for target in parameter.targets))
+        for parameter in parameters
+    )
 
 
 def _body_of(target_field: TargetField) -> int:
@@ -394,18 +377,16 @@ def _require_compatible(parameter: Parameter, parametrisations: set[str], arrays
     )
 
 
-def _require_one_owner(
-    parameters: Sequence[Parameter], fields: Sequence[tuple[TargetField, ...]]
-) -> None:
+def _require_one_owner(parameters: Sequence[Parameter]) -> None:
     """Raise where two targets write one number."""
     owner_of_field: dict[TargetField, str] = {}
     owner_of_number: dict[tuple[str, int, int], str] = {}
 
-    for parameter, row in zip(parameters, fields, strict=True):
-        for target, target_field in zip(parameter.targets, row, strict=True):
-            numbers = target_field.numbers if isinstance(target_field, ModelField) else set()
+    for parameter in parameters:
+        for target in parameter.targets:
+            numbers = target.field.numbers if isinstance(target.field, ModelField) else set()
             owners = [owner_of_number[number] for number in numbers if number in owner_of_number]
-            other = owner_of_field.get(target_field) or next(iter(owners), None)
+            other = owner_of_field.get(target.field) or next(iter(owners), None)
             if other is not None:
                 raise _parameter_error(
                     parameter,
@@ -413,48 +394,49 @@ def _require_one_owner(
                     "parameters cannot set one number",
                 )
 
-            owner_of_field[target_field] = parameter.name
+            owner_of_field[target.field] = parameter.name
             owner_of_number |= dict.fromkeys(numbers, parameter.name)
 
 
 def _require_movable(
-    model: Any, parameter: Parameter, target_field: TargetField, mocap: MocapPlacement | None
+    parameters: Sequence[Parameter], model: Any, mocap: MocapPlacement | None
 ) -> None:
     """Raise where a parameter moves a mocap body whose pose a keyframe states."""
-    if isinstance(target_field, RotationField):
-        array, row = target_field.array, target_field.row
-    elif isinstance(target_field, ModelField):
-        array, row = target_field.array, target_field.rows[0]
-    else:
+    if mocap is None:
         return
 
-    if mocap is not None and array in ("body_pos", "body_quat") and row in mocap.bodies:
-        name = element_name(model, "body", row)
-        raise _parameter_error(
-            parameter,
-            f"the keyframe states the pose of mocap body {name!r}; remove its mpos and mquat from "
-            "the keyframe, or the parameter from the experiment",
-        )
+    for parameter in parameters:
+        for target in parameter.targets:
+            if isinstance(target.field, RotationField):
+                array, row = target.field.array, target.field.row
+            elif isinstance(target.field, ModelField):
+                array, row = target.field.array, target.field.rows[0]
+            else:
+                continue
+
+            if array in ("body_pos", "body_quat") and row in mocap.bodies:
+                name = element_name(model, "body", row)
+                raise _parameter_error(
+                    parameter,
+                    f"the keyframe states the pose of mocap body {name!r}; remove its mpos and "
+                    "mquat from the keyframe, or the parameter from the experiment",
+                )
 
 
-def _nominal_values(
-    parameters: Sequence[Parameter], fields: Sequence[tuple[TargetField, ...]], model: Any
-) -> dict[tuple[str, int], Array]:
+def _nominal_values(parameters: Sequence[Parameter], model: Any) -> dict[tuple[str, int], Array]:
     """Values of inertias and orientations in the model, as in `ParameterSet.nominal`."""
     nominal: dict[tuple[str, int], Array] = {}
-    for parameter, row in zip(parameters, fields, strict=True):
-        for target_field in row:
-            if isinstance(target_field, InertiaField):
+    for parameter in parameters:
+        for target in parameter.targets:
+            place = target.field
+            if isinstance(place, InertiaField):
                 try:
-                    target_field.read(model)
+                    place.read(model)
                 except ExperimentError as error:
                     raise _parameter_error(parameter, str(error)) from None
-                parametrisation = INERTIA_PARAMETRISATIONS[target_field.parametrisation]
-                inertia = body_inertia(model, target_field.body)
-                nominal[target_field.parametrisation, target_field.body] = (
-                    parametrisation.coordinates(inertia)
-                )
-            elif isinstance(target_field, RotationField):
-                quaternion = getattr(model, target_field.array)[target_field.row]
-                nominal[target_field.array, target_field.row] = np.array(quaternion)
+                parametrisation = INERTIA_PARAMETRISATIONS[place.parametrisation]
+                inertia = body_inertia(model, place.body)
+                nominal[place.parametrisation, place.body] = parametrisation.coordinates(inertia)
+            elif isinstance(place, RotationField):
+                nominal[place.array, place.row] = np.array(getattr(model, place.array)[place.row])
     return nominal

@@ -75,9 +75,16 @@ class ModelField:
         return float(number) / self.factor
 
     def magnitude(self, model: Any) -> float:
-        """Radius of gyration [m] for a centre of mass; 0 where the value is the magnitude."""
-        if self.array == "body_ipos" and float(model.body_mass[self.rows[0]]) > 0.0:
-            return body_inertia(model, self.rows[0]).gyration_radius
+        """Length with which a change of a position is compared; 0 where the value is compared.
+
+        It is the radius of gyration [m] for a centre of mass, and the bounding radius [m] for the
+        position of a geom.
+        """
+        row = self.rows[0]
+        if self.array == "body_ipos" and float(model.body_mass[row]) > 0.0:
+            return body_inertia(model, row).gyration_radius
+        if self.array == "geom_pos":
+            return float(model.geom_rbound[row])
         return 0.0
 
     def write(self, model: Any, value: float) -> None:

@@ -37,7 +37,7 @@ def unknowns(*parameters: dict) -> ParameterSet:
     built = tuple(
         Parameter(name=f"p{i}", targets=(), **{"guess": 0.0, **p}) for i, p in enumerate(parameters)
     )
-    return ParameterSet(built, ((),) * len(built))
+    return ParameterSet(built)
 
 
 @pytest.mark.parametrize("size", [1e-12, 1.0, 1e9])

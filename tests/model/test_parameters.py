@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -231,9 +233,30 @@ CHARTED = [
 ]
 
 
+def target_at(path: str, scale: float = 1.0, offset: float = 0.0) -> Target:
+    """A target whose field is not resolved yet; `parameter_set` does it."""
+    return Target(path=path, field=cast(Any, None), scale=scale, offset=offset)
+
+
+def parameter_set(
+    parameters: Sequence[Parameter],
+    model: Any,
+    outputs: Sequence[str] = (),
+    decoration: Collection[str] = frozenset(),
+) -> ParameterSet:
+    """The parameters with the fields that their targets lead to in a model."""
+    resolved = []
+    for parameter in parameters:
+        targets = tuple(
+            replace(t, field=resolve(model, t.path, outputs, decoration)) for t in parameter.targets
+        )
+        resolved.append(replace(parameter, targets=targets))
+    return ParameterSet.build(resolved, model)
+
+
 def one(path: str, scale: float = 1.0, offset: float = 0.0) -> Parameter:
     """A parameter with one target."""
-    return Parameter(name="theta", targets=(Target(path, scale, offset),), guess=1.0)
+    return Parameter(name="theta", targets=(target_at(path, scale, offset),), guess=1.0)
 
 
 def compiled(xml: str, parameters: list[Parameter]) -> tuple[Any, Any]:
@@ -267,7 +290,7 @@ def both_ways(xml: str, path: str, value: float) -> tuple[Any, Any, Any]:
     """(base, written in place, recompiled) for one target."""
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
-    resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
+    resolved = parameter_set(parameters, base, decoration=decoration(spec, base))
     theta, other = np.array([value]), spec.copy()
     write_spec(other, base, resolved.writer.model(base, theta), resolved, theta)
     return base, resolved.writer.model(base, theta), other.compile()
@@ -373,8 +396,8 @@ SOLID = ARM.replace(
 def test_inertias_and_rotations_written_in_place_equal_a_compile(xml: str, path: str) -> None:
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
-    resolved = ParameterSet.build(parameters, base)
-    field = resolved.fields[0][0]
+    resolved = parameter_set(parameters, base)
+    field = resolved.parameters[0].targets[0].field
     value, change = (
         field.read(base),
         0.01 * field.magnitude(base) * (-1.0 if "firstmoment" in path else 1.0),
@@ -440,8 +463,8 @@ def test_inertias_of_simple_bodies_are_written_with_the_right_dynamics() -> None
         "body/slider:logcholesky[9]",
     ):
         spec, base = compiled(SIMPLE, [one(path)])
-        resolved = ParameterSet.build([one(path)], base)
-        field, other = resolved.fields[0][0], spec.copy()
+        resolved = parameter_set([one(path)], base)
+        field, other = resolved.parameters[0].targets[0].field, spec.copy()
         change = 0.05 * field.magnitude(base)
         written_by_hand(other, base, path, change)
         own = resolved.writer.model(base, np.array([field.read(base) + change]))
@@ -460,8 +483,8 @@ def test_geoms_that_change_the_dynamics_are_compiled_anew(
     """It agrees with MuJoCo's compile of the edited element."""
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
-    resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
-    assert isinstance(resolved.fields[0][0], SpecField)
+    resolved = parameter_set(parameters, base, decoration=decoration(spec, base))
+    assert isinstance(resolved.parameters[0].targets[0].field, SpecField)
     assert resolved.needs_compile.tolist() == resolved.changes_model.tolist() == [True]
     source = PlantModel(
         ModelSource(Path("model.xml"), spec),
@@ -613,8 +636,8 @@ def test_a_mesh_moves_from_its_compiled_place() -> None:
     source = PlantModel(
         ModelSource(Path("model.xml"), spec), moved_bodies=["a", "b"], sensors=True, friction=True
     )
-    resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
-    now = resolved.fields[0][0].read(base)
+    resolved = parameter_set(parameters, base, decoration=decoration(spec, base))
+    now = resolved.parameters[0].targets[0].field.read(base)
     assert abs(now - 0.2) > 0.01, "no offset: a weak test"
     np.testing.assert_allclose(
         resolved.writer.model(source, np.array([now])).geom_pos, base.geom_pos, rtol=0, atol=1e-14
@@ -640,12 +663,10 @@ def test_mass_and_density_of_geoms_are_not_in_the_compiled_model() -> None:
 def test_one_rest_length_stands_for_both_ends_of_the_range() -> None:
     """Otherwise the lower end would exceed the upper one, which MuJoCo refuses."""
     _, base = compiled(TENDON, [])
-    own = ParameterSet.build([one("tendon/t:springlength")], base).writer.model(
-        base, np.array([0.5])
-    )
+    own = parameter_set([one("tendon/t:springlength")], base).writer.model(base, np.array([0.5]))
     assert own.tendon_lengthspring.tolist() == [[0.5, 0.5]]
     _, ranged = compiled(TENDON.replace('springlength=".3"', 'springlength=".3 .4"'), [])
-    own = ParameterSet.build([one("tendon/t:springlength")], ranged).writer.model(
+    own = parameter_set([one("tendon/t:springlength")], ranged).writer.model(
         ranged, np.array([0.1])
     )
     assert own.tendon_lengthspring.tolist() == [[0.1, 0.4]]
@@ -670,10 +691,10 @@ def test_servo_gains_are_those_of_the_mjcf(kind: str, written: str, path: str) -
     (_, base), (_, again) = (
         compiled(ARM.replace(servo, written.format(gain)), []) for gain in ("10", "7.25")
     )
-    resolved = ParameterSet.build([one(path)], base)
-    assert resolved.fields[0][0].read(base) == 10.0
+    resolved = parameter_set([one(path)], base)
+    assert resolved.parameters[0].targets[0].field.read(base) == 10.0
     own = resolved.writer.model(base, np.array([7.25]))
-    assert resolved.fields[0][0].read(own) == 7.25
+    assert resolved.parameters[0].targets[0].field.read(own) == 7.25
     np.testing.assert_array_equal(own.actuator_gainprm, again.actuator_gainprm)
     np.testing.assert_array_equal(own.actuator_biasprm, again.actuator_biasprm)
     np.testing.assert_array_equal(rollout(own), rollout(again))
@@ -686,9 +707,9 @@ def test_servo_gains_are_those_of_the_mjcf(kind: str, written: str, path: str) -
 def test_a_gain_by_two_names_is_one_number(first: str, second: str) -> None:
     _, base = compiled(ARM, [])
     with pytest.raises(ExperimentError, match=r"b: target .* already belongs to parameters\.a"):
-        ParameterSet.build(
+        parameter_set(
             [
-                Parameter(name=n, targets=(Target(f"actuator/p:{field}"),), guess=1.0)
+                Parameter(name=n, targets=(target_at(f"actuator/p:{field}"),), guess=1.0)
                 for n, field in (("a", first), ("b", second))
             ],
             base,
@@ -721,16 +742,16 @@ def test_servos_with_several_controls_have_gains_too(written: str, path: str) ->
     base, again = (
         mujoco.MjModel.from_xml_string(BALL.format(written.format(gain))) for gain in ("2", "3.5")
     )
-    resolved = ParameterSet.build([one(path)], base)
-    assert resolved.fields[0][0].read(base) == 2.0
+    resolved = parameter_set([one(path)], base)
+    assert resolved.parameters[0].targets[0].field.read(base) == 2.0
     mine, theirs = arrays(resolved.writer.model(base, np.array([3.5]))), arrays(again)
     assert [n for n in theirs if not np.array_equal(mine[n], theirs[n])] == []
 
 
 def test_gears_are_counted_by_force_outputs() -> None:
     base = mujoco.MjModel.from_xml_string(BALL.format('<orientation name="s" joint="j" kp="2"/>'))
-    resolved = ParameterSet.build([one("actuator/m:gear")], base)
-    assert resolved.fields[0][0].read(base) == 1.5
+    resolved = parameter_set([one("actuator/m:gear")], base)
+    assert resolved.parameters[0].targets[0].field.read(base) == 1.5
     np.testing.assert_array_equal(
         resolved.writer.model(base, np.array([7.0])).actuator_gear[:, 0], [1.0, 1.0, 1.0, 7.0]
     )
@@ -739,10 +760,10 @@ def test_gears_are_counted_by_force_outputs() -> None:
 def test_the_damping_of_a_servo_does_not_follow_its_gain() -> None:
     parameters = [
         one("actuator/p:kp"),
-        Parameter(name="kv", targets=(Target("actuator/p:kv"),), guess=1.0),
+        Parameter(name="kv", targets=(target_at("actuator/p:kv"),), guess=1.0),
     ]
     _, base = compiled(ARM, [])
-    own = ParameterSet.build(parameters, base).writer.model(base, np.array([20.0, 3.0]))
+    own = parameter_set(parameters, base).writer.model(base, np.array([20.0, 3.0]))
     assert own.actuator("p").gainprm[0] == 20.0
     assert own.actuator("p").biasprm[:3].tolist() == [0.0, -20.0, -3.0]
 
@@ -756,10 +777,11 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
         'name="t" ', 'name="t" euler="1 0 .3" '
     )
     parameters = [
-        Parameter(name=f"r{i}", targets=(Target(f"{thing}:rot[{i}]"),), guess=0.0) for i in range(3)
+        Parameter(name=f"r{i}", targets=(target_at(f"{thing}:rot[{i}]"),), guess=0.0)
+        for i in range(3)
     ]
     spec, base = compiled(xml, parameters)
-    resolved, vector = ParameterSet.build(parameters, base), np.array([0.5, -0.9, 0.7])
+    resolved, vector = parameter_set(parameters, base), np.array([0.5, -0.9, 0.7])
     kind, name = thing.split("/")
     turn, quat = np.zeros(4), np.zeros(4)
     mujoco.mju_axisAngle2Quat(turn, vector / np.linalg.norm(vector), float(np.linalg.norm(vector)))
@@ -771,7 +793,8 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
     np.testing.assert_allclose(
         rollout(own, 100), rollout(spec.compile(), 100), rtol=1e-9, atol=1e-9
     )
-    assert all(isinstance(s, RotationField) for row in resolved.fields for s in row)
+    targets = [t for parameter in resolved.parameters for t in parameter.targets]
+    assert all(isinstance(t.field, RotationField) for t in targets)
     again = resolved.writer.model(base, np.zeros(3))  # nothing of the first value is left
     np.testing.assert_allclose(rollout(again, 100), rollout(base, 100), rtol=1e-9, atol=1e-9)
 
@@ -795,19 +818,19 @@ def test_mixed_parametrisations_of_one_body_are_refused(
     _, base = compiled(SOLID, [])
     for first, second in (fields, fields[::-1]):
         pair = [
-            Parameter(name=n, targets=(Target(f"body/a:{f}"),), guess=1.0)
+            Parameter(name=n, targets=(target_at(f"body/a:{f}"),), guess=1.0)
             for n, f in (("p", first), ("q", second))
         ]
         with pytest.raises(
             ExperimentError,
             match=r"parameters\.[pq]: .*several coordinates at once .*valid together",
         ):
-            ParameterSet.build(pair, base)
+            parameter_set(pair, base)
     apart = [
-        Parameter(name="p", targets=(Target(f"body/a:{fields[0]}"),), guess=1.0),
-        Parameter(name="q", targets=(Target(f"body/b:{fields[1]}"),), guess=1.0),
+        Parameter(name="p", targets=(target_at(f"body/a:{fields[0]}"),), guess=1.0),
+        Parameter(name="q", targets=(target_at(f"body/b:{fields[1]}"),), guess=1.0),
     ]
-    assert len(ParameterSet.build(apart, base)) == 2
+    assert len(parameter_set(apart, base)) == 2
 
 
 def test_mass_beside_first_moments_keeps_them() -> None:
@@ -820,14 +843,14 @@ def test_mass_beside_first_moments_keeps_them() -> None:
     )
     parameters = [
         one("body/a:mass"),
-        Parameter(name="h", targets=(Target("body/a:firstmoment[2]"),), guess=1.0),
+        Parameter(name="h", targets=(target_at("body/a:firstmoment[2]"),), guess=1.0),
     ]
-    own = ParameterSet.build(parameters, base).writer.model(base, np.array([1.5, before[3] + 0.02]))
+    own = parameter_set(parameters, base).writer.model(base, np.array([1.5, before[3] + 0.02]))
     after = INERTIA_PARAMETRISATIONS["barycentric"].coordinates(body_inertia(own, own.body("a").id))
     wanted = np.array(before)
     wanted[0], wanted[3] = 1.5, before[3] + 0.02
     np.testing.assert_allclose(after, wanted, rtol=1e-12, atol=1e-15)
-    alone = ParameterSet.build([one("body/a:mass")], base).writer.model(base, np.array([1.5]))
+    alone = parameter_set([one("body/a:mass")], base).writer.model(base, np.array([1.5]))
     np.testing.assert_array_equal(alone.body("a").ipos, base.body("a").ipos)
 
 
@@ -850,11 +873,11 @@ def test_measurement_and_initial_state_are_outside_the_model() -> None:
     """Linear maps of theta outside the model, by the scale of their targets."""
     paths = ["initial/k:qvel", "initial/j:qpos", "output/b:bias", "output:delay", "body/a:mass"]
     parameters = [
-        Parameter(name=p, targets=(Target(p, s),), guess=1.0)
+        Parameter(name=p, targets=(target_at(p, s),), guess=1.0)
         for p, s in zip(paths, (2.0, -1.0, 0.5, 3.0, 1.0), strict=True)
     ]
     _, base = compiled(ARM, [])
-    resolved = ParameterSet.build(parameters, base, outputs=("a", "b"))
+    resolved = parameter_set(parameters, base, outputs=("a", "b"))
     start = np.zeros((4, 5))
     start[3, 0], start[0, 1] = 2.0, -1.0
     np.testing.assert_array_equal(resolved.initial_state_derivative(4), start)
@@ -904,13 +927,13 @@ def test_the_model_at_theta_has_the_right_dynamics_for_simple_bodies(tmp_path) -
 
 def test_several_targets_follow_one_parameter_by_scale_and_offset() -> None:
     targets = (
-        Target("body/a:mass"),
-        Target("body/b:mass", 2.0, 0.5),
-        Target("joint/j:damping", -1.0, 3.0),
+        target_at("body/a:mass"),
+        target_at("body/b:mass", 2.0, 0.5),
+        target_at("joint/j:damping", -1.0, 3.0),
     )
     parameters = [Parameter(name="m", targets=targets, guess=1.0), one("option:gravity[1]")]
     spec, base = compiled(ARM, parameters)
-    resolved = ParameterSet.build(parameters, base)
+    resolved = parameter_set(parameters, base)
     own = resolved.writer.model(base, np.array([1.25, -0.5]))
     assert (own.body("a").mass[0], own.body("b").mass[0], own.joint("j").damping[0]) == (
         1.25,
@@ -927,13 +950,13 @@ def test_one_number_takes_one_parameter() -> None:
     parameters = [one("body/a:mass"), one("body/a:mass")]
     _, base = compiled(ARM, [])
     with pytest.raises(ExperimentError, match=r"body/a:mass.*already belongs"):
-        ParameterSet.build(parameters, base)
+        parameter_set(parameters, base)
 
 
 def test_stating_the_inertia_of_geoms_changes_only_the_target() -> None:
     spec, base = compiled(ARM, [])
     assert not spec.body("b").explicitinertial
-    resolved = ParameterSet.build([one("body/b:mass")], base)
+    resolved = parameter_set([one("body/b:mass")], base)
     write_spec(spec, base, base, resolved, np.array([base.body("b").mass[0]]))
     assert spec.body("b").explicitinertial
     np.testing.assert_array_equal(rollout(spec.compile()), rollout(base))
@@ -942,7 +965,7 @@ def test_stating_the_inertia_of_geoms_changes_only_the_target() -> None:
 def test_values_are_written_into_private_copies() -> None:
     parameters = [one("body/b:ipos[1]"), one("body/b:mass")]
     _, base = compiled(ARM, parameters)
-    before, resolved = arrays(base), ParameterSet.build(parameters, base)
+    before, resolved = arrays(base), parameter_set(parameters, base)
     first = resolved.writer.model(base, np.array([0.2, 3.0]))
     kept = arrays(first)
     second = resolved.writer.model(base, np.array([0.3, 4.0]))
@@ -956,7 +979,7 @@ def test_values_are_written_into_private_copies() -> None:
 def test_writing_twice_leaves_no_trace_of_the_first_value() -> None:
     parameters = [one("body/b:ipos[1]"), one("body/b:mass")]
     _, base = compiled(ARM, parameters)
-    resolved = ParameterSet.build(parameters, base)
+    resolved = parameter_set(parameters, base)
     own, fresh = (
         resolved.writer.model(base, np.array([0.4, 9.0])),
         resolved.writer.model(base, np.array([0.1, 2.0])),
@@ -973,7 +996,7 @@ def test_joint_fields_reach_every_degree_of_freedom_of_the_joint_and_no_other(
     path: str, rows
 ) -> None:
     _, base = compiled(SIMPLE, [])
-    own = ParameterSet.build([one(path)], base).writer.model(base, np.array([0.7]))
+    own = parameter_set([one(path)], base).writer.model(base, np.array([0.7]))
     assert list(np.flatnonzero(own.dof_damping)) == list(rows)
 
 
@@ -1054,9 +1077,8 @@ def test_names_may_hold_slashes_and_spaces() -> None:
 def test_the_message_about_a_wrong_path_names_valid_values(path: str, said: list[str]) -> None:
     _, base = compiled(ARM, [])
     with pytest.raises(ExperimentError) as caught:
-        ParameterSet.build([one(path)], base)
+        resolve(base, path)
     message = str(caught.value)
-    assert message.startswith("parameters.theta: ")
     assert repr(path) in message
     for part in said:
         assert part in message
@@ -1077,7 +1099,7 @@ def test_names_are_listed_without_the_unnamed() -> None:
 
 def test_theta_of_the_wrong_length_is_refused() -> None:
     _, base = compiled(ARM, [])
-    resolved = ParameterSet.build([one("body/a:mass")], base)
+    resolved = parameter_set([one("body/a:mass")], base)
     with pytest.raises(ValueError, match=r"shorter|longer"):
         resolved.writer.model(base, np.array([1.0, 2.0]))
 
@@ -1085,17 +1107,17 @@ def test_theta_of_the_wrong_length_is_refused() -> None:
 def test_difference_steps_and_priors_follow_guess_and_scale() -> None:
     _, base = compiled(ARM, [])
     large = Parameter(
-        name="large", targets=(Target("body/a:mass"),), guess=-3.0, scale=0.5, prior=0.1
+        name="large", targets=(target_at("body/a:mass"),), guess=-3.0, scale=0.5, prior=0.1
     )
     zero = Parameter(
         name="zero",
-        targets=(Target("joint/j:damping"),),
+        targets=(target_at("joint/j:damping"),),
         guess=0.0,
         scale=0.2,
         true=0.4,
         bounds=(0.0, 1.0),
     )
-    resolved = ParameterSet.build([large, zero], base)
+    resolved = parameter_set([large, zero], base)
     np.testing.assert_array_equal(resolved.magnitude, [3.0, 0.2])
     np.testing.assert_allclose(resolved.prior_information, np.diag([100.0, 0.0]), rtol=1e-14)
     np.testing.assert_array_equal(resolved.true, [-3.0, 0.4])

@@ -87,22 +87,20 @@ class ParameterEdits:
         # Whether the inertia matrix of a body is varied as a whole, by name of the body.
         bodies: dict[str, bool] = {}
 
-        for parameter, fields, value in zip(
-            parameters.parameters, parameters.fields, theta, strict=True
-        ):
+        for parameter, value in zip(parameters.parameters, theta, strict=True):
             if parameter.function is not None:
                 raise ModelError(f"parameters.{parameter.name} is a Python function of the MjSpec")
 
-            for target, target_field in zip(parameter.targets, fields, strict=True):
+            for target in parameter.targets:
                 kind, name, field = _parts(target)
-                as_matrix = isinstance(target_field, InertiaField)
+                as_matrix = isinstance(target.field, InertiaField)
 
                 # All parameters of one body's inertia are written together.
                 if as_matrix or (kind == "body" and field in INERTIAL_FIELDS):
                     bodies[name] = bodies.get(name, False) or as_matrix
                 else:
                     written = target.scale * float(value) + target.offset
-                    self._write_field(kind, name, field, target_field, written)
+                    self._write_field(kind, name, field, target.field, written)
 
         for name, as_matrix in bodies.items():
             write_inertial(self.document, name, self._old, self._wanted, as_matrix=as_matrix)
