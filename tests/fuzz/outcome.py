@@ -96,7 +96,6 @@ def _known(kind: str, description: str, complaint: str, reason: str) -> KnownFai
 
 # Failures that are reported, but do not make the suite fail. This list must be empty in the end.
 KNOWN_FAILURES: tuple[KnownFailure, ...] = (
-    _known("input", "1e300", "RuntimeWarning", "a huge number in a log is not named"),
     _known("kill", "SIGTERM", "exit code -15", "SIGTERM ends without results"),
     _known("kill", "SIGINT", "exit code -2", "Ctrl-C at start-up or at the end has no message"),
     _known("kill", "", "processes alive", "workers outlive a killed parent"),
