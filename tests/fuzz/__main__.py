@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -13,6 +14,7 @@ from pathlib import Path
 from mjfim.parallel import cores
 from tests.fuzz.outcome import KINDS, Case, Outcome
 from tests.fuzz.workers import run_cases
+from tests.support.paths import ROOT
 
 
 def cases_of(counts: dict[str, int], seed: int) -> Iterator[Case]:
@@ -93,8 +95,11 @@ def _here(cases: list[Case]) -> Iterator[Outcome]:
     """Run cases in this process, for a debugger; their files stay."""
     from tests.fuzz.workers import run_case
 
+    home = Path(tempfile.mkdtemp(prefix="mjfim-fuzz-"))
+    sys.path.insert(0, str(ROOT))
+    os.chdir(home)
     for case in cases:
-        folder = Path(tempfile.mkdtemp(prefix="mjfim-fuzz-"))
+        folder = Path(tempfile.mkdtemp(dir=home))
         print(f"{case}: files in {folder}")
         yield run_case(case, folder)
 

@@ -97,13 +97,15 @@ class Worker:
     """A process that runs one case after the other; it is replaced when it crashes or hangs."""
 
     def __init__(self) -> None:
+        # The parent removes the folder: a process that is killed cannot.
+        self._home = tempfile.TemporaryDirectory(prefix="mjfim-fuzz-", ignore_cleanup_errors=True)
         self._start()
 
     def _start(self) -> None:
         """Start the process, and wait until it is ready."""
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,))
+        self._process = context.Process(target=_serve, args=(theirs, self._home.name))
         self._process.start()
         theirs.close()
         if not self._connection.poll(PREPARATION):
@@ -128,11 +130,16 @@ class Worker:
         else:
             fault = f"no end after {limit:g} s"
 
-        self.stop()
+        self._kill()
         self._start()
         return Outcome(case=case, group="crash", description=description, complaint=fault)
 
     def stop(self) -> None:
+        """End the process and what it has started, and remove its files."""
+        self._kill()
+        self._home.cleanup()
+
+    def _kill(self) -> None:
         """End the process and what it has started."""
         if hasattr(os, "killpg") and self._process.pid is not None:
             with contextlib.suppress(ProcessLookupError):
@@ -152,8 +159,8 @@ def announce(description: str) -> None:
         connection.send(description)
 
 
-def _serve(connection: Connection) -> None:
-    """Run the cases that arrive, each in an empty folder, until the parent ends."""
+def _serve(connection: Connection, home: str) -> None:
+    """Run the cases that arrive, each in an empty folder inside `home`, until the parent ends."""
     if hasattr(os, "setsid"):
         os.setsid()
     _limit_memory()
@@ -161,17 +168,15 @@ def _serve(connection: Connection) -> None:
     # MuJoCo writes its log into the current folder; processes still have to find the package.
     sys.path.insert(0, str(ROOT))
     os.environ["PYTHONPATH"] = str(ROOT)
-    with tempfile.TemporaryDirectory(prefix="mjfim-fuzz-") as home:
-        os.chdir(home)
-        _parent.append(connection)
-        connection.send("ready")
-        try:
-            while True:
-                case = connection.recv()
-                with tempfile.TemporaryDirectory(dir=home, ignore_cleanup_errors=True) as folder:
-                    connection.send(run_case(case, Path(folder)))
-        except (EOFError, ConnectionError):
-            return
+    os.chdir(home)
+    _parent.append(connection)
+    connection.send("ready")
+
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            case = connection.recv()
+            with tempfile.TemporaryDirectory(dir=home, ignore_cleanup_errors=True) as folder:
+                connection.send(run_case(case, Path(folder)))
 
 
 def _limit_memory() -> None:
