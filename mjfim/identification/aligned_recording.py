@@ -171,6 +171,28 @@ def _outputs(system: System, recording: Recording) -> Array:
     return y
 
 
+def changes_within_samples(t: Array, ctrl: Array, dt: float) -> float:
+    """Share of the changes of a control that lie inside a sample of the grid.
+
+    The control of such a sample is replaced by its mean, so that the change acts earlier or later
+    than it did on the robot.
+
+    Args:
+        t: (M,) times of the rows [s].
+        ctrl: (M-1, nu) control that is held from each row to the next one [u-unit].
+        dt: Sample period of the grid [s].
+
+    Returns:
+        The share, 0 for a control that never changes.
+    """
+    changed = np.any(np.diff(ctrl, axis=0) != 0.0, axis=1)
+    if not changed.any():
+        return 0.0
+
+    place = (t[1:-1][changed] - t[0]) / dt
+    return float(np.mean(np.abs(place - np.rint(place)) > GRID_TOLERANCE))
+
+
 def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     """Mean of a held control over each sample period.
 

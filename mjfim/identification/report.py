@@ -11,6 +11,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.identification.accuracy import Accuracy, accuracy_of
+from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
 from mjfim.identification.fit_quality import FitQuality, fit_quality
 from mjfim.identification.missing_terms import find_missing_terms
@@ -30,6 +31,11 @@ IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
 # Distance from a bound, relative to the magnitude of the parameter, at which an estimate counts as
 # at the bound.
 BOUND_TOLERANCE = 1e-6
+
+
+# A recording is remarked on if at least this share of the changes of its control lies inside
+# samples of the experiment.
+MIN_SHARE_WITHIN_SAMPLES = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -255,6 +261,8 @@ def _warnings(findings: _Findings) -> Iterator[str]:
     # Where the misfit is, and where it may come from.
     if findings.reasons and findings.quality.worst_residual is not None:
         yield str(findings.quality.worst_residual)
+    if findings.reasons:
+        yield from _warnings_of_rate(result.task)
     for term in findings.missing:
         yield f"the model may lack {term}"
 
@@ -266,6 +274,24 @@ def _warnings(findings: _Findings) -> Iterator[str]:
     for recording in result.task.recordings:
         for remark in plausibility_remarks(channels, recording):
             yield f"poor data in {Path(recording.name).name}: {remark}"
+
+
+def _warnings_of_rate(task: FitTask) -> Iterator[str]:
+    """Warnings about recordings whose control changes inside the samples of the experiment."""
+    dt = task.system.dt
+    for recording in task.recordings:
+        count = len(recording.t) - 1
+        share = changes_within_samples(recording.t, recording.ctrl[:count], dt)
+        if share < MIN_SHARE_WITHIN_SAMPLES:
+            continue
+
+        rate = 1.0 / float(np.median(np.diff(recording.t)))
+        yield (
+            f"{100 * share:.0f} % of the changes of the control in {Path(recording.name).name} lie "
+            f"inside the samples of the experiment ({1.0 / dt:g} Hz), which hold its mean: this "
+            f"alone can cause a misfit. State the rate of the log, rate = {rate:.4g}, in the "
+            "experiment file (each sample is a whole number of timesteps of the model)"
+        )
 
 
 def _warnings_of_search(findings: _Findings) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -159,3 +160,34 @@ def test_one_extreme_value_is_named_where_the_simulation_diverges(
     message = rf"diverges at the start .*; log: column '{name}' holds 1e\+200 in row {row} of"
     with pytest.raises(SimulationDivergedError, match=message):
         mjfim.identify(experiment, [faulty], threads=1)
+
+
+def test_a_log_at_a_higher_rate_is_fitted_at_its_own_rate(tmp_path: Path) -> None:
+    """At half the rate of the log every other change of the control acts too early or too late.
+
+    The warning names the cause, and the rate of the log mends it.
+    """
+    model = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
+    model = model.replace('timestep="0.01"', 'timestep="0.005"')
+    (tmp_path / "fine.xml").write_text(model, encoding="utf-8")
+    text = MINIMAL.replace((MODELS / "cart_pendulum.xml").as_posix(), "fine.xml")
+    text = text.replace("state = 0.05", "state = 0.001")
+    for rate in (100, 200):
+        stated = text.replace("rate = 100.0", f"rate = {rate}.0")
+        (tmp_path / f"{rate}.toml").write_text(stated, encoding="utf-8")
+    slow, fast = (mjfim.Experiment.from_file(tmp_path / f"{rate}.toml") for rate in (100, 200))
+
+    system, rng = System.resolve(fast), np.random.default_rng(1)
+    t, ctrl = np.arange(201) * system.dt, 10.0 * rng.standard_normal((200, 1))
+    y, _ = system.plant.measure(system.parameters.true[None], ctrl)
+    y = y[0] + 0.001 * rng.standard_normal(y[0].shape)
+    log = Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log")
+
+    at_half_rate = mjfim.identify(slow, [log], threads=1)
+    assert at_half_rate.misfit
+    cause = [warning for warning in at_half_rate.warnings if "rate = 200" in warning]
+    assert cause and cause[0].startswith("50 % of the changes of the control in log lie inside")
+
+    at_its_rate = mjfim.identify(fast, [log], threads=1)
+    assert not at_its_rate.misfit
+    assert not any("inside the samples" in warning for warning in at_its_rate.warnings)
