@@ -221,11 +221,13 @@ class ControlConstraint:
 class ControlRateConstraint:
     """Ranges of the rates of the controls.
 
-    A rate is the change of a control from one sample to the next over the sample period.
+    A rate is the change of a control from one sample to the next over the time in which it is
+    played: the period of the rows of design.csv. Every row of a sample has the same control, so
+    that the control changes within one row.
 
     Attributes:
         bounds: Range of the rate of each control, (nu,) [u-unit / s].
-        dt: Sample period [s].
+        dt: Period of the rows of design.csv, the sample period without a `playback_rate` [s].
         control_before: (nu,) control before the first sample [u-unit]; None where it is free.
         control_after: (nu,) control after the last sample [u-unit]; None where it is free.
         periodic: The control after the last sample is that of the first one.

@@ -227,7 +227,7 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
     if rate_bounds is not None:
         rate = ControlRateConstraint(
             bounds=rate_bounds,
-            dt=task.dt,
+            dt=task.dt / task.system.stated_grid.rows_per_sample,
             control_before=before,
             control_after=after,
             periodic=boundary.end == "periodic",

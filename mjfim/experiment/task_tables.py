@@ -231,7 +231,11 @@ class Limits(Section):
     )
     control_rate: Positive | dict[str, Positive | Range] = Field(
         default_factory=dict,
-        description="Limit of the change of the controls [actuator unit per s].",
+        description=(
+            "Limit of the change of the controls from one row of design.csv to the next, over the "
+            "period of the rows [actuator unit per s]. Each sample is held, so a `playback_rate` "
+            "of k times `rate` divides the allowed change from sample to sample by k."
+        ),
     )
     force: Positive | dict[str, Positive | Range] = Field(
         default_factory=dict, description="Limit of the actuator forces [N or N m]."

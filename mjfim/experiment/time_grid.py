@@ -54,6 +54,11 @@ class TimeGrid:
             playback_steps=_playback_steps(rate, experiment.playback_rate, substeps),
         )
 
+    @property
+    def rows_per_sample(self) -> int:
+        """Rows of design.csv in one sample, on the stated grid."""
+        return self.substeps // self.playback_steps
+
     def with_variant(self, variant: ModelVariant) -> TimeGrid:
         """This grid with longer samples or a longer timestep; longer samples are all measured."""
         if self.substeps % variant.timestep_factor:

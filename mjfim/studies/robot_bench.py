@@ -497,22 +497,18 @@ class RobotBench:
         return np.array(margins)
 
     def _control_rates(self, sent: Array, before: Array, feedback: bool) -> Array:
-        """Rates of the control over one sample [unit of the actuator / s].
+        """Rates of the control from row to row of design.csv [unit of the actuator / s].
 
         They include the change from the control before the motion, and the change to the control
         after its end.
         """
-        rows_per_sample = round(self.stated.dt / self.plan.period)
         rate = self.constraints.rate
         after = sent[-1] if feedback or rate is None else rate.control_after
         if after is None:
             after = sent[-1]
 
-        controls = np.concatenate(
-            [np.tile(before, (rows_per_sample, 1)), sent, np.tile(after, (rows_per_sample, 1))]
-        )
-        changes = controls[rows_per_sample:] - controls[:-rows_per_sample]
-        return np.asarray(changes / self.stated.dt)
+        changes = np.diff(sent, axis=0, prepend=before[None], append=after[None])
+        return np.asarray(changes / self.plan.period)
 
     # ---- predictions of the model
 

@@ -12,6 +12,7 @@ import pytest
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, verify
+from mjfim.output.playback import simulate_playback
 from tests.support.numerics import CART_PENDULUM, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
@@ -163,6 +164,28 @@ def test_violated_limits_that_are_only_checked_leave_a_design_feasible(tmp_path:
         found = verify(task, task.initial)
         assert found.margins["position"] < 0.0
         assert found.margins["clearance"] < 0.0
+        assert found.is_feasible is kept
+
+
+@pytest.mark.parametrize("rows", [1, 20])
+def test_a_rate_of_the_control_holds_from_row_to_row_of_the_played_table(
+    rows: int, tmp_path: Path
+) -> None:
+    """The table holds each sample for all its rows, so that the control jumps within one row."""
+    control = {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0}
+    tables: dict[str, Any] = {"initial": {"qvel": (SPEED,), "control": control}}
+    tables["playback_rate"] = 10.0 * rows
+    task = spring_task(tmp_path, **tables)
+
+    # The largest rate of the rows, from the table itself.
+    gain = np.zeros((len(task.control), 1, 2))
+    played = simulate_playback(task.system, task.initial, gain)
+    fastest = np.abs(np.diff(played.ctrl, axis=0)).max() / (played.t[1] - played.t[0])
+
+    for share, kept in ((1.01, True), (0.99, False)):
+        limited = spring_task(tmp_path, limits={"control_rate": share * fastest}, **tables)
+        found = verify(limited, limited.initial)
+        assert found.margins["control_rate"] == pytest.approx((share - 1.0) * fastest)
         assert found.is_feasible is kept
 
 

@@ -114,7 +114,8 @@ def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
         },
     }
 
-    # The rate of a control is limited from sample to sample, not from row to row.
+    # The player takes the rate of a control over a sample; with a playback rate, the limit holds
+    # from row to row.
     if substeps > 1 and "control_rate" not in tables["limits"] and rng.random() < 0.3:
         tables["playback_rate"] = 1.0 / plant.timestep
     return tables
