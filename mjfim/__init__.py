@@ -5,30 +5,36 @@ information about them, `simulate` makes a synthetic recording, `identify` estim
 from recordings, and `monte_carlo` compares the estimates with the Cramér-Rao bound.
 """
 
-from mjfim.budget import Budget, StopToken
-from mjfim.errors import MjfimError
-from mjfim.excitation.design import design
-from mjfim.excitation.evaluation import evaluate
-from mjfim.excitation.joint_design import design_jointly
-from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
-from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate
-from mjfim.identification.cross_validation import predict
-from mjfim.identification.identify import identify
-from mjfim.parallel import Pool
-from mjfim.records.campaign import Campaign
-from mjfim.records.check import Check
-from mjfim.records.comparison import Comparison
-from mjfim.records.design import Design
-from mjfim.records.estimate import Estimate
-from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
-from mjfim.studies.campaign import run_campaign
-from mjfim.studies.check import check
-from mjfim.studies.compare import compare
-from mjfim.studies.monte_carlo import monte_carlo
-from mjfim.studies.robustness import assess_robustness
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+# Programs import each name when they use it first, see `__getattr__`: importing all of them takes
+# seconds, in which the command line must be able to react to Ctrl-C.
+if TYPE_CHECKING:
+    from mjfim.budget import Budget, StopToken
+    from mjfim.errors import MjfimError
+    from mjfim.excitation.design import design
+    from mjfim.excitation.evaluation import evaluate
+    from mjfim.excitation.joint_design import design_jointly
+    from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
+    from mjfim.experiment.schema import Experiment
+    from mjfim.experiment.simulate import simulate
+    from mjfim.identification.cross_validation import predict
+    from mjfim.identification.identify import identify
+    from mjfim.parallel import Pool
+    from mjfim.records.campaign import Campaign
+    from mjfim.records.check import Check
+    from mjfim.records.comparison import Comparison
+    from mjfim.records.design import Design
+    from mjfim.records.estimate import Estimate
+    from mjfim.records.monte_carlo import MonteCarloStudy
+    from mjfim.records.recording import Recording
+    from mjfim.records.trajectory import Trajectory
+    from mjfim.studies.campaign import run_campaign
+    from mjfim.studies.check import check
+    from mjfim.studies.compare import compare
+    from mjfim.studies.monte_carlo import monte_carlo
+    from mjfim.studies.robustness import assess_robustness
 
 __all__ = [
     "Budget",
@@ -60,6 +66,36 @@ __all__ = [
 ]
 __version__ = "0.1.0"
 
+# Module of each name.
+MODULES = {
+    "Budget": "mjfim.budget",
+    "StopToken": "mjfim.budget",
+    "MjfimError": "mjfim.errors",
+    "design": "mjfim.excitation.design",
+    "evaluate": "mjfim.excitation.evaluation",
+    "design_jointly": "mjfim.excitation.joint_design",
+    "ShortestExperiment": "mjfim.excitation.shortest_horizon",
+    "shortest_experiment": "mjfim.excitation.shortest_horizon",
+    "Experiment": "mjfim.experiment.schema",
+    "simulate": "mjfim.experiment.simulate",
+    "predict": "mjfim.identification.cross_validation",
+    "identify": "mjfim.identification.identify",
+    "Pool": "mjfim.parallel",
+    "Campaign": "mjfim.records.campaign",
+    "Check": "mjfim.records.check",
+    "Comparison": "mjfim.records.comparison",
+    "Design": "mjfim.records.design",
+    "Estimate": "mjfim.records.estimate",
+    "MonteCarloStudy": "mjfim.records.monte_carlo",
+    "Recording": "mjfim.records.recording",
+    "Trajectory": "mjfim.records.trajectory",
+    "run_campaign": "mjfim.studies.campaign",
+    "check": "mjfim.studies.check",
+    "compare": "mjfim.studies.compare",
+    "monte_carlo": "mjfim.studies.monte_carlo",
+    "assess_robustness": "mjfim.studies.robustness",
+}
+
 # Names of earlier versions, each with its new name.
 RENAMED = {
     "Study": "MonteCarloStudy",
@@ -77,16 +113,24 @@ REPLACED = {
 
 
 def __getattr__(name: str) -> object:
-    """Raise an error that states the new name of a renamed function or record.
+    """Import a name when it is used first; explain the names of earlier versions.
 
     Raises:
         ImportError: The name was renamed; the message states the new one. An AttributeError is not
             used, because `from mjfim import name` would replace it and its message.
         AttributeError: The name does not exist and did not exist before.
     """
+    if name in MODULES:
+        return getattr(import_module(MODULES[name]), name)
+
     if name in RENAMED:
         raise ImportError(f"mjfim.{name} is called mjfim.{RENAMED[name]} now")
     if name in REPLACED:
         raise ImportError(f"mjfim.{name} does not exist any more: use {REPLACED[name]}")
 
     raise AttributeError(f"module 'mjfim' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Names of the package, also those that are not imported yet."""
+    return sorted({*globals(), *__all__})

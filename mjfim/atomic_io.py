@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import platform
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +14,16 @@ from typing import Protocol
 
 # Permissions of a new file, from which the umask of the process removes some.
 DEFAULT_PERMISSIONS = 0o666
+
+# Begin of the names of temporary files. The computer is named, because the number of a process says
+# nothing on another one that shares the folder.
+COMPUTER = re.sub(r"[^A-Za-z0-9]", "", platform.node()) or "local"
+PREFIX = f".mjfim-{COMPUTER}-"
+
+# Temporary files that this process is writing, and folders in which it has looked for left-over
+# ones.
+_open_files: set[Path] = set()
+_tidied_folders: set[Path] = set()
 
 
 class Guard(Protocol):
@@ -67,7 +79,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """Write a file under a temporary name and rename it at the end.
 
     The file appears under its name if the block succeeds. If the block fails, the temporary file is
-    removed and an existing file remains unchanged. Missing parent folders are created.
+    removed and an existing file remains unchanged. Missing parent folders are created. Temporary
+    files that a killed process left in the folder are removed.
 
     Args:
         path: Name of the final file.
@@ -78,13 +91,17 @@ def replacing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
 
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    _remove_left_over_files(path.parent)
+
+    prefix = f"{PREFIX}{os.getpid()}-"
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
+    temporary = Path(name)
+    _open_files.add(temporary)
     os.close(handle)
 
     # mkstemp creates files that only their owner may read; results get the usual permissions.
     os.chmod(name, DEFAULT_PERMISSIONS & ~_umask())
 
-    temporary = Path(name)
     try:
         yield temporary
         guard = _guard.get()
@@ -93,6 +110,41 @@ def replacing(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+        _open_files.discard(temporary)
+
+
+def remove_temporary_files() -> None:
+    """Remove the temporary files of this process, which has to end at once."""
+    for temporary in list(_open_files):
+        temporary.unlink(missing_ok=True)
+
+
+def _remove_left_over_files(folder: Path) -> None:
+    """Remove temporary files of processes of this computer that have ended, once per folder."""
+    place = folder.resolve()
+    if place in _tidied_folders:
+        return
+
+    _tidied_folders.add(place)
+    for left_over in folder.glob(f"{PREFIX}*"):
+        owner = re.match(r"(\d+)-", left_over.name.removeprefix(PREFIX))
+        if owner is not None and left_over.is_file() and not _is_running(int(owner[1])):
+            left_over.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    """Check whether a process exists, by its number."""
+    # On Windows this call would end the process, so files remain there.
+    if os.name == "nt":
+        return True
+
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _umask() -> int:

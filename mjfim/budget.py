@@ -12,13 +12,15 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from enum import Enum
 from types import FrameType
 from typing import Any
 
 import numpy as np
+
+from mjfim.interruption import current_interruption
 
 
 class StopReason(Enum):
@@ -41,17 +43,17 @@ class StopToken:
     """
 
     def __init__(self, also: Callable[[], bool] | None = None) -> None:
-        self._event = threading.Event()
+        self._is_requested = False
         self._also = also
 
     def request(self) -> None:
         """Ask all computations that share this token to return their best result so far."""
-        self._event.set()
+        self._is_requested = True
 
     @property
     def requested(self) -> bool:
         """True after a request to stop."""
-        return self._event.is_set() or (self._also is not None and self._also())
+        return self._is_requested or (self._also is not None and self._also())
 
 
 class Budget:
@@ -179,9 +181,9 @@ _active: ContextVar[StopToken | None] = ContextVar("mjfim_stop_token", default=N
 def stop_on_interrupt(stop: StopToken | None = None) -> Iterator[StopToken]:
     """Turn the first Ctrl-C inside the context into a request to stop.
 
-    A second Ctrl-C raises KeyboardInterrupt as usual. Nested contexts share the token of the
-    outermost one. Outside the main thread, to which Python delivers no signals, the token is only
-    yielded.
+    A second Ctrl-C raises KeyboardInterrupt as usual, except on the command line, which has a
+    handler of its own (`mjfim.interruption`). Nested contexts share the token of the outermost one.
+    Outside the main thread, to which Python delivers no signals, the token is only yielded.
 
     Args:
         stop: Token to set; default: that of the surrounding context, or a new one.
@@ -191,13 +193,29 @@ def stop_on_interrupt(stop: StopToken | None = None) -> Iterator[StopToken]:
     """
     outer = _active.get()
     token = stop or outer or StopToken()
-    handled = threading.current_thread() is threading.main_thread() and (
-        outer is None or token is not outer
-    )
-    previous = signal.getsignal(signal.SIGINT) if handled else None
+    restore = _active.set(token)
+    try:
+        with nullcontext() if token is outer else _requested_by_interrupt(token, outer):
+            yield token
+    finally:
+        _active.reset(restore)
+
+
+@contextmanager
+def _requested_by_interrupt(token: StopToken, outer: StopToken | None) -> Iterator[None]:
+    """Request a token, and that of the surrounding context, at Ctrl-C."""
+    interruption = current_interruption()
+    if interruption is not None:
+        with interruption.computing(token):
+            yield
+        return
 
     # A process that ignores Ctrl-C, such as a worker, continues to ignore it.
-    handled = handled and callable(previous)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    previous = signal.getsignal(signal.SIGINT)
+    if not in_main_thread or not callable(previous):
+        yield
+        return
 
     def request(number: int, frame: FrameType | None) -> None:
         """Set this token and the one of the surrounding context; a second call interrupts."""
@@ -207,12 +225,8 @@ def stop_on_interrupt(stop: StopToken | None = None) -> Iterator[StopToken]:
         if outer is not None:
             outer.request()
 
-    restore = _active.set(token)
-    if handled:
-        signal.signal(signal.SIGINT, request)
+    signal.signal(signal.SIGINT, request)
     try:
-        yield token
+        yield
     finally:
-        _active.reset(restore)
-        if handled:
-            signal.signal(signal.SIGINT, previous)
+        signal.signal(signal.SIGINT, previous)

@@ -63,6 +63,10 @@ class NoResultError(MjfimError):
     """The computation was asked to stop before it had a result."""
 
 
+class UnfinishedError(Exception):
+    """The user wants the program to end; results that may be left out are not written."""
+
+
 def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
     """Describe the use of a name that does not exist.
 

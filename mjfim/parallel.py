@@ -6,20 +6,26 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from multiprocessing import connection
 from multiprocessing.synchronize import Event
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from mjfim.budget import Budget, StopToken
+from mjfim.interruption import SIGNALS, hurried
 
 T = TypeVar("T")
 
 # Time for which the parent process waits for running tasks after a request to stop [s]. The tasks
-# check the request after each iterate.
-GRACE = 20.0
+# check the request after each iterate. A second Ctrl-C ends the waiting.
+GRACE = 4.0
+
+# Time after a signal to terminate at which a worker ends, whether or not its task has ended [s].
+TERMINATION_SECONDS = 2.0 * GRACE
 
 # Period at which the parent process checks its stop token while it waits for a task [s].
 POLL_INTERVAL = 0.2
@@ -44,13 +50,20 @@ class Pool(ProcessPoolExecutor):
 
     Args:
         count: Number of processes; the default and the maximum are one per core.
+
+    Attributes:
+        is_abandoned: True if tasks are not waited for when the pool is shut down.
     """
 
     def __init__(self, count: int | None = None) -> None:
         context = multiprocessing.get_context("spawn")
         self._stop = context.Event()
         processes = min(count or cores(), cores())
-        super().__init__(processes, context, _initialize_worker, (self._stop,))
+
+        # The workers end when nobody holds the writing end of this pipe any more.
+        lifeline, self._hold = context.Pipe(duplex=False)
+        self.is_abandoned = False
+        super().__init__(processes, context, _initialize_worker, (self._stop, lifeline))
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Submit a task; the arguments are those of `concurrent.futures.Executor.submit`.
@@ -67,6 +80,15 @@ class Pool(ProcessPoolExecutor):
     def resume(self) -> None:
         """Withdraw the request to stop. No task may be running."""
         self._stop.clear()
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the workers; the arguments are those of `concurrent.futures.Executor.shutdown`.
+
+        The workers of an abandoned pool are ended at once, whether or not their tasks have ended.
+        """
+        if self.is_abandoned:
+            self._hold.close()
+        super().shutdown(wait, cancel_futures=cancel_futures)
 
 
 # Stop token of the pool to which this process belongs. In a worker process, `_initialize_worker`
@@ -147,19 +169,37 @@ def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T
 
     if isinstance(executor, Pool):
         executor.stop()
-    done, running = wait(waiting, timeout=GRACE)
+    done, running = _wait_for_all(waiting)
 
     # The request is withdrawn, so that the pool can be used again, unless a task is still running.
-    if isinstance(executor, Pool) and not running:
-        executor.resume()
+    # Such a task does not look at the request, so nobody waits for it any longer.
+    if isinstance(executor, Pool):
+        if running:
+            executor.is_abandoned = True
+        else:
+            executor.resume()
 
     ended = [future for future in waiting if future in done and not future.cancelled()]
     return [future.result() for future in ended if future.exception() is None]
 
 
+def _wait_for_all(futures: Sequence[Future[T]]) -> tuple[set[Future[T]], set[Future[T]]]:
+    """Wait for tasks until `GRACE` is over, or until the user presses Ctrl-C a second time.
+
+    Returns:
+        The tasks that have ended, and those that have not.
+    """
+    deadline = time.monotonic() + GRACE
+    done, running = wait(futures, timeout=0.0)
+    while running and time.monotonic() < deadline and not hurried():
+        done, running = wait(futures, timeout=min(POLL_INTERVAL, GRACE))
+
+    return done, running
+
+
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C in this thread, and thereby in processes that it starts.
+    """Block Ctrl-C and SIGTERM in this thread, and thereby in processes that it starts.
 
     Without signal masks, as on Windows, this has no effect.
     """
@@ -167,38 +207,64 @@ def _interrupts_blocked() -> Iterator[None]:
         yield
         return
 
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _initialize_worker(stop: Event) -> None:
+def _initialize_worker(stop: Event, lifeline: connection.Connection) -> None:
     """Prepare a new worker process.
 
     It ignores Ctrl-C, its token follows the pool's event, and it ends with its parent process.
 
     Args:
         stop: The pool's event.
+        lifeline: Connection that ends when the pool gives up its workers.
     """
     global _pool_token
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _pool_token = StopToken(also=stop.is_set)
 
-    watch = threading.Thread(target=_end_with_parent, name="mjfim-parent-watch", daemon=True)
-    watch.start()
+    _run_in_background(_end_with_parent, lifeline)
+    _delay_termination()
 
 
-def _end_with_parent() -> None:
-    """Wait until the parent process is gone, then end this process at once.
+def _run_in_background(function: Callable[..., None], *arguments: object) -> None:
+    """Run a function in a thread that does not keep the process alive."""
+    threading.Thread(target=function, args=arguments, name="mjfim-watch", daemon=True).start()
+
+
+def _end_with_parent(lifeline: connection.Connection) -> None:
+    """Wait until the parent process or its pool is gone, then end this process at once.
 
     A worker waits for tasks from a queue whose other end it holds itself, so the queue does not
     tell it that the parent process was killed.
     """
     parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    connection.wait([parent.sentinel])
+    sentinels = [] if parent is None else [parent.sentinel]
+    connection.wait([lifeline, *sentinels])
     os._exit(1)
+
+
+def _delay_termination() -> None:
+    """End this process some time after SIGTERM instead of at once.
+
+    SIGTERM is often sent to all processes of a program. The parent process then asks the tasks for
+    their best results so far, which they can only return while their process lives.
+    """
+    received: SimpleQueue[int] = SimpleQueue()
+
+    def end_later() -> None:
+        """Wait for the signal, and then for the task."""
+        received.get()
+        time.sleep(TERMINATION_SECONDS)
+        os._exit(1)
+
+    _run_in_background(end_later)
+    signal.signal(signal.SIGTERM, lambda number, frame: received.put(number))
+
+    # The parent process blocked the signals while it started this process.
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})

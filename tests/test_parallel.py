@@ -64,6 +64,7 @@ def test_processes_of_a_pool_are_others_and_see_the_request_to_stop(pool: mjfim.
 @pytest.mark.slow
 def test_a_stopped_pool_can_be_used_again_once_nothing_runs() -> None:
     with mjfim.Pool(1) as pool:
+        assert pool.submit(identity).result()
         waiting = [pool.submit(wait_for_stop, 60.0) for _ in range(3)]
         time.sleep(0.5)
         first = workers.collect_finished(pool, waiting)[0]
@@ -125,10 +126,11 @@ def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(
 
 
 @pytest.mark.slow
-def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
-    tmp_path: Path,
+@pytest.mark.parametrize(("number", "presses"), [(signal.SIGINT, 1), (signal.SIGTERM, 2)])
+def test_signals_on_the_command_line_reach_all_processes_and_leave_the_best(
+    number: signal.Signals, presses: int, tmp_path: Path
 ) -> None:
-    """A terminal sends SIGINT to all processes of the group."""
+    """A terminal sends SIGINT, and `timeout` SIGTERM, to all processes of the group."""
     hard = (
         "[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] "
         "}\ncontrol_rate = 100.0"
@@ -142,7 +144,10 @@ def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
     ) as p:
         try:
             time.sleep(15.0)
-            os.killpg(p.pid, signal.SIGINT)
+            os.killpg(p.pid, number)
+            if presses > 1:
+                time.sleep(1.0)
+                os.killpg(p.pid, number)
             _, told = p.communicate(timeout=60)
         finally:
             with suppress(ProcessLookupError):
@@ -151,8 +156,11 @@ def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
     assert "Traceback" not in told
     data = read(tmp_path / "out" / "design.json")
     assert data["status"] == "interrupted"
-    assert data["final"]["cost"] < data["initial"]["cost"]
     assert "out" in names(tmp_path)
+
+    # After the second signal, nobody waits for the workers.
+    if presses == 1:
+        assert data["final"]["cost"] < data["initial"]["cost"]
 
 
 # A program with one busy and one idle worker, which says when both are running.

@@ -15,11 +15,10 @@ from mjfim.cli.common import (
     Folder,
     Force,
     Threads,
-    UnfinishedError,
     claim_folder,
     errors,
+    keep_result,
     out,
-    raise_on_interrupt,
     verb,
 )
 from mjfim.errors import ExperimentError, RecordingError
@@ -92,8 +91,8 @@ def campaign(
 
     found = run.simulated(rounds, seed) if simulated else run.real(rounds, recordings or [])
 
-    with raise_on_interrupt(UnfinishedError(str(output))):
-        warning = run.folder.write_campaign(found, simulated=simulated)
+    keep_result(output)
+    warning = run.folder.write_campaign(found, simulated=simulated)
     if warning:
         errors.print(f"warning: {warning}", markup=False)
     out.print(render(describe_campaign(found, run.task.parameters, simulated=simulated)))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import functools
 import io
-import signal
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import ModuleType
 from typing import Annotated, Any
 
 import typer
@@ -18,7 +16,13 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 import mjfim
-from mjfim.errors import MjfimError, NoResultError, RecordingError
+from mjfim.errors import MjfimError, NoResultError, RecordingError, UnfinishedError
+from mjfim.interruption import (
+    INTERRUPTED_CODE,
+    NOTHING_SENTENCE,
+    Interruption,
+    current_interruption,
+)
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.serialization import as_json as records_as_json
 
@@ -129,38 +133,15 @@ def claim_file(file: Path, inputs: Sequence[Path], *, force: bool) -> None:
     _claims.enter_context(claimed(file.parent, guard, exclusive=False))
 
 
-class UnfinishedError(Exception):
-    """The user pressed Ctrl-C while results were written; the message is their folder."""
-
-
-@contextmanager
-def raise_on_interrupt(error: Exception) -> Iterator[None]:
-    """Raise an error if the user presses Ctrl-C inside the context.
-
-    Long computations inside the context replace this by a stop token, see
-    `mjfim.budget.stop_on_interrupt`, and return their best result so far.
+def keep_result(folder: Path | None = None) -> None:
+    """Say that there is a result, so that Ctrl-C does not end the verb before it is written.
 
     Args:
-        error: The error.
+        folder: Folder that receives it, or None.
     """
-    previous = signal.getsignal(signal.SIGINT)
-    in_main_thread = threading.current_thread() is threading.main_thread()
-
-    # Python delivers signals to the main thread only. A process that ignores Ctrl-C continues to
-    # ignore it.
-    if not in_main_thread or not callable(previous):
-        yield
-        return
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        """Raise the error."""
-        raise error
-
-    signal.signal(signal.SIGINT, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    interruption = current_interruption()
+    if interruption is not None:
+        interruption.keep(folder)
 
 
 def replace_unencodable_characters() -> None:
@@ -177,22 +158,21 @@ def replace_unencodable_characters() -> None:
 def writing(folder: Path) -> Iterator[ModuleType]:
     """Create a folder for results, and import the module that writes them.
 
-    After Ctrl-C inside the context, the folder holds only a part of the results.
+    After Ctrl-C inside the context, the data are written completely, but figures are left out if
+    they take too long.
 
     Args:
         folder: The folder.
 
     Yields:
         The module `mjfim.output.folders`.
-
-    Raises:
-        UnfinishedError: The user pressed Ctrl-C.
     """
+    keep_result()
     from mjfim.output import folders as results  # imports matplotlib and rerun, which takes a while
 
     folder.mkdir(parents=True, exist_ok=True)
-    with raise_on_interrupt(UnfinishedError(str(folder))):
-        yield results
+    keep_result(folder)
+    yield results
 
 
 def _version(wanted: bool) -> None:
@@ -234,8 +214,7 @@ def _require_utf8_paths(values: Iterable[Any]) -> None:
 def verb(function: Callable[..., None]) -> Callable[..., None]:
     """Register a function as a verb, and turn its errors into messages and exit codes.
 
-    Misuse gives exit code 2. Ctrl-C before there is a result, and a file that cannot be written,
-    give exit code 1.
+    Misuse gives exit code 2. Ctrl-C, and a file that cannot be written, give exit code 1.
 
     Args:
         function: The function; underscores in its name become hyphens.
@@ -247,13 +226,14 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(function)
     def wrapped(*args: Any, **kwargs: Any) -> None:
         """Call the verb; print one message and exit for each error."""
+        interruption = Interruption(_announce)
         try:
-            with _claims, raise_on_interrupt(NoResultError()):
+            with interruption, _claims:
                 _require_utf8_paths([*args, *kwargs.values()])
                 function(*args, **kwargs)
-        except NoResultError:
-            errors.print("mjfim: interrupted before there was a result; nothing was written")
-            raise typer.Exit(1) from None
+        except (NoResultError, UnfinishedError):
+            _say_what_is_there(interruption)
+            raise typer.Exit(INTERRUPTED_CODE) from None
         except MjfimError as error:
             errors.print(f"mjfim: {error}", markup=False)
             raise typer.Exit(2) from None
@@ -262,16 +242,36 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
             fault = error.strerror or error
             errors.print(f"mjfim: {place}: {fault}", markup=False)
             raise typer.Exit(1) from None
-        except UnfinishedError as unfinished:
-            errors.print(
-                f"mjfim: interrupted; {unfinished}/ holds only a part of the results, but each "
-                "file in it is complete",
-                markup=False,
-            )
-            raise typer.Exit(1) from None
+        except typer.Exit as end:
+            # An interrupted verb did not do all that it was asked for.
+            if interruption.incomplete:
+                _say_what_is_there(interruption)
+            if interruption.presses and not end.exit_code:
+                raise typer.Exit(INTERRUPTED_CODE) from None
+            raise
+
+        if interruption.presses:
+            raise typer.Exit(INTERRUPTED_CODE)
 
     app.command(function.__name__.replace("_", "-"))(wrapped)
     return wrapped
+
+
+def _announce(sentence: str) -> None:
+    """Show a sentence about Ctrl-C."""
+    errors.print(f"mjfim: {sentence}", markup=False)
+
+
+def _say_what_is_there(interruption: Interruption) -> None:
+    """Say after Ctrl-C whether anything was written."""
+    if interruption.folder is None:
+        _announce(NOTHING_SENTENCE)
+        return
+
+    _announce(
+        f"interrupted; {interruption.folder}/ holds only a part of the results, but each file in "
+        "it is complete"
+    )
 
 
 class ProgressDisplay:

@@ -12,11 +12,10 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
-    UnfinishedError,
     claim_folder,
     errors,
+    keep_result,
     out,
-    raise_on_interrupt,
     verb,
 )
 from mjfim.experiment.input_files import input_files
@@ -51,6 +50,6 @@ def export_sysid(
     for sentence in result.warnings:
         errors.print(f"warning: {sentence}", markup=False)
 
-    with raise_on_interrupt(UnfinishedError(str(output))):
-        sysid_comparison.write_sysid_comparison(output, result)
+    keep_result(output)
+    sysid_comparison.write_sysid_comparison(output, result)
     out.print(f"wrote {output}: comparison.json, sysid_report.html", markup=False)

@@ -16,6 +16,7 @@ from mjfim.cli.common import (
     Force,
     claim_folder,
     errors,
+    keep_result,
     out,
     progress,
     verb,
@@ -220,6 +221,7 @@ def design_with_reserve(
         design = design_task(task, callback=show, budget=design_budget(task, stop))
 
     write_design(folder, design, task.system)
+    keep_result(folder)
     margins = ", ".join(f"{kind} {margin:.3g}" for kind, margin in design.limits.items())
     errors.print(f"designed in {design.seconds:.0f} s: {design.status.value}", markup=False)
     errors.print(f"margins to the tightened limits: {margins}", markup=False)

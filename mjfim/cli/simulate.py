@@ -17,6 +17,7 @@ from mjfim.cli.common import (
     claim_file,
     claim_folder,
     errors,
+    keep_result,
     print_result,
     progress,
     verb,
@@ -48,7 +49,9 @@ def simulate(
     claim_file(output, input_files(system.experiment, [design_file]), force=force)
     trajectory = archive.read_design(design_file)["final"]
     archive.check_fits(design_file, trajectory, system)
-    archive.write_recording(output, simulate_system(system, trajectory, seed), system)
+    recording = simulate_system(system, trajectory, seed)
+    keep_result(output.parent)
+    archive.write_recording(output, recording, system)
     errors.print(f"wrote {output}")
 
 
@@ -86,9 +89,11 @@ def montecarlo(
         results.write_study_folder(output, study, system)
     print_result(as_json, study.summary(), render(describe_study(study, system.units)))
     errors.print(f"wrote {output}/")
-    if len(study.sets) < len(named):
-        errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")
+    done = {name: found.trials for name, found in study.sets.items()}
+    is_complete = done == dict.fromkeys(named, trials)
+    if not is_complete:
+        parts = ", ".join(f"{count} of {trials} trials of {name}" for name, count in done.items())
+        errors.print(f"mjfim: interrupted; only {parts} are finished", markup=False)
 
-    is_complete = len(study.sets) == len(named)
     has_failures = any(trials.failed for trials in study.sets.values())
     raise typer.Exit(0 if is_complete and not has_failures else 1)

@@ -16,6 +16,7 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.system import System
+from mjfim.interruption import run_optional
 from mjfim.output import plots
 from mjfim.output.archive import check_fits, write_design
 from mjfim.output.folders import DESIGN_ARCHIVE
@@ -234,13 +235,17 @@ class CampaignFolder:
         if campaign.estimate is None:
             return ""
 
-        figure = plots.campaign_figure(campaign, self.system.parameters, simulated=simulated)
-        plots.save(figure, self.path / "campaign.png")
+        run_optional(lambda: self._write_figure(campaign, simulated=simulated))
         try:
             write_identified(self.path / "identified.xml", self.system, campaign.estimate.theta)
         except ModelError as error:
             return str(error)
         return ""
+
+    def _write_figure(self, campaign: Campaign, *, simulated: bool) -> None:
+        """Write campaign.png."""
+        figure = plots.campaign_figure(campaign, self.system.parameters, simulated=simulated)
+        plots.save(figure, self.path / "campaign.png")
 
     def _summary(self, campaign: Campaign, *, simulated: bool) -> dict[str, Any]:
         """Return the contents of campaign.json."""

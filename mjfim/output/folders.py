@@ -11,6 +11,7 @@ from mjfim.atomic_io import remove_earlier_result
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import measured_trajectory
+from mjfim.interruption import run_optional
 from mjfim.output import archive, plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.labels import Labels
@@ -166,6 +167,11 @@ def write_design_folder(folder: Path, design: Design, system: System) -> None:
     """
     archive.write_design(folder, design, system)
 
+    run_optional(lambda: _write_design_pictures(folder, design, system))
+
+
+def _write_design_pictures(folder: Path, design: Design, system: System) -> None:
+    """Write the figures of a design and its Rerun file."""
     labels = Labels.of_system(system)
     figures = {
         "trajectories": plots.trajectories(design, labels),
@@ -190,7 +196,7 @@ def write_check_folder(folder: Path, check: Check) -> None:
         check: The check.
     """
     check.save(folder)
-    plots.save(plots.check_figure(check), folder / "check.png")
+    run_optional(lambda: plots.save(plots.check_figure(check), folder / "check.png"))
 
 
 def write_robustness_folder(folder: Path, result: Robustness, seconds: float) -> None:
@@ -203,7 +209,7 @@ def write_robustness_folder(folder: Path, result: Robustness, seconds: float) ->
     """
     result.save_archive(folder)
     write_json(folder / "playback.json", {**result.summary(), "seconds": seconds})
-    plots.save(plots.robustness_figure(result), folder / "playback.png")
+    run_optional(lambda: plots.save(plots.robustness_figure(result), folder / "playback.png"))
 
 
 def write_comparison_folder(folder: Path, comparison: Comparison, system: System) -> None:
@@ -222,7 +228,7 @@ def write_comparison_folder(folder: Path, comparison: Comparison, system: System
     for row in comparison.rows:
         if row.control is not None:
             archive.write_control(folder / _control_name(row.method), row.control, system)
-    plots.save(plots.compare_figure(comparison), folder / "compare.png")
+    run_optional(lambda: plots.save(plots.compare_figure(comparison), folder / "compare.png"))
 
 
 def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> list[str]:
@@ -247,6 +253,12 @@ def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> l
     except ModelError as error:
         remarks.append(str(error))
 
+    run_optional(lambda: _write_estimate_pictures(folder, estimate, system))
+    return remarks
+
+
+def _write_estimate_pictures(folder: Path, estimate: Estimate, system: System) -> None:
+    """Write the figures of an estimate and its Rerun file."""
     labels = Labels.of_system(system)
     _write_fit_figures(folder, estimate, labels)
     if estimate.motion is not None:
@@ -254,7 +266,6 @@ def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> l
         model = system.model_at(estimate.theta)
         target = folder / "estimate.rrd"
         rerun_log.log_estimate(target, model, estimate, measured, estimate.motion, labels)
-    return remarks
 
 
 def _write_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None:
@@ -281,6 +292,11 @@ def write_study_folder(folder: Path, study: MonteCarloStudy, system: System) -> 
     """
     study.save(folder)
 
+    run_optional(lambda: _write_study_figures(folder, study, system))
+
+
+def _write_study_figures(folder: Path, study: MonteCarloStudy, system: System) -> None:
+    """Write a histogram per parameter, and the tables as a figure."""
     labels = Labels.of_system(system)
     for i, name in enumerate(study.parameters):
         plots.save(plots.histogram(study, i, labels), folder / _histogram_name(name))

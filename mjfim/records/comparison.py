@@ -213,7 +213,9 @@ class Comparison(SavedRecord):
         """Sentences for the user, the most important one first."""
         sentences = [_verdict(self)]
         if self.interrupted:
-            sentences.append("Interrupted: only the methods in the table are finished.")
+            sentences.append(
+                "Interrupted: methods are missing, or have not used their whole budget."
+            )
         return tuple(sentences)
 
     def summary(self) -> dict[str, Any]:

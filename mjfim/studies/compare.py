@@ -34,6 +34,9 @@ from mjfim.studies.baselines.methods import METHODS, run_baseline
 # Name of the design for the user.
 DESIGN_TITLE = "mjfim's design"
 
+# Remark about a method that the user interrupted.
+INTERRUPTED_NOTE = "interrupted"
+
 # Share of its time after which a design is stopped. A design checks the time itself, but only after
 # each iterate.
 LATEST_END = 1.05
@@ -135,8 +138,7 @@ def compare_task(
             )
             row = run.design(evaluation) if method == DESIGN else run.baseline(evaluation)
 
-            # An interrupted baseline is left out. An interrupted design is kept with its best
-            # control so far.
+            # An interrupted method is kept with its best control so far.
             if row is not None:
                 rows.append(row)
             if token.requested:
@@ -252,7 +254,7 @@ class _MethodRun:
         self.callback(event)
 
     def baseline(self, evaluation: MethodEvaluation) -> MethodResult | None:
-        """Run a baseline and evaluate its control; None where it was interrupted."""
+        """Run a baseline and evaluate its control; None where it was stopped without one."""
         if self.executor is None:
             result: SearchResult | None = run_baseline(
                 self.search, lambda used, best: self.report(used, best.cost), self.stop
@@ -260,9 +262,12 @@ class _MethodRun:
         else:
             result = self.divided_baseline(self.executor)
 
-        if result is None or self.stop.requested:
+        # An interrupted search is compared by its best control so far.
+        interrupted = self.stop.requested
+        if result is None or (interrupted and result.control is None):
             return None
-        return evaluation.result(self.search.method, self.title, result)
+        note = INTERRUPTED_NOTE if interrupted else ""
+        return evaluation.result(self.search.method, self.title, result, note)
 
     def divided_baseline(self, executor: Executor) -> SearchResult | None:
         """Run a part of a baseline in every worker, each with its share of the steps.
@@ -441,7 +446,8 @@ class MethodEvaluation:
             if control is not found.control:
                 factor = _largest_entry(control - self.task.centre) / deviation
 
-            remark = note if factor == 1.0 else f"shrunk to {100.0 * factor:.3g} %"
+            shrunk = "" if factor == 1.0 else f"shrunk to {100.0 * factor:.3g} %"
+            remark = ", ".join(filter(None, [note, shrunk]))
             result = self._evaluate(method, title, replace(found, control=control), remark)
             if result is None:
                 return None

@@ -54,6 +54,9 @@ ESTIMATE_COPIES = 6
 # Smallest number of trials that are stepped together.
 MIN_CHUNK = 64
 
+# Number of chunks of many trials. A study that is stopped keeps the chunks that are finished.
+CHUNKS = 10
+
 # Difference step for the Jacobian of each trial, relative to the size of each parameter.
 JACOBIAN_STEP = 1e-6
 
@@ -86,7 +89,7 @@ def monte_carlo(
         measure_rate: Measurement rate [Hz] instead of that of the experiment.
         callback: Called with a `StudyEvent` whenever all trials have made a step.
         threads: Threads of MuJoCo; None for all cores.
-        stop: Ends the study early, as Ctrl-C does; the trajectories that are finished are returned.
+        stop: Ends the study early, as Ctrl-C does; the trials that are finished are returned.
 
     Raises:
         ExperimentError: Fewer than two trials, or more than fit into memory.
@@ -133,10 +136,11 @@ def monte_carlo_system(
             progress = _Progress(callback=callback, part=name, index=i, count=len(named))
             found = _trial_set(system, curve, trials, generators[i], progress, budget)
 
-            # An interrupted set is incomplete and therefore left out.
-            if found is None:
+            # An interrupted set holds the trials that are finished.
+            if found is not None:
+                sets[name], information[name] = found
+            if token.requested:
                 break
-            sets[name], information[name] = found
 
     return MonteCarloStudy(
         parameters=system.parameters.names,
@@ -311,8 +315,8 @@ def _trial_set(
         budget: Ends the study early.
 
     Returns:
-        Statistics of the trials and (p, p) information of the trajectory [1 / theta-unit^2]; None
-        where the study was interrupted.
+        Statistics of the finished trials and (p, p) information of the trajectory
+        [1 / theta-unit^2]; None where the study was interrupted before any were finished.
     """
     begun = time.perf_counter()
     y, G = _exact_outputs(system, curve)
@@ -321,8 +325,10 @@ def _trial_set(
     information = np.asarray(J.T @ J)
     require_visible(system.parameters, system.parameters.prior_information, J)
 
-    # Step as many trials at once as the memory allows.
-    chunk = max(MIN_CHUNK, int(CHUNK_BYTES / (8 * J.size)))
+    # Step as many trials at once as the memory allows. Those of a finished chunk are kept after a
+    # request to stop.
+    most = min(int(CHUNK_BYTES / (8 * J.size)), -(-count // CHUNKS))
+    chunk = max(MIN_CHUNK, most)
     firsts = range(0, count, chunk)
     estimates = []
     for number, first in enumerate(firsts):
@@ -333,8 +339,11 @@ def _trial_set(
         report = progress.chunk(number, len(firsts)).report
         found = _estimate(trials, _fit_mean(trials), report, budget)
         if found is None:
-            return None
+            break
         estimates.append(found)
+
+    if not estimates:
+        return None
 
     crlb = np.asarray(np.linalg.inv(information))
     seconds = time.perf_counter() - begun

@@ -5,20 +5,23 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
 import mjfim
+from mjfim.cli.common import ProgressDisplay
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.output import archive, plots
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.design import Status
-from mjfim.records.events import DesignEvent
+from mjfim.records.events import DesignEvent, FitEvent
 from tests.support.cli import (
     DESIGN,
+    ESTIMATE_DATA,
     PROCESS,
     names,
     read,
@@ -61,6 +64,37 @@ def test_interrupted_while_writing(
     result = run("design", study, "-o", tmp_path / "out")
     assert "design.npz" in names(tmp_path / "out")
     assert "nothing was written" not in result.stderr
+
+
+def test_two_presses_during_an_estimation_keep_its_data(
+    study: Path, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def press_twice(display: ProgressDisplay, event: FitEvent) -> None:
+        if event.iteration == 1:
+            interrupt()
+            interrupt()
+
+    monkeypatch.setattr(ProgressDisplay, "_show_fit", press_twice)
+    result = run("identify", study, recorded, "-o", tmp_path / "fit")
+    assert (result.exit_code, type(result.exception)) == (1, SystemExit)
+    assert names(tmp_path / "fit") == {*ESTIMATE_DATA, MANIFEST}
+    assert "holds only a part of the results" in result.stderr
+    assert "interrupted" in read(tmp_path / "fit" / "estimate.json")["status"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.15, 0.6])
+def test_a_press_while_the_program_starts(seconds: float) -> None:
+    words = [*PROCESS, "design", "none.toml", "-o", "none"]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        time.sleep(seconds)
+        process.send_signal(signal.SIGTERM)
+        _, told = process.communicate(timeout=20.0)
+
+    # The program has either been interrupted or found that the file is missing.
+    assert process.returncode in (1, 2)
+    assert "Traceback" not in told
+    assert len(told.splitlines()) == 1
 
 
 def test_interrupted_on_the_coarse_level() -> None:

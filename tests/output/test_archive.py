@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mjfim
-from mjfim.atomic_io import replacing
+from mjfim.atomic_io import PREFIX, replacing
 from mjfim.errors import ModelError, RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
@@ -390,6 +393,22 @@ def test_replacing_replaces(tmp_path: Path) -> None:
             temporary.write_text(text, encoding="utf-8")
         assert path.read_text(encoding="utf-8") == text
     assert [p.name for p in path.parent.iterdir()] == ["x.csv"]
+
+
+def test_files_of_killed_processes_are_removed_and_those_of_others_stay(tmp_path: Path) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    kept = {
+        f"{PREFIX}{os.getpid()}-a.png",
+        f".mjfim-another-{ended.pid}-a.png",
+        f"{PREFIX}notes.txt",
+        ".histogram_a.png",
+    }
+    for name in (f"{PREFIX}{ended.pid}-x8.png", *kept):
+        (tmp_path / name).touch()
+    with replacing(tmp_path / "x.json") as temporary:
+        assert temporary.name.startswith(PREFIX)
+    assert {path.name for path in tmp_path.iterdir()} == {"x.json", *kept}
 
 
 @pytest.mark.parametrize("interruption", [OSError, KeyboardInterrupt])

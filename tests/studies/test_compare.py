@@ -231,11 +231,11 @@ def test_a_design_is_stopped_at_its_steps() -> None:
     np.testing.assert_allclose(shares, [0.4, 0.7, 0.95, 1.1], atol=0.05)
 
 
-def test_a_request_to_stop_keeps_the_methods_that_are_finished() -> None:
+def test_a_request_to_stop_keeps_finished_methods_and_the_best_of_the_last() -> None:
     token = StopToken()
 
     def stop_in_the_second_method(event: Event) -> None:
-        if isinstance(event, StudyEvent) and event.index == 1:
+        if isinstance(event, StudyEvent) and event.index == 1 and event.share > 0.3:
             token.request()
 
     c = mjfim.compare(
@@ -245,7 +245,8 @@ def test_a_request_to_stop_keeps_the_methods_that_are_finished() -> None:
         callback=stop_in_the_second_method,
         stop=token,
     )
-    assert [r.method for r in c.rows] == ["chirp"]
+    assert [(r.method, r.note) for r in c.rows] == [("chirp", ""), ("steps", "interrupted")]
+    assert np.isfinite(c.rows[1].cost)
     assert c.interrupted
     assert not c.ok
     assert "not run" in c.verdict[0]

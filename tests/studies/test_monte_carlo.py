@@ -214,6 +214,29 @@ def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experim
     np.testing.assert_allclose(np.linalg.inv(prior.information["final"]), prior.sets["final"].crlb)
 
 
+def test_a_request_to_stop_keeps_the_finished_trials(
+    design: mjfim.Design, experiment: Experiment
+) -> None:
+    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+    token = StopToken()
+
+    def stop_in_the_third_chunk(event: StudyEvent) -> None:
+        if event.share > 0.5:
+            token.request()
+
+    everything = monte_carlo(experiment, curves, trials=256)
+    study = monte_carlo(
+        experiment, curves, trials=256, callback=stop_in_the_third_chunk, stop=token
+    )
+
+    # 256 trials are stepped in four chunks; the initial trajectory comes first.
+    assert set(study.sets) == {"initial"}
+    assert study.sets["initial"].trials == 128
+    np.testing.assert_array_equal(
+        study.sets["initial"].estimates, everything.sets["initial"].estimates[:128]
+    )
+
+
 def test_a_request_to_stop_keeps_the_finished_sets(
     design: mjfim.Design, experiment: Experiment
 ) -> None:

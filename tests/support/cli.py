@@ -31,7 +31,8 @@ DESIGN = {
 }
 
 # Files that `mjfim identify` writes.
-ESTIMATE = {"estimate.json", "estimate.npz", "identified.xml", "estimate.rrd"} | {
+ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml"}
+ESTIMATE = {*ESTIMATE_DATA, "estimate.rrd"} | {
     f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
 }
 

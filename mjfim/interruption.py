@@ -1,0 +1,230 @@
+"""Reaction of a program to Ctrl-C and SIGTERM, so that no result is lost.
+
+The first press asks the computation to return its best result so far, which is then written. A
+second press, which follows by itself after `FINISH_SECONDS`, leaves out what is not necessary, such
+as figures. Before there is anything to keep, the first press ends the program.
+"""
+
+from __future__ import annotations
+
+import _thread
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from types import FrameType, TracebackType
+from typing import Any, Protocol
+
+from mjfim.atomic_io import remove_temporary_files
+from mjfim.errors import NoResultError, UnfinishedError
+
+# Time after the first press at which a second one follows by itself [s]. Computations end within
+# about 5 s; figures take some more seconds, above all on a busy computer.
+FINISH_SECONDS = 20.0
+
+# Time after the second press of the user at which the process ends in any case [s].
+LAST_SECONDS = 5.0
+
+# Exit code of an interrupted program.
+INTERRUPTED_CODE = 1
+
+# Signals that interrupt a program.
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+# What the user reads where there is nothing to keep, after the first press, and before a process is
+# ended from outside its loops.
+NOTHING_SENTENCE = "interrupted before there was a result; nothing was written"
+FIRST_SENTENCE = "interrupted; finishing with the best so far; press again to stop at once"
+LAST_SENTENCE = "interrupted; stopped at once; each file that was written is complete"
+
+
+class Request(Protocol):
+    """Something that can be asked to stop, such as a `mjfim.budget.StopToken`."""
+
+    def request(self) -> None:
+        """Ask the computation to return its best result so far."""
+
+
+class Interruption:
+    """Handler of Ctrl-C and SIGTERM while a program runs; a context manager.
+
+    Python delivers signals to the main thread only; in another thread the context has no effect. A
+    process that ignores Ctrl-C, such as a worker, continues to ignore it.
+
+    Attributes:
+        presses: Number of presses so far.
+        folder: Folder that holds results already, or None.
+        incomplete: True after results were left out.
+    """
+
+    def __init__(self, announce: Callable[[str], None]) -> None:
+        """Prepare the handler.
+
+        Args:
+            announce: Shows a sentence to the user; called from another thread.
+        """
+        self.presses = 0
+        self.folder: Path | None = None
+        self.incomplete = False
+
+        self._announce = announce
+        self._requests: list[Request] = []
+        self._has_result = False
+        self._is_optional = False
+        self._before: dict[int, Any] = {}
+
+        # A queue of this kind may be used in a signal handler; None ends the thread that watches.
+        self._pressed: SimpleQueue[int | None] = SimpleQueue()
+
+    def __enter__(self) -> Interruption:
+        """Handle the signals from here on."""
+        is_main_thread = threading.current_thread() is threading.main_thread()
+        if not is_main_thread or not callable(signal.getsignal(signal.SIGINT)):
+            return self
+
+        global _current
+        _current = self
+        self._before = {number: signal.getsignal(number) for number in SIGNALS}
+        threading.Thread(target=self._watch, name="mjfim-interruption", daemon=True).start()
+        for number in SIGNALS:
+            signal.signal(number, self)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Restore the handlers of before."""
+        global _current
+        if not self._before:
+            return
+
+        for number, handler in self._before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        _current = None
+        self._pressed.put(None)
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """React to a press.
+
+        Raises:
+            NoResultError: There is nothing to keep yet.
+            UnfinishedError: The second press, while something is written that may be left out.
+        """
+        self.presses += 1
+        self._pressed.put(self.presses)
+
+        for request in self._requests:
+            request.request()
+
+        # The error ends the program; a further press must not disturb that.
+        if not self._requests and not self._has_result:
+            self._has_result = True
+            raise NoResultError
+        if self._is_optional and self.hurried:
+            raise UnfinishedError
+
+    @property
+    def hurried(self) -> bool:
+        """True after the second press."""
+        return self.presses > 1
+
+    def keep(self, folder: Path | None = None) -> None:
+        """Say that there is a result, so that no press ends the program before it is written.
+
+        Args:
+            folder: Folder that receives it, or None.
+        """
+        self._has_result = True
+        self.folder = folder or self.folder
+
+    @contextmanager
+    def computing(self, request: Request) -> Iterator[None]:
+        """Pass presses on to a computation; afterwards, there is a result to keep.
+
+        Args:
+            request: Asks the computation to stop; after an earlier press, it is asked at once.
+        """
+        self._requests.append(request)
+        if self.presses:
+            request.request()
+        try:
+            yield
+            self._has_result = True
+        finally:
+            self._requests.remove(request)
+
+    def run_optional(self, write: Callable[[], object]) -> None:
+        """Call a function, and leave it at the second press.
+
+        Args:
+            write: Writes something that may be left out.
+        """
+        self._is_optional = True
+        try:
+            if self.hurried:
+                raise UnfinishedError
+            write()
+        except UnfinishedError:
+            self.incomplete = True
+        finally:
+            self._is_optional = False
+
+    def _watch(self) -> None:
+        """Announce the first press, press again after a time, and end the process at last."""
+        if self._pressed.get() is None:
+            return
+        if self._requests or self._has_result:
+            self._announce(FIRST_SENTENCE)
+
+        # Without a second press of the user, results are finished for a limited time.
+        try:
+            pressed = self._pressed.get(timeout=FINISH_SECONDS)
+        except Empty:
+            if _current is self:
+                _thread.interrupt_main(signal.SIGINT)
+            pressed = self._pressed.get() and self._pressed.get()
+        if pressed is None:
+            return
+
+        # The user wants an end; work that does not return in time is given up.
+        try:
+            while self._pressed.get(timeout=LAST_SECONDS) is not None:
+                continue
+        except Empty:
+            self._announce(LAST_SENTENCE)
+            remove_temporary_files()
+            os._exit(INTERRUPTED_CODE)
+
+
+# The handler in force. Signals concern the whole process, and so does the handler.
+_current: Interruption | None = None
+
+
+def current_interruption() -> Interruption | None:
+    """Return the handler in force; None where the program has none, or in another thread."""
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    return _current if is_main_thread else None
+
+
+def hurried() -> bool:
+    """Return whether the user has pressed Ctrl-C twice."""
+    return _current is not None and _current.hurried
+
+
+def run_optional(write: Callable[[], object]) -> None:
+    """Call a function, and leave it when the user presses Ctrl-C twice.
+
+    Args:
+        write: Writes something that may be left out, such as figures.
+    """
+    interruption = current_interruption()
+    if interruption is None:
+        write()
+    else:
+        interruption.run_optional(write)

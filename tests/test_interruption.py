@@ -1,0 +1,102 @@
+"""Ctrl-C and SIGTERM on the command line: what one press and two presses do at each moment."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from mjfim import interruption as module
+from mjfim.budget import StopToken, stop_on_interrupt
+from mjfim.errors import NoResultError
+from mjfim.interruption import Interruption, hurried, run_optional
+
+
+@pytest.fixture
+def sentences() -> list[str]:
+    """What the user was told."""
+    return []
+
+
+@pytest.fixture
+def interruption(sentences: list[str]) -> Iterator[Interruption]:
+    """A handler in force."""
+    before = [signal.getsignal(number) for number in module.SIGNALS]
+    with Interruption(sentences.append) as handler:
+        yield handler
+    assert [signal.getsignal(number) for number in module.SIGNALS] == before
+
+
+@pytest.mark.parametrize("number", module.SIGNALS)
+def test_nothing_is_kept_before_there_is_a_result(
+    interruption: Interruption, number: signal.Signals
+) -> None:
+    with pytest.raises(NoResultError):
+        signal.raise_signal(number)
+
+
+@pytest.mark.parametrize("number", module.SIGNALS)
+def test_no_number_of_presses_ends_a_computation_from_outside(
+    interruption: Interruption, number: signal.Signals
+) -> None:
+    inner = StopToken()
+    with stop_on_interrupt() as outer, stop_on_interrupt(inner):
+        signal.raise_signal(number)
+        assert outer.requested
+        assert inner.requested
+        assert not hurried()
+
+        signal.raise_signal(number)
+        assert hurried()
+
+    # The result is written however often the user presses.
+    signal.raise_signal(number)
+    assert interruption.presses == 3
+
+
+def test_a_computation_that_begins_after_a_press_is_stopped_at_once(
+    interruption: Interruption,
+) -> None:
+    interruption.keep()
+    signal.raise_signal(signal.SIGINT)
+    with stop_on_interrupt() as token:
+        assert token.requested
+
+
+def test_the_second_press_leaves_out_figures_and_the_program_goes_on(
+    interruption: Interruption,
+) -> None:
+    drawn = []
+
+    def draw() -> None:
+        drawn.append("begun")
+        signal.raise_signal(signal.SIGINT)
+        drawn.append("after one press")
+        signal.raise_signal(signal.SIGINT)
+        drawn.append("after two presses")
+
+    interruption.keep()
+    run_optional(draw)
+    run_optional(draw)
+    assert drawn == ["begun", "after one press"]
+    assert interruption.incomplete
+
+
+def test_the_second_press_follows_by_itself(
+    interruption: Interruption, sentences: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "FINISH_SECONDS", 0.1)
+
+    def draw_for_ever() -> None:
+        signal.raise_signal(signal.SIGINT)
+        end = time.monotonic() + 10.0
+        while time.monotonic() < end:
+            time.sleep(0.01)
+        pytest.fail("nobody has ended the figure")
+
+    interruption.keep()
+    run_optional(draw_for_ever)
+    assert sentences == [module.FIRST_SENTENCE]
+    assert interruption.incomplete
