@@ -143,7 +143,9 @@ def test_signals_on_the_command_line_reach_all_processes_and_leave_the_best(
         words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as p:
         try:
-            time.sleep(15.0)
+            # The first start has ended, and others are running.
+            assert p.stderr is not None
+            assert any("iteration" in line for line in iter(p.stderr.readline, ""))
             os.killpg(p.pid, number)
             if presses > 1:
                 time.sleep(1.0)
