@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError
+from mjfim.errors import ExperimentError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Correlated, NoiseSpec
 from mjfim.model.coordinates import (
@@ -144,11 +144,11 @@ class _NoiseTable:
                 )
 
         rows = self.indices(block.outputs)
-        listed = ", ".join(block.outputs)
+        outputs = listed(block.outputs)
         if len(set(rows.tolist())) < len(rows):
-            raise ExperimentError(f"correlated.outputs: an output is listed twice: {listed}")
+            raise ExperimentError(f"correlated.outputs: an output is listed twice: {outputs}")
         if len(set(self.strides[rows].tolist())) > 1:
-            raise ExperimentError(f"correlated.outputs: {listed} are measured at different rates")
+            raise ExperimentError(f"correlated.outputs: {outputs} are measured at different rates")
 
         others = np.setdiff1d(np.arange(len(self.columns)), rows)
         if np.any(self.covariance[np.ix_(rows, others)]):
@@ -186,7 +186,7 @@ def _noise_of_mjcf(coordinates: ModelCoordinates, *, required: bool) -> dict[str
     """
     stated = {number.sensor: number.sigma for number in coordinates.sensors if number.sigma > 0}
     if required and not stated:
-        valid = ", ".join(["state", *coordinates.measurable])
+        valid = listed(["state", *coordinates.measurable])
         raise ExperimentError(
             "noise: no output is measured; state `state` or outputs by name here, or `noise` of "
             f"sensors in the MJCF; valid: {valid}"

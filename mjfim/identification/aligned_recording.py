@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array, freeze
-from mjfim.errors import RecordingError, unknown
+from mjfim.errors import RecordingError, listed, unknown
 from mjfim.experiment.system import System
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.records.recording import Recording
@@ -162,7 +162,7 @@ def _outputs(system: System, recording: Recording) -> Array:
     if not recorded:
         raise RecordingError(
             f"{recording.name}: no measured column; "
-            f"{unknown('column', ', '.join(recording.outputs), names)}"
+            f"{unknown('column', listed(recording.outputs), names)}"
         )
 
     y = np.full((len(recording.t), len(names)), np.nan)

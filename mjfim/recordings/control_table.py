@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError, unknown
+from mjfim.errors import RecordingError, listed, unknown
 from mjfim.recordings.formats.read import read_table
 
 # Prefixes of the columns that a design.csv has besides the time and the controls.
@@ -66,14 +66,14 @@ def _columns_of_control(
 ) -> tuple[Array, Array]:
     """Times: (M,) and controls: (M, nu) of a table with a control, or of a design.csv."""
     if "t" not in columns:
-        raise RecordingError(f"{path}: column 't' is missing; found: {', '.join(columns)}")
+        raise RecordingError(f"{path}: column 't' is missing; found: {listed([*columns])}")
 
     keys = [name if name in columns else f"ctrl:{name}" for name in names]
     for name, key in zip(names, keys, strict=True):
         if key not in columns:
             raise RecordingError(
                 f"{path}: no column for actuator {name!r}; expected columns: t, "
-                f"{', '.join(names)}; found: {', '.join(columns)}"
+                f"{listed(names)}; found: {listed([*columns])}"
             )
 
     known = {"t", *names, *(f"ctrl:{name}" for name in names)}

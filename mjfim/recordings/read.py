@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, RecordingError, unknown
+from mjfim.errors import ExperimentError, RecordingError, listed, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
 from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
@@ -155,7 +155,7 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     if not any(name in measured for name in channels.outputs):
         used = {channels.spec.time, *(source.column for source in controls.values())}
         found = measured or [name for name in table.names if name not in used]
-        fault = unknown("column", ", ".join(found) or "none", channels.outputs)
+        fault = unknown("column", listed([*found]), channels.outputs)
         raise RecordingError(f"{table.source}: no measured column; {fault}")
 
     return {**controls, **measured}
@@ -192,7 +192,7 @@ def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]
         if len(labels) != len(parts):
             raise RecordingError(
                 f"{table.source}: array {matrix!r} has {len(labels)} columns; the model needs "
-                f"{len(parts)}: {', '.join(parts)}"
+                f"{len(parts)}: {listed(parts)}"
             )
         found.update(zip(parts, labels, strict=True))
 

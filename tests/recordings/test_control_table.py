@@ -123,3 +123,13 @@ def test_table_keeps_every_digit(tmp_path: Path) -> None:
     values = np.random.default_rng(0).standard_normal(50) * 10.0 ** np.arange(-25, 25)
     path.write_text("u\n" + "\n".join(repr(float(v)) for v in values) + "\n", encoding="utf-8")
     assert read_table(path)["u"].tolist() == values.tolist()
+
+
+def test_messages_about_many_actuators_are_short(tmp_path: Path) -> None:
+    """They list the first names and count the others."""
+    names = tuple(f"a_rather_long_name_{i}" for i in range(300))
+    header = ",".join(("t", *names[:-1]))
+    (tmp_path / "u.csv").write_text(f"{header}\n{','.join(['0'] * 300)}\n", encoding="utf-8")
+    with pytest.raises(RecordingError, match=r"no column for actuator .* more; found: ") as told:
+        read_control(tmp_path / "u.csv", np.zeros(2), 0.1, names)
+    assert len(str(told.value).removeprefix(str(tmp_path))) < 600

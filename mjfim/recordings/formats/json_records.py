@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError, unknown
+from mjfim.errors import RecordingError, listed, unknown
 from mjfim.recordings.formats.table import NOT_NUMERIC, Table, length_fault, one_line
 from mjfim.recordings.spec import RecordingSpec
 
@@ -87,9 +87,9 @@ def _keys_of_records(path: Path, content: Any, spec: RecordingSpec) -> tuple[str
 
     found = list(_lists_of_records(content))
     if len(found) > 1:
-        listed = ", ".join(".".join(keys) for keys in found)
+        paths = listed([".".join(keys) for keys in found])
         raise RecordingError(
-            f"{path}: several lists of records: {listed}; select one by recording.records"
+            f"{path}: several lists of records: {paths}; select one by recording.records"
         )
     if found:
         return found[0]
@@ -210,7 +210,7 @@ def _table_of_lists(path: Path, content: Mapping[str, Any], time: str) -> Table:
     values = dict(_leaves(content))
     lists = {name: value for name, value in values.items() if isinstance(value, list)}
     if time not in lists:
-        found = ", ".join(lists) or "none"
+        found = listed([*lists])
         raise RecordingError(f"{path}: column {time!r} is missing; found: {found}")
 
     rows = len(lists[time])

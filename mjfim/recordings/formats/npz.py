@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError
+from mjfim.errors import RecordingError, listed
 from mjfim.recordings.formats.table import (
     NOT_NUMERIC,
     Table,
@@ -84,7 +84,7 @@ def _table(
     time = headers[spec.time][0] if spec.time in headers else None
     if time is None or len(time) != 1:
         fault = "is missing" if time is None else f"has shape {time}; times are a vector"
-        found = ", ".join(labels) or "none"
+        found = listed([*labels])
         raise RecordingError(f"{path}: array {spec.time!r} {fault}; found: {found}")
 
     rows = time[0]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError, unknown
+from mjfim.errors import RecordingError, listed, unknown
 from mjfim.recordings.formats.table import Table, one_line
 from mjfim.recordings.spec import RecordingSpec
 
@@ -107,7 +107,7 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
         ) from None
 
     if not blocks:
-        topics = ", ".join(connection.topic for connection in connections)
+        topics = listed([connection.topic for connection in connections])
         raise RecordingError(f"{path}: topic {topics} has no message")
     return _merged(path, blocks, with_topic=len(spec.topics) > 1)
 
@@ -132,14 +132,14 @@ def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]
         others = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
         raise RecordingError(
             f"{path}: no topic of {JOINT_STATE}, the only type of message that is read; "
-            f"found: {', '.join(others) or 'none'}"
+            f"found: {listed(others)}"
         )
     for topic in topics:
         if topic not in available:
             raise RecordingError(f"{path}: recording.topics: {unknown('topic', topic, available)}")
     if len(available) > 1 and not topics:
         raise RecordingError(
-            f"{path}: several topics of joint states: {', '.join(available)}; select one by "
+            f"{path}: several topics of joint states: {listed(available)}; select one by "
             "recording.topics"
         )
 
@@ -168,8 +168,8 @@ def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict
         block = blocks.get(layout)
         if block is None:
             if len(set(layout.joints)) < len(layout.joints):
-                listed = ", ".join(layout.joints)
-                raise RecordingError(f"{where}: a joint is listed twice: {listed}")
+                joints = listed(layout.joints)
+                raise RecordingError(f"{where}: a joint is listed twice: {joints}")
             block = blocks[layout] = _Block()
 
         block.stamps.append(stamp)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError
+from mjfim.errors import RecordingError, listed
 from mjfim.recordings.spec import RecordingSpec
 
 # Longest quotation of another library's error message [characters].
@@ -61,7 +61,7 @@ class Table:
         if name in self.faults:
             raise RecordingError(f"{self.source}: column {name!r} {self.faults[name]}")
 
-        found = ", ".join(self.names) or "none"
+        found = listed(self.names)
         raise RecordingError(f"{self.source}: column {name!r} is missing; found: {found}")
 
     def measurement(self, name: str) -> Array:
