@@ -15,6 +15,8 @@ from multiprocessing.synchronize import Event
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from mjfim.budget import Budget, StopToken
 from mjfim.interruption import SIGNALS, hurried
 
@@ -37,6 +39,17 @@ def cores() -> int:
         return len(os.sched_getaffinity(0))
 
     return os.cpu_count() or 1
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Use one thread of the linear algebra libraries; also a decorator of functions.
+
+    Several threads divide long sums differently, so results would depend on their number. The
+    matrices are small, so that more threads would not be quicker.
+    """
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 class Pool(ProcessPoolExecutor):

@@ -6,7 +6,6 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken
@@ -23,7 +22,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import RELAXED, ModelVariant
-from mjfim.parallel import pool_stop_token
+from mjfim.parallel import one_blas_thread, pool_stop_token
 from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 from mjfim.signals import independent_curves
@@ -102,6 +101,7 @@ class ConstrainedSearch:
         )
 
 
+@one_blas_thread()
 def run_in_worker(search: ConstrainedSearch) -> RunResult:
     """Run a search to its end, for an executor.
 
@@ -115,9 +115,7 @@ def run_in_worker(search: ConstrainedSearch) -> RunResult:
     stop = StopToken(also=lambda: search_stop.requested or pool_stop.requested)
     search = replace(search, budget=search.budget.with_stop(stop))
 
-    # Matrices are small: threads of the BLAS would only wait for each other.
-    with threadpool_limits(1, user_api="blas"):
-        return consume(search.run(), None)
+    return consume(search.run(), None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

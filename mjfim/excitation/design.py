@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
@@ -31,6 +30,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
+from mjfim.parallel import one_blas_thread
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import ParameterGroup, join_names
@@ -96,6 +96,7 @@ def design_budget(task: DesignTask, stop: StopToken | None = None) -> Budget:
     return Budget(seconds=np.inf if seconds is None else seconds, stop=stop)
 
 
+@one_blas_thread()
 def design_task(
     task: DesignTask,
     *,
@@ -131,10 +132,8 @@ def design_task(
     stage = DescentLevel(task, identifiability.basis)
     first = stage.problem.reevaluated(first)
 
-    # Search. Matrices are small: threads of the BLAS would only wait for each other.
     search = _Search(stage=stage, first=first, executor=executor, budget=budget)
-    with threadpool_limits(1, user_api="blas"):
-        results = consume(search.run(starts), callback)
+    results = consume(search.run(starts), callback)
     interrupted = budget.stop.requested
 
     # Steps on other plants, also those of workers, are counted by the runs.

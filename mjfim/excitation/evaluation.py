@@ -16,6 +16,7 @@ from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, Verification
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification, regulator
+from mjfim.parallel import one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import Roughness
 from mjfim.records.design import Evaluation
@@ -101,6 +102,7 @@ def evaluate(
     return evaluate_task(DesignTask.resolve(experiment, threads=threads), trajectory)
 
 
+@one_blas_thread()
 def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
     """Evaluate the control of a trajectory in a resolved task. See `evaluate`."""
     return _evaluate_control(task, trajectory.ctrl)

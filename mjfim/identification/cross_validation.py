@@ -17,6 +17,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.residuals import FitProblem
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
+from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.recording import Recording
 
@@ -34,6 +35,7 @@ MAX_SAMPLES = 400_000
 SEARCH = SearchSettings(max_iterations=8, tolerance=1e-2, relinearise_at_end=False)
 
 
+@one_blas_thread()
 def predict(
     experiment: Experiment,
     theta: Array,

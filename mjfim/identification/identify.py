@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
@@ -33,6 +32,7 @@ from mjfim.optimize.levenberg_marquardt import (
     UnknownValues,
     minimise,
 )
+from mjfim.parallel import one_blas_thread
 from mjfim.plant.noise import Noise
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
@@ -178,8 +178,7 @@ def identify_task(
     begun = time.perf_counter()
     steps_before = task.system.plant.engine_steps
 
-    # One thread of the linear algebra library: the matrices are too small for more.
-    with threadpool_limits(1, user_api="blas"), stop_on_interrupt(stop) as token:
+    with one_blas_thread(), stop_on_interrupt(stop) as token:
         problem = task.problem()
         held_out = task.held_out_problem()
         search = _Search(task=task, budget=Budget(stop=token), callback=callback)

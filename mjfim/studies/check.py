@@ -22,6 +22,7 @@ from mjfim.identification.same_data import refuse_same_data
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability
 from mjfim.information.marginal import shared
+from mjfim.parallel import one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
     CONFOUNDED_CORRELATION,
@@ -83,6 +84,7 @@ def check(
     return check_task(DesignTask.resolve(experiment, threads=threads), trajectory)
 
 
+@one_blas_thread()
 def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
     """Check the initial control of a task, or the control of a trajectory.
 
@@ -107,6 +109,7 @@ def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
     ).check()
 
 
+@one_blas_thread()
 def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     """Check which parameters recordings identify; derivatives are tested along the longest one.
 

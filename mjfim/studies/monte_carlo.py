@@ -29,6 +29,7 @@ from mjfim.identification.identify import least_squares, newton_raphson
 from mjfim.identification.residuals import FitProblem
 from mjfim.information.identifiability import require_visible
 from mjfim.memory import require_memory
+from mjfim.parallel import one_blas_thread
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
@@ -105,6 +106,7 @@ def monte_carlo(
     )
 
 
+@one_blas_thread()
 def monte_carlo_system(
     system: System,
     trajectory: Trajectory | Mapping[str, Trajectory],

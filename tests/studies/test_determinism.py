@@ -1,0 +1,177 @@
+"""Equal inputs and seeds give equal files, whatever the number of threads and workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import mjfim
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.schema import Experiment
+from mjfim.output.archive import write_design
+from mjfim.records.events import Event
+from tests.support.limits import ARM, cart_inside, floating_task
+from tests.support.numerics import filtered_task, make_task
+from tests.support.paths import ROOT
+
+
+def without_times(value: Any) -> Any:
+    """JSON values without the measured times, in the order of the file."""
+    if isinstance(value, dict):
+        return [(key, without_times(entry)) for key, entry in value.items() if key != "seconds"]
+    if isinstance(value, list):
+        return [without_times(entry) for entry in value]
+    return value
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """Every file of a folder: its bytes, or its arrays and JSON values without measured times."""
+    found: dict[str, Any] = {}
+
+    for file in sorted(folder.iterdir()):
+        if file.suffix == ".json":
+            found[file.name] = without_times(json.loads(file.read_text(encoding="utf-8")))
+        elif file.suffix == ".npz":
+            with np.load(file) as arrays:
+                rest = {key: arrays[key].tobytes() for key in arrays if key != "record"}
+                record = without_times(json.loads(str(arrays["record"])))
+            found[file.name] = (rest, record)
+        else:
+            found[file.name] = file.read_bytes()
+
+    return found
+
+
+def study(
+    experiment: Experiment, folder: Path, *, threads: int, executor: Executor | None = None
+) -> dict[str, Any]:
+    """Design, simulate, identify and repeat with noise; return all files without times."""
+    # More threads of the linear algebra libraries must change nothing either.
+    with threadpool_limits(threads, user_api="blas"):
+        task = DesignTask.resolve(experiment, threads=threads)
+        design = design_task(task, executor=executor)
+        write_design(folder, design, task.system)
+
+        recording = mjfim.simulate(experiment, design.trajectory, seed=3, threads=threads)
+        mjfim.identify(experiment, [recording], threads=threads).save(folder)
+
+        repeated = mjfim.monte_carlo(experiment, design.trajectory, trials=3, threads=threads)
+        repeated.save(folder)
+
+    return contents(folder)
+
+
+def test_two_runs_and_other_numbers_of_threads_give_the_same_files(tmp_path: Path) -> None:
+    descent = {"max_iterations": 2}
+    experiment = cart_inside(tmp_path, horizon=0.2, descent=descent).experiment
+
+    first = study(experiment, tmp_path / "first", threads=1)
+    assert {"design.csv", "reference.csv", "estimate.npz", "montecarlo.json"} <= set(first)
+    assert study(experiment, tmp_path / "second", threads=2) == first
+
+
+def test_long_sums_are_not_divided_among_threads(tmp_path: Path) -> None:
+    """The rounding of a sum depends on the number of threads of the linear algebra libraries."""
+    experiment = cart_inside(tmp_path, horizon=0.3).experiment
+    trajectory = cart_inside(tmp_path, horizon=0.3).initial
+    seen: list[int] = []
+
+    def look(event: Event) -> None:
+        """Note the threads of every library."""
+        seen.extend(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+
+    with threadpool_limits(2, user_api="blas"):
+        mjfim.monte_carlo(experiment, trajectory, trials=2, callback=look)
+        after = [one["num_threads"] for one in threadpool_info()]
+
+    assert seen
+    assert set(seen) == {1}
+    assert 2 in after
+
+
+@pytest.mark.slow
+def test_searches_in_workers_give_the_same_files(tmp_path: Path) -> None:
+    """Searches in two worker processes and in this process."""
+    descent = {"max_iterations": 6, "starts": 3, "seed": 2}
+    experiment = cart_inside(tmp_path, horizon=0.3, descent=descent).experiment
+    alone = study(experiment, tmp_path / "alone", threads=1)
+
+    with mjfim.Pool(2) as pool:
+        assert study(experiment, tmp_path / "workers", threads=2, executor=pool) == alone
+
+
+def clearance(folder: Path) -> Experiment:
+    """An arm that keeps its distance from the floor and a post, within limits of its servos."""
+    initial = {"qpos": (0.2, 0.3), "control": {"kind": "sine", "amplitude": 0.3, "frequency": 1.0}}
+    task = make_task(
+        ARM,
+        folder,
+        horizon=0.4,
+        initial=initial,
+        parameters={
+            "m": {"target": "body/fore:mass"},
+            "c": {"target": "joint/shoulder:damping"},
+        },
+        noise={"state": 0.02},
+        cost={"control": 0.0},
+        limits={"control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)}, "clearance": 0.01},
+        descent={"max_iterations": 4},
+    )
+    return task.experiment
+
+
+def robust(folder: Path) -> Experiment:
+    """A robust design, whose parameters are drawn at random, and a fit of several segments."""
+    parameters = {"m": {"bounds": (0.5, 4.0)}, "l": {"bounds": (0.5, 2.0)}}
+    task = cart_inside(folder, horizon=0.4, descent={"max_iterations": 4})
+    return task.experiment.replace(
+        parameters=parameters, robust={"samples": 4}, fit={"segments": 0.1}
+    )
+
+
+def floating(folder: Path) -> Experiment:
+    """A floating arm with quaternions and an activation state, under many limits."""
+    return floating_task(folder, descent={"max_iterations": 3}).experiment
+
+
+def free(folder: Path) -> Experiment:
+    """A free design with random initial controls."""
+    return filtered_task(folder, descent={"max_iterations": 5, "starts": 2}).experiment
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [clearance, robust, floating, free])
+def test_other_problems_give_the_same_files_with_any_threads(make: Any, tmp_path: Path) -> None:
+    experiment = make(tmp_path)
+    first = study(experiment, tmp_path / "first", threads=1)
+    assert study(experiment, tmp_path / "second", threads=2) == first
+
+
+@pytest.mark.slow
+def test_the_order_of_sets_in_python_does_not_change_the_files(tmp_path: Path) -> None:
+    """Python orders sets of words differently in every process."""
+    code = (
+        "import pathlib, sys; from tests.studies.test_determinism import robust, study; "
+        "home = pathlib.Path(sys.argv[1]); study(robust(home), home / 'out', threads=1)"
+    )
+    found = []
+
+    for seed in ("1", "2"):
+        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(ROOT)}
+        home = tmp_path / seed
+        home.mkdir()
+        subprocess.run([sys.executable, "-c", code, str(home)], env=environment, check=True)
+        found.append(contents(home / "out"))
+
+    assert "design.json" in found[0]
+    assert found[0] == found[1]
