@@ -131,9 +131,7 @@ class Multistart:
 
         for _ in range(MAX_TIGHTENED_RUNS):
             violated = self._violated_by_winner(results)
-            if violated is None:
-                return results
-            if self.budget.exhausted is not None:
+            if violated is None or self.budget.exhausted is not None:
                 break
 
             winner, margins = violated
@@ -150,13 +148,23 @@ class Multistart:
                 if np.isfinite(result.cost):
                     results[winner] = _append_run(results[winner], result)
 
+        return self._repaired(results)
+
+    def _repaired(self, results: Sequence[RunResult]) -> list[RunResult]:
+        """Shrink controls that violate a limit where that gives a feasible result."""
+        results = list(results)
+
         # Shrink the control where tighter limits did not help.
         violated = self._violated_by_winner(results)
         if violated is not None:
             winner, _ = violated
             results[winner] = self._shrink(results[winner])
 
-        return results
+        if any(np.isfinite(result.cost) for result in results):
+            return results
+
+        # No start found anything feasible: a smaller motion about the holding control may be.
+        return [self._rescued(result) for result in results]
 
     # ---- properties of the task
 
@@ -283,6 +291,16 @@ class Multistart:
             return None
 
         return winner, found.relative_margins
+
+    def _rescued(self, result: RunResult) -> RunResult:
+        """Shrink the control of an infeasible result, even when the time is used up."""
+        if result.control is None or self.budget.stop.requested:
+            return result
+
+        shrunk = self._shrink(result)
+        if not np.isfinite(shrunk.cost):
+            return result
+        return replace(shrunk, status=Status.MAX_ITERATIONS)
 
     def _shrink(self, result: RunResult) -> RunResult:
         """Shrink the control of a result until no limit is violated, if that is possible."""

@@ -192,6 +192,23 @@ def test_an_infeasible_start_is_made_feasible(tmp_path: Path) -> None:
     assert design.final.cost < 0.5 * first.cost
 
 
+def test_an_infeasible_result_with_a_feasible_motion_inside_is_shrunk(tmp_path: Path) -> None:
+    """No start ended inside the limits; a smaller control about the centre is inside them."""
+    wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
+    task = cart_inside(tmp_path, control=wild)
+    free = task.relaxed()
+    none = RunResult(name="none")
+    outside = RunResult(name="wild", control=task.control, status=Status.INFEASIBLE)
+    assert not np.isfinite(outside.cost)
+
+    unchanged, found = consume(multistart_of(free).tighten_winner([none, outside]), None)
+    assert unchanged is none
+    assert np.isfinite(found.cost)
+    assert found.status is Status.MAX_ITERATIONS
+    assert np.abs(found.control).max() > 0.0
+    assert_inside(task, found.control)
+
+
 SWINGING = CART_PENDULUM.format(integrator="RK4").replace(
     "</mujoco>", '<keyframe><key name="rest" qpos="0.3 3.141592653589793"/></keyframe></mujoco>'
 )
