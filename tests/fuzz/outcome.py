@@ -89,17 +89,5 @@ class KnownFailure:
         return bool(outcome.complaint) and is_place and self.complaint in outcome.complaint
 
 
-def _known(kind: str, description: str, complaint: str, reason: str) -> KnownFailure:
-    """A known failure, in one line."""
-    return KnownFailure(kind=kind, description=description, complaint=complaint, reason=reason)
-
-
 # Failures that are reported, but do not make the suite fail. This list must be empty in the end.
-KNOWN_FAILURES: tuple[KnownFailure, ...] = (
-    _known("kill", "SIGTERM", "exit code -15", "SIGTERM ends without results"),
-    _known("kill", "SIGINT", "exit code -2", "Ctrl-C at start-up or at the end has no message"),
-    _known("kill", "", "processes alive", "workers outlive a killed parent"),
-    _known("kill", "", "KeyboardInterrupt", "Ctrl-C at start-up shows a traceback"),
-    _known("kill", "", "Traceback", "Ctrl-C at some moments shows a traceback"),
-    _known("kill", "", "no end", "Ctrl-C waits for long iterates and all pictures"),
-)
+KNOWN_FAILURES: tuple[KnownFailure, ...] = ()

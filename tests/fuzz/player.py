@@ -62,7 +62,7 @@ def play(
     model: mujoco.MjModel,
     rows: list[dict[str, float]],
     ranges: dict[tuple[str, str], Range],
-    sample: float,
+    period: float,
     feedback: bool = False,
 ) -> Excess:
     """Play the rows from the state of the first one, and observe every engine step.
@@ -72,7 +72,7 @@ def play(
         rows: Rows of design.csv.
         ranges: Range by kind and name of every limit; the kinds "end_position" and "end_velocity"
             are deviations of the final state from the initial one.
-        sample: Sample period of the design, over which the rate of a control is taken [s].
+        period: Time from row to row, over which the rate of a control is taken [s].
         feedback: True adds the gains times the deviation from the planned state.
 
     Returns:
@@ -100,7 +100,7 @@ def play(
         for i, name in enumerate(drives):
             excess.see("control", name, float(ctrl[i]))
             if before is not None:
-                excess.see("control_rate", name, float((ctrl[i] - before[i]) / sample))
+                excess.see("control_rate", name, float((ctrl[i] - before[i]) / period))
         before = ctrl
 
         data.ctrl[:] = ctrl

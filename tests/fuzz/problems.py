@@ -55,10 +55,10 @@ def violations(plant: Plant, tables: dict[str, Any], folder: Path) -> list[str]:
     model = mujoco.MjModel.from_xml_path(str(folder / "plant.xml"))
     rows = read_rows(folder / "design.csv")
     ranges = all_ranges(plant, tables)
-    sample = 1.0 / tables["rate"]
+    period = 1.0 / tables.get("playback_rate", tables["rate"])
 
-    found = play(model, rows, ranges, sample).sentences(ROUNDING)
-    with_feedback = play(model, rows, ranges, sample, feedback=True)
+    found = play(model, rows, ranges, period).sentences(ROUNDING)
+    with_feedback = play(model, rows, ranges, period, feedback=True)
     found += [f"with gains: {text}" for text in with_feedback.sentences(ROUNDING_WITH_FEEDBACK)]
     return found
 
@@ -114,9 +114,8 @@ def random_tables(rng: Rng, plant: Plant) -> dict[str, Any]:
         },
     }
 
-    # The player takes the rate of a control over a sample; with a playback rate, the limit holds
-    # from row to row.
-    if substeps > 1 and "control_rate" not in tables["limits"] and rng.random() < 0.3:
+    # With a playback rate, the limit of a control's rate holds from row to row.
+    if substeps > 1 and rng.random() < 0.3:
         tables["playback_rate"] = 1.0 / plant.timestep
     return tables
 

@@ -93,7 +93,7 @@ def test_the_player_notices_every_kind_of_violation(limit: tuple[str, str], feed
 
     for factor, is_violated in ((1.001, False), (0.999, True)):
         bound = factor * LARGEST[limit]
-        found = play(model, rows, {limit: (-bound, bound)}, sample=0.1, feedback=feedback)
+        found = play(model, rows, {limit: (-bound, bound)}, period=0.1, feedback=feedback)
         assert bool(found.sentences(ROUNDING)) is is_violated
 
 
@@ -107,15 +107,15 @@ def test_feedback_is_played() -> None:
         {"t": 0.2, "qpos:slide": 1.0, "qvel:slide": 0.0, **row},
     ]
     limit = {("control", "motor"): (-2.9, 2.9)}
-    assert not play(model, rows, limit, sample=0.1).sentences(ROUNDING)
-    assert play(model, rows, limit, sample=0.1, feedback=True).sentences(ROUNDING)
+    assert not play(model, rows, limit, period=0.1).sentences(ROUNDING)
+    assert play(model, rows, limit, period=0.1, feedback=True).sentences(ROUNDING)
 
 
 def test_a_state_that_is_not_a_number_is_a_violation() -> None:
     model = mujoco.MjModel.from_xml_string(MASS)
     first = {"t": 0.0, "ctrl:motor": np.nan, "qpos:slide": 0.0, "qvel:slide": 0.0}
     limit = {("control", "motor"): (-1.0, 1.0)}
-    assert play(model, [first, {**first, "t": 0.1}], limit, sample=0.1).sentences(ROUNDING)
+    assert play(model, [first, {**first, "t": 0.1}], limit, period=0.1).sentences(ROUNDING)
 
 
 def test_the_toml_of_the_suite_is_read_back() -> None:
