@@ -6,7 +6,10 @@ from recordings, and `monte_carlo` compares the estimates with the Cramér-Rao b
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+
+# The module `typing` is not imported, because a file of this name in the current folder would be
+# taken until `mjfim.__main__` has removed that folder from the search path.
+TYPE_CHECKING = False
 
 # Programs import each name when they use it first, see `__getattr__`: importing all of them takes
 # seconds, in which the command line must be able to react to Ctrl-C.

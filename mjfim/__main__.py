@@ -1,13 +1,27 @@
-"""`python -m mjfim` and the command `mjfim`: reacts to Ctrl-C while the program is imported."""
+"""`python -m mjfim` and the command `mjfim`.
 
-from __future__ import annotations
+Reacts to Ctrl-C while the program is imported, and takes no code or settings from the current
+folder, which may hold a file `signal.py` or `matplotlibrc` beside the experiment.
+"""
 
 import os
-import signal
-from types import FrameType
-from typing import NoReturn
+import sys
 
-from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS
+# Folder from which this package is imported.
+HOME = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
+
+# `python -m` searches modules in the current folder first. This comes before all other imports.
+if sys.path and os.path.realpath(sys.path[0]) == os.path.realpath(os.curdir) != HOME:
+    del sys.path[0]
+
+# Processes that libraries start shall not search there either.
+os.environ["PYTHONSAFEPATH"] = "1"
+
+import signal  # noqa: E402
+from types import FrameType  # noqa: E402
+from typing import NoReturn  # noqa: E402
+
+from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS  # noqa: E402
 
 
 def main() -> NoReturn:
@@ -17,6 +31,7 @@ def main() -> NoReturn:
     for number in SIGNALS if handled else ():
         signal.signal(number, _end_at_once)
 
+    _import_matplotlib()
     from mjfim.cli.main import main as run_command_line
 
     # Verbs have a handler of their own. After a verb, the program ends by itself.
@@ -25,6 +40,20 @@ def main() -> NoReturn:
     finally:
         for number in SIGNALS if handled else ():
             signal.signal(number, signal.SIG_IGN)
+
+
+def _import_matplotlib() -> None:
+    """Import matplotlib with its own defaults; it would read a `matplotlibrc` of this folder."""
+    current = os.open(os.curdir, os.O_RDONLY) if hasattr(os, "fchdir") else os.getcwd()
+    os.chdir(HOME)
+    try:
+        import matplotlib
+
+        matplotlib.rcdefaults()
+    finally:
+        os.chdir(current)
+        if isinstance(current, int):
+            os.close(current)
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> None:

@@ -70,7 +70,8 @@ class Pool(ProcessPoolExecutor):
 
     def __init__(self, count: int | None = None) -> None:
         context = multiprocessing.get_context("spawn")
-        self._stop = context.Event()
+        with _safe_path():
+            self._stop = context.Event()
         processes = min(count or cores(), cores())
 
         # The workers end when nobody holds the writing end of this pipe any more.
@@ -83,7 +84,7 @@ class Pool(ProcessPoolExecutor):
 
         A process that is started for the task ignores Ctrl-C from the beginning.
         """
-        with _interrupts_blocked():
+        with _interrupts_blocked(), _safe_path():
             return super().submit(fn, *args, **kwargs)
 
     def stop(self) -> None:
@@ -208,6 +209,23 @@ def _wait_for_all(futures: Sequence[Future[T]]) -> tuple[set[Future[T]], set[Fut
         done, running = wait(futures, timeout=min(POLL_INTERVAL, GRACE))
 
     return done, running
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let Python processes that are started here import nothing from the current folder.
+
+    Otherwise they would take a file `signal.py` or `socket.py` there for the module of this name.
+    """
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop("PYTHONSAFEPATH", None)
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 @contextmanager

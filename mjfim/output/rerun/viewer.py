@@ -25,7 +25,8 @@ def show(path: Path) -> None:
     if not Path(path).is_file():
         raise RecordingError(f"there is no Rerun recording at {str(path)!r}")
 
-    command = [sys.executable, "-m", "rerun", "--new", str(path)]
+    # With -P, Python does not look for the viewer in the current folder.
+    command = [sys.executable, "-P", "-m", "rerun", "--new", str(path)]
     viewer = subprocess.Popen(command, start_new_session=True)
     try:
         code = viewer.wait(timeout=START_SECONDS)
