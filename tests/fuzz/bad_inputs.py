@@ -386,7 +386,7 @@ def _in_format(name: str, rows: list[list[str]]) -> bytes:
     if name.endswith(".csv"):
         return text.encode()
     if name.endswith(".gz"):
-        return gzip.compress(text.encode())
+        return gzip.compress(text.encode(), mtime=0)
 
     columns = {key: _column([row[i] for row in rows[1:]]) for i, key in enumerate(rows[0])}
     stream = io.BytesIO()
