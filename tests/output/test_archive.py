@@ -499,8 +499,8 @@ def test_recording_columns(recording: Recording, task: DesignTask, tmp_path: Pat
 
 
 def test_extreme_numbers_survive(task: DesignTask, tmp_path: Path) -> None:
-    """Numbers of the smallest and of the largest magnitude are read back exactly."""
-    values = np.array([5e-324, 1e-300, 0.1 + 0.2, -1.7976931348623157e308])
+    """Numbers of the smallest and of the largest accepted magnitude are read back exactly."""
+    values = np.array([5e-324, 1e-300, 0.1 + 0.2, -1.2345678901234567e150])
     r = Recording(
         t=np.arange(4) * 0.01, ctrl=values[:3, None], y=values[:, None], outputs=("qpos:slide",)
     )
