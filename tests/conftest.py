@@ -34,4 +34,7 @@ def empty_figures(monkeypatch: pytest.MonkeyPatch) -> None:
         with replacing(path):
             return path
 
-    monkeypatch.setattr("mjfim.output.plots.save", touch)
+    # Imported here, because most tests draw nothing and matplotlib takes a while to import.
+    from mjfim.output import plots
+
+    monkeypatch.setattr(plots, "save", touch)

@@ -104,12 +104,19 @@ def test_design_that_stops_at_its_budget(tmp_path: Path, lines: dict[str, str]) 
 
 
 @pytest.mark.usefixtures("no_files")
-def test_budget_used_up_where_derivatives_do_not_exist(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_budget_used_up_where_derivatives_do_not_exist(tmp_path: Path) -> None:
     """A trajectory that is not smooth has to be looked at, whatever ended the search."""
-    monkeypatch.setattr("mjfim.excitation.design.saturated_actuators", lambda *_: ["motor"])
     path = write_experiment(tmp_path, max_iterations="1")
+
+    # The motor is clamped, because limits are only checked here.
+    model = tmp_path / "cart_pendulum.xml"
+    text, old = model.read_text(encoding="utf-8"), '<motor name="force" joint="slide"/>'
+    assert old in text
+    weak = old.replace("/>", ' forcelimited="true" forcerange="-0.2 0.2"/>')
+    model.write_text(text.replace(old, weak), encoding="utf-8")
+    with path.open("a", encoding="utf-8") as experiment:
+        experiment.write("\n[limits]\nenforce = false\n")
+
     result = run("design", path, "-o", tmp_path / "out", "--json")
     assert (result.exit_code, loads(result.stdout)["status"]) == (1, "rough")
 
