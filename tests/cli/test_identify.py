@@ -98,10 +98,12 @@ def test_bad_recordings(study: Path, recorded: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_stale_pictures_of_an_older_estimate_are_removed(
-    study: Path, recorded: Path, tmp_path: Path
+    study: Path, archived: Path, recorded: Path, tmp_path: Path
 ) -> None:
     """An estimate from one recording follows an estimate from two in one folder."""
-    run("identify", study, recorded, recorded, "-o", tmp_path / "e")
+    second = tmp_path / "second.csv"
+    run("simulate", study, archived, "-o", second, "--seed", "6")
+    run("identify", study, recorded, second, "-o", tmp_path / "e")
     (tmp_path / "e" / "fitness.png").touch()  # a file of the user
     assert {"fit_1.png", "fit_2.png"} <= names(tmp_path / "e")
     run("identify", study, recorded, "-o", tmp_path / "e")
