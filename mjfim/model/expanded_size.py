@@ -13,6 +13,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from mjfim.errors import ModelError
+from mjfim.model.included_files import read_with_included_files
 
 # Largest number of elements of a model after replication.
 MAX_ELEMENTS = 200_000
@@ -44,18 +45,7 @@ def check_expanded_size(path: Path) -> None:
         ModelError: The model has too many elements or values, or a too large arena.
     """
     size = _Size()
-    waiting: list[tuple[Path, float]] = [(path, 1.0)]
-    known = {path.resolve()}
-
-    # MuJoCo includes each file only once; its path is relative to the folder of the main file.
-    while waiting:
-        file, factor = waiting.pop()
-        for name, repeated in size.add(file, factor):
-            other = path.parent / name
-            if other.is_file() and other.resolve() not in known:
-                known.add(other.resolve())
-                waiting.append((other, repeated))
-
+    read_with_included_files(path, 1.0, size.add)
     size.require_within_bounds(path)
 
 

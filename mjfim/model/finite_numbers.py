@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ModelError
+from mjfim.model.included_files import read_with_included_files
 
 # NaN as MuJoCo reads it.
 NAN = re.compile(r"[+-]?nan(\(\w*\))?", re.IGNORECASE)
@@ -55,14 +56,7 @@ def check_file_numbers(path: Path) -> None:
         ModelError: A number is NaN; the message names file, line, element and attribute.
     """
     scan = _Scan()
-    files, known = [path], {path.resolve()}
-
-    for file in files:
-        # Included paths are relative to the folder of the main file.
-        found = [path.parent / name for name in scan.read(file)]
-        new = [other for other in found if other.resolve() not in known and other.is_file()]
-        known.update(other.resolve() for other in new)
-        files += new
+    read_with_included_files(path, None, scan.read)
 
     # The reference to an element that is called "nan" is no number.
     for value, message in scan.suspects:
@@ -83,11 +77,12 @@ class _Scan:
         self.names: set[str] = set()
         self.suspects: list[tuple[str, str]] = []
 
-    def read(self, path: Path) -> list[str]:
+    def read(self, path: Path, context: None = None) -> list[tuple[str, None]]:
         """Search one file.
 
         Args:
             path: The file.
+            context: Nothing: all files are searched alike.
 
         Returns:
             The files that it names.
@@ -97,14 +92,14 @@ class _Scan:
         if not re.search(rb"nan|<include|<model", text, re.IGNORECASE):
             return []
 
-        files: list[str] = []
+        files: list[tuple[str, None]] = []
         parser = expat.ParserCreate()
 
         def start(tag: str, attributes: dict[str, str]) -> None:
             """Keep the names, the files and the suspects of an element."""
             self.names.update(attributes[key] for key in ("name", "class") if key in attributes)
             if tag in FILE_ELEMENTS and "file" in attributes:
-                files.append(attributes["file"])
+                files.append((attributes["file"], None))
 
             label = f"{tag} {attributes['name']!r}" if "name" in attributes else f"<{tag}>"
             for key, value in _not_a_number(attributes):
