@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from mjfim.budget import Budget, StopToken
+from mjfim.errors import ExperimentError
 from mjfim.interruption import SIGNALS, hurried
 
 T = TypeVar("T")
@@ -32,6 +33,9 @@ TERMINATION_SECONDS = 2.0 * GRACE
 # Period at which the parent process checks its stop token while it waits for a task [s].
 POLL_INTERVAL = 0.2
 
+# Largest number of threads that can be asked for; more would only use memory.
+MAX_THREADS = 1024
+
 
 def cores() -> int:
     """Return the number of processors that this process may use."""
@@ -39,6 +43,22 @@ def cores() -> int:
         return len(os.sched_getaffinity(0))
 
     return os.cpu_count() or 1
+
+
+def require_threads(threads: int | None) -> None:
+    """Refuse a number of threads that is not positive, or so large that it only uses memory.
+
+    Args:
+        threads: Threads that the user asks for; None for one per core.
+
+    Raises:
+        ExperimentError: The number cannot be used.
+    """
+    if threads is not None and not 1 <= threads <= MAX_THREADS:
+        raise ExperimentError(
+            f"threads: {threads} is not possible; it must be a whole number from 1 to "
+            f"{MAX_THREADS}, or None for one thread per core"
+        )
 
 
 @contextmanager

@@ -19,6 +19,7 @@ import pytest
 import mjfim
 from mjfim import parallel as workers
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.errors import ExperimentError
 from mjfim.excitation import constrained
 from mjfim.excitation.design import design_task
 from mjfim.excitation.interior_point import BarrierIterate, InteriorPointMethod
@@ -26,7 +27,7 @@ from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 from tests.support.cli import names, read, write_experiment
 from tests.support.limits import HARD, cart_inside
-from tests.support.paths import ROOT
+from tests.support.paths import MODELS, ROOT
 
 
 def identity() -> int:
@@ -227,3 +228,11 @@ def test_seconds_end_a_design(tmp_path: Path, limits: dict[str, object]) -> None
     assert len(design.starts) < 500
     assert design.status is not Status.INTERRUPTED
     assert design.final.cost <= design.initial.cost
+
+
+@pytest.mark.parametrize("threads", [0, -1, 1_000_000])
+def test_impossible_numbers_of_threads_are_refused(threads: int) -> None:
+    """The message states the bounds, before anything is allocated."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    with pytest.raises(ExperimentError, match=rf"threads: {threads} .* from 1 to 1024"):
+        mjfim.check(experiment, threads=threads)

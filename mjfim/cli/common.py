@@ -23,6 +23,7 @@ from mjfim.interruption import (
     Interruption,
     current_interruption,
 )
+from mjfim.parallel import MAX_THREADS
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.serialization import as_json as records_as_json
 
@@ -47,9 +48,6 @@ out = Console(
     markup=False,
     emoji=False,
 )
-
-# Largest number of threads that can be asked for; more would only use memory.
-MAX_THREADS = 1024
 
 # Number of iterations from one line of progress to the next, for a design and for an estimation,
 # if stderr is not a terminal.

@@ -25,6 +25,7 @@ from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import STATED, MocapPlacement, ModelVariant, PlantModel, Relaxation
+from mjfim.parallel import require_threads
 from mjfim.plant.batch import state_space
 from mjfim.plant.noise import Noise
 from mjfim.plant.outputs import Outputs
@@ -82,6 +83,7 @@ class System:
                 names the key.
             ModelError: The model cannot be used.
         """
+        require_threads(threads)
         try:
             return cls._resolved(experiment, threads, source)
         except ExperimentError as error:

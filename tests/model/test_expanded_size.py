@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mjfim.errors import ModelError
-from mjfim.model.expanded_size import check_expanded_size
+from mjfim.model.expanded_size import ModelSize, check_expanded_size
 from mjfim.model.loading import load_spec
 from tests.support.paths import MODELS
 
@@ -70,3 +70,60 @@ def test_files_that_are_not_xml_are_left_to_mujoco(tmp_path: Path) -> None:
 def test_models_of_the_repository_are_small(path: Path) -> None:
     """No model of the repository comes close to a bound."""
     check_expanded_size(path)
+
+
+def _write_model(folder: Path, name: str, asset: str, body: str) -> Path:
+    """Write a model with some assets and one body."""
+    path = folder / f"{name}.xml"
+    path.write_text(
+        f'<mujoco model="{name}"><asset>{asset}</asset>'
+        f'<worldbody><body name="b"><geom size="1"/>{body}</body></worldbody></mujoco>',
+        encoding="utf-8",
+    )
+    return path
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_attached_models_are_multiplied(named: bool, tmp_path: Path) -> None:
+    """Six models, each of which attaches the previous one ten times, make a million bodies."""
+    path = _write_model(tmp_path, "m0", "", "")
+    for i in range(6):
+        name = f'name="m{i}"' if named else ""
+        asset = f'<model {name} file="m{i}.xml"/>'
+        attach = "".join(f'<attach model="m{i}" body="b" prefix="{k}"/>' for k in range(10))
+        path = _write_model(tmp_path, f"m{i + 1}", asset, attach)
+    with pytest.raises(ModelError, match=r"m6\.xml: the model expands to .*e\+06 elements"):
+        load_spec(path)
+
+
+def test_a_model_that_attaches_itself_is_refused(tmp_path: Path) -> None:
+    """MuJoCo would read it for ever, which ends the process."""
+    path = _write_model(tmp_path, "self", '<model name="s" file="self.xml"/>', "")
+    with pytest.raises(ModelError, match=r"self\.xml: the model .*self\.xml names itself"):
+        load_spec(path)
+
+
+@pytest.mark.parametrize(
+    "element", ['texture name="t" type="2d"', 'hfield name="h" size="1 1 1 1"']
+)
+def test_packed_images_are_refused_by_their_pixels(element: str, tmp_path: Path) -> None:
+    """The first bytes of a PNG file state how large it is unpacked."""
+    folder = tmp_path / "assets"
+    folder.mkdir()
+    header = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + (100_000).to_bytes(4, "big") * 2
+    (folder / "bomb.png").write_bytes(header)
+    path = _write_model(tmp_path, "image", f'<{element} file="bomb.png"/>', "")
+    text = path.read_text(encoding="utf-8")
+    compiler = '</asset><compiler assetdir="assets"/>'
+    path.write_text(text.replace("</asset>", compiler), encoding="utf-8")
+    with pytest.raises(ModelError, match=r"1e\+10 pixels of images.*at most 2\.5e\+08"):
+        load_spec(path)
+
+
+def test_mesh_files_are_refused_by_their_size(tmp_path: Path) -> None:
+    """The message states the size and the bound."""
+    (tmp_path / "big.obj").write_bytes(b"v 0 0 0\n" * 1000)
+    path = _write_model(tmp_path, "mesh", '<mesh name="m" file="big.obj"/>', "")
+    check_expanded_size(path)
+    with pytest.raises(ModelError, match=r"8e\+03 bytes of mesh files.*at most 5e\+03"):
+        check_expanded_size(path, ModelSize(elements=9, mesh_bytes=5e3))
