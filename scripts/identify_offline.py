@@ -6,16 +6,23 @@ A recording in the format of mjfim has a column `t`, one column `ctrl:<actuator>
 and the measured columns (`qpos:<joint>`, `qvel:<joint>` or the name of a sensor). The table
 `[recording]` of the experiment maps the columns of any other log. `mjfim simulate` writes a
 recording to try it.
+
+The identified model is written beside the recording. A file identified.xml that is there and that
+mjfim did not write is replaced with --force only, and inputs never.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import mjfim
+from mjfim.errors import MjfimError
+from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
+from mjfim.output.manifest import OutputGuard, claimed
 from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings.read import read_recording
 
@@ -27,11 +34,26 @@ def main() -> int:
     )
     parser.add_argument("experiment", type=Path)
     parser.add_argument("recordings", type=Path, nargs="+")
+    parser.add_argument("--force", action="store_true", help="replace your own identified.xml")
     args = parser.parse_args()
 
+    try:
+        return identify(args.experiment, args.recordings, force=args.force)
+    except MjfimError as error:
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        return 2
+
+
+def identify(experiment: Path, files: list[Path], *, force: bool) -> int:
+    """Identify from recordings, and return the exit code."""
     # The experiment file says what is unknown, where to start, and how noisy each output is.
-    system = System.resolve(mjfim.Experiment.from_file(args.experiment))
-    recordings = [read_recording(path, system.channels) for path in args.recordings]
+    system = System.resolve(mjfim.Experiment.from_file(experiment))
+    recordings = [read_recording(path, system.channels) for path in files]
+
+    # Refuse before the work to replace an input, or a file that mjfim did not write.
+    target = files[0].with_name("identified.xml")
+    guard = OutputGuard(input_files(system.experiment, files), force=force)
+    guard.check([target])
 
     # Weighted least squares in MuJoCo over all recordings at once.
     estimate = identify_system(system, recordings)
@@ -45,8 +67,8 @@ def main() -> int:
         print(f"warning: {warning}")
 
     # Write the model with the estimated values.
-    target = args.recordings[0].with_name("identified.xml")
-    remark = write_identified(target, system, estimate.theta)
+    with claimed(target.parent, guard, exclusive=False):
+        remark = write_identified(target, system, estimate.theta)
     print(f"wrote {target}{f' ({remark})' if remark else ''}")
     return 0 if estimate.success and not estimate.misfit else 1
 

@@ -59,6 +59,8 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, default=Path("recording.csv"))
     parser.add_argument("--real-time", action="store_true", help="wait for the time of each row")
     args = parser.parse_args()
+    if args.output.exists():
+        parser.error(f"{args.output} exists; choose another name for the log with -o")
 
     rows = read_rows(args.design)
     robot = SimulatedRobot(args.model, rows[0])
@@ -79,8 +81,12 @@ def main() -> int:
 
     names = [name for name in rows[0] if name.startswith(("qpos:", "qvel:", "ctrl:"))]
     header = ["t", *sorted(names, key=lambda name: ("qpos:", "qvel:", "ctrl:").index(name[:5]))]
-    with args.output.open("w", newline="", encoding="utf-8") as stream:
+
+    # A log that was not written to its end must not be taken for a whole one.
+    temporary = args.output.with_name(f"{args.output.name}.part")
+    with temporary.open("w", newline="", encoding="utf-8") as stream:
         csv.writer(stream).writerows([header, *log])
+    temporary.replace(args.output)
     print(f"wrote {args.output}: {len(log)} rows")
     return 0
 

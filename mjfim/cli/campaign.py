@@ -29,6 +29,11 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_recording
 from mjfim.output.campaign_folder import CampaignFolder, accuracy_sentence
+from mjfim.output.campaign_settings import (
+    campaign_settings,
+    require_same_settings,
+    write_settings,
+)
 from mjfim.output.summaries import describe_campaign
 from mjfim.output.text import render
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
@@ -66,7 +71,7 @@ def campaign(
         bool,
         typer.Option(
             "--resume",
-            help="Continue a simulated campaign after its last complete round, with equal --seed.",
+            help="Continue a simulated campaign after its last complete round, with equal settings.",
         ),
     ] = False,
     force: Force = False,
@@ -85,7 +90,7 @@ def campaign(
 
     simulated = not (real or recordings)
     if simulated:
-        run.require_simulation(resume=resume)
+        run.require_simulation(seed, resume=resume)
     names = run.folder.next_files(simulated=simulated)
     claim_folder(output, names, input_files(stated, recordings or []), force=force)
 
@@ -131,16 +136,17 @@ class CampaignRun:
         self._wanted = target_accuracies(task)
         self._estimate: Estimate | None = None
 
-    def require_simulation(self, *, resume: bool) -> None:
+    def require_simulation(self, seed: int, *, resume: bool) -> None:
         """Check that a simulated campaign can begin, or continue.
 
         Args:
+            seed: Seed of the simulated noise.
             resume: Whether a campaign in the folder is continued.
 
         Raises:
             ExperimentError: No parameter states a true value.
-            RecordingError: The folder holds a campaign that is not continued, or one with
-                recordings of a real robot.
+            RecordingError: The folder holds a campaign that is not continued, one with recordings
+                of a real robot, or one that began with other settings.
         """
         experiment = self.task.experiment
         if all(spec.true is None for spec in experiment.parameters.values()):
@@ -159,6 +165,8 @@ class CampaignRun:
                 f"{self.folder.path}: the recordings of this campaign are those of a real robot, "
                 "to which --resume would add simulated ones; continue it with --real"
             )
+        if resume and self.folder.has_rounds:
+            require_same_settings(self.folder.path, campaign_settings(experiment, seed))
 
     def simulated(self, rounds: int, seed: int) -> Campaign:
         """Run a campaign on a robot that is the model at its true values.
@@ -175,8 +183,13 @@ class CampaignRun:
             write_recording(self.folder.round(number) / "recording.csv", recording, system)
             return recording
 
+        settings = campaign_settings(self.task.experiment, seed)
+
         def measure(design: Design, number: int) -> Recording:
             """Write the design of a round, and simulate its recording."""
+            # A call that continues the campaign needs the settings as soon as there is a round.
+            if not self.folder.has_rounds:
+                write_settings(self.folder.path, settings)
             self._write_design(design, number)
             return record(design, number)
 

@@ -19,6 +19,7 @@ from mjfim.experiment.system import System
 from mjfim.interruption import run_optional
 from mjfim.output import plots
 from mjfim.output.archive import check_fits, write_design
+from mjfim.output.campaign_settings import SETTINGS_FILE
 from mjfim.output.folders import DESIGN_ARCHIVE
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.plots.style import format_with_uncertainty
@@ -29,7 +30,13 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.serialization import read_json, write_json
 
 # Files of a campaign beside the folders of its rounds.
-CAMPAIGN_FILES = ("campaign.json", "campaign.npz", "campaign.png", "identified.xml")
+CAMPAIGN_FILES = (
+    SETTINGS_FILE,
+    "campaign.json",
+    "campaign.npz",
+    "campaign.png",
+    "identified.xml",
+)
 
 # Files of the estimate after a round.
 ESTIMATE_ARCHIVE = ("estimate.json", "estimate.npz")

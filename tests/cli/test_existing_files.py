@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 from pathlib import Path
 
 import pytest
 
+from mjfim.errors import OutputError
+
 from mjfim.output import folders
 from mjfim.output.file_lock import FileLock
 from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, OutputGuard, claimed
 from tests.support.cli import misused, names, run, write_experiment
+from tests.support.paths import SCRIPTS
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -122,3 +126,25 @@ def test_every_file_of_a_verb_is_checked_before_the_work(
     assert names(home / "out") - {MANIFEST} <= set(folders.DESIGN_FILES)
     assert names(home / "fit") - {MANIFEST} == set(folders.estimate_files(1))
     assert set(folders.study_files(["m", "l", "c"])) >= {"histogram_m.png", "montecarlo.json"}
+
+
+def test_the_script_for_logs_does_not_replace_a_model_of_the_user(
+    study: Path, recorded: Path, tmp_path: Path
+) -> None:
+    """Its own earlier result is replaced; the user's with --force, which the message names."""
+    spec = importlib.util.spec_from_file_location("script", SCRIPTS / "identify_offline.py")
+    assert spec is not None and spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+
+    log = tmp_path / "log.csv"
+    shutil.copy(recorded, log)
+    mine = tmp_path / "identified.xml"
+    mine.write_text("mine", encoding="utf-8")
+    with pytest.raises(OutputError, match=r"identified\.xml: not listed.*--force"):
+        script.identify(study, [log], force=False)
+    assert mine.read_text(encoding="utf-8") == "mine"
+
+    assert script.identify(study, [log], force=True) == 0
+    assert script.identify(study, [log], force=False) == 0
+    assert mine.read_text(encoding="utf-8").startswith("<mujoco")

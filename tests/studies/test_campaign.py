@@ -18,12 +18,18 @@ from typer.testing import Result
 import mjfim
 from mjfim.arrays import Array
 from mjfim.budget import StopToken
+from mjfim.cli.campaign import with_target_accuracies
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.identification.residual_tests import is_larger_than_noise
+from mjfim.output.campaign_settings import (
+    campaign_settings,
+    require_same_settings,
+    write_settings,
+)
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
@@ -526,3 +532,26 @@ def test_a_campaign_is_not_continued_by_mistake(tmp_path: Path) -> None:
 
     (folder / "campaign.json").write_text('{"simulated": false}', encoding="utf-8")
     misused(run(*words, "--resume"), f"{folder}: the recordings", "real robot", "--real")
+
+
+def test_a_campaign_is_continued_with_its_own_settings_only(tmp_path: Path) -> None:
+    """The seed, every key of the experiment, and the contents of its files are compared."""
+    study, folder = write_study(tmp_path), tmp_path / "out"
+    (folder / "round_1").mkdir(parents=True)
+    words = ("campaign", study, "-o", folder, "--resume")
+    misused(run(*words, "--wanted", 0.1), "settings.json: no such file", "another folder")
+
+    experiment = with_target_accuracies(mjfim.Experiment.from_file(study), 0.1)
+    write_settings(folder, campaign_settings(experiment, seed=5))
+    require_same_settings(folder, campaign_settings(experiment, seed=5))
+    other = run(*words, "--wanted", 0.2, "--seed", 6)
+    told = ("--seed was 5, is 6", "parameters.c.wanted was 0.13", "is 0.27", "and 1 more")
+    misused(other, f"{folder}: --resume needs the settings", *told)
+
+    # A comment in the experiment file changes nothing, a comment in the model may.
+    study.write_text(study.read_text(encoding="utf-8") + "# end\n", encoding="utf-8")
+    require_same_settings(folder, campaign_settings(experiment, seed=5))
+    model = tmp_path / "cart_pendulum.xml"
+    model.write_text(model.read_text(encoding="utf-8") + "<!-- end -->\n", encoding="utf-8")
+    changed = run(*words, "--wanted", 0.1, "--seed", 5)
+    misused(changed, "the file cart_pendulum.xml was changed")
