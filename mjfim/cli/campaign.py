@@ -71,7 +71,7 @@ def campaign(
         bool,
         typer.Option(
             "--resume",
-            help="Continue a simulated campaign after its last complete round, with equal settings.",
+            help="Continue a simulated campaign after its last complete round; settings as before.",
         ),
     ] = False,
     force: Force = False,

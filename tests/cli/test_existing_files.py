@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from mjfim.errors import OutputError
-
 from mjfim.output import folders
 from mjfim.output.file_lock import FileLock
 from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, OutputGuard, claimed
