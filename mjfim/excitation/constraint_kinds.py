@@ -30,7 +30,8 @@ class ConstraintValues:
 
     Attributes:
         trajectory: The trajectory.
-        observed: (N, substeps, w) quantities at every engine step [unit of each quantity].
+        observed: (N, rows, w) quantities at every engine step of a sample, followed by the further
+            rows of forces [unit of each quantity].
         distances: (N, m) distances at the samples 1 ... N [m], or None without a clearance.
         distance_slopes: (N, m, nv) derivatives of the distances by the position [m / q-unit], or
             None where they were not requested.

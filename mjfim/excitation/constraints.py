@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
@@ -19,7 +20,7 @@ from mjfim.excitation.constraint_kinds import (
     ExpansionSums,
     SubstepConstraint,
 )
-from mjfim.excitation.limits import Limit
+from mjfim.excitation.limits import Limit, has_constant_forces
 from mjfim.excitation.task import DesignTask
 from mjfim.model.geom_distance import GeomDistances
 from mjfim.model.geom_pairs import find_geom_pairs
@@ -95,7 +96,7 @@ class ConstraintSet:
 
         Args:
             trajectory: The trajectory.
-            observed: (N, substeps, w) observations at every engine step.
+            observed: (N, rows, w) observations at every engine step, and further rows of forces.
             slopes: Compute the derivatives of distances as well.
 
         Returns:
@@ -266,6 +267,7 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
         actuator_forces=addresses["force"],
         joint_forces=addresses["joint_force"],
         derivative_substeps=derivative_substeps_of(task.system.grid.substeps),
+        force_rows=_force_rows(task) if by_kind["force"] or by_kind["joint_force"] else (),
         timestep=float(task.plant.simulator.model.opt.timestep),
     )
     lower = np.array([limit.lower for limit in ordered])
@@ -276,6 +278,23 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
         kinds=tuple(limit.kind for limit in ordered),
         names=tuple(limit.name for limit in ordered),
     )
+
+
+def _force_rows(task: DesignTask) -> tuple[int, ...]:
+    """Engine steps of a sample whose forces have to be computed in addition to a rollout.
+
+    MuJoCo keeps the forces at the beginning of each engine step, and with RK4 those of its last
+    stage. The forces at the end of a sample under its control are those that the next sample
+    begins with where the control does not change.
+    """
+    model = task.system.model
+    if has_constant_forces(model):
+        return ()
+
+    substeps = task.system.grid.substeps
+    with_stages = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+    begun = range(substeps) if with_stages else ()
+    return (*begun, substeps - 1)
 
 
 def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, nu: int) -> Bounds | None:

@@ -232,6 +232,30 @@ def _model_ranges(indices: Mapping[str, int], limited: Any, ranges: Any) -> dict
     return {name: tuple(ranges[i]) for name, i in indices.items() if limited[i]}
 
 
+def has_constant_forces(model: Any) -> bool:
+    """Check whether a constant control means constant forces of all actuators and on all joints.
+
+    This holds for motors that act directly on slides and hinges. The forces of servos, filtered
+    actuators and muscles change with the state.
+
+    Args:
+        model: MjModel.
+    """
+    is_direct = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    driven = model.actuator_trnid[is_direct, 0]
+    scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+    if not is_direct.all() or not np.isin(model.jnt_type[driven], scalar).all():
+        return False
+
+    is_motor = (
+        (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED))
+        & (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
+        & (model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_NONE))
+    )
+    is_damped = model.actuator_damping.any() or model.actuator_dampingpoly.any()
+    return bool(is_motor.all()) and not is_damped and not model.jnt_actgravcomp.any()
+
+
 def unsupported_ranges(model: Any) -> tuple[str, ...]:
     """Find the elements with a range in the MJCF that a design cannot keep as a limit.
 

@@ -182,13 +182,20 @@ def _unenforced_kinds(task: DesignTask) -> frozenset[str]:
 def _usage_within_samples(
     task: DesignTask, constraints: ConstraintSet, observed: Array
 ) -> Iterator[LimitUsage]:
-    """Position of the observed quantities, (N, substeps, w), in their ranges."""
+    """Position of the observed quantities, (N, rows, w), in their ranges."""
     substeps = constraints.substeps
-    N, steps, w = observed.shape
-    flat = observed.reshape(N * steps, w)
-    positions = substeps.bounds.relative_position(flat)
+    N, _, w = observed.shape
+    steps = task.system.grid.substeps
+    shares = substeps.bounds.relative_position(observed)
 
-    t = _engine_times(task, len(flat))
+    # The position of an engine step is the farthest one of all rows that belong to it.
+    within = shares[:, :steps].copy()
+    for row, step in enumerate(constraints.observations.force_rows, start=steps):
+        farther = np.abs(shares[:, row]) > np.abs(within[:, step])
+        within[:, step] = np.where(farther, shares[:, row], within[:, step])
+    positions = within.reshape(N * steps, w)
+
+    t = _engine_times(task, len(positions))
     for i, (kind, name) in enumerate(zip(substeps.kinds, substeps.names, strict=True)):
         yield LimitUsage(kind=kind, name=name, t=t, share=positions[:, i])
 

@@ -224,7 +224,11 @@ class Limits(Section):
         default_factory=dict, description="Limit of the joint velocities [m/s or rad/s]."
     )
     acceleration: Positive | dict[str, Positive | Range] = Field(
-        default_factory=dict, description="Limit of the joint accelerations [m/s² or rad/s²]."
+        default_factory=dict,
+        description=(
+            "Limit of the joint accelerations [m/s² or rad/s²]: the change of the velocity over "
+            "each engine step, divided by the timestep."
+        ),
     )
     control: dict[str, Range] = Field(
         default_factory=dict, description="Range of a control by actuator name [actuator unit]."
@@ -238,7 +242,11 @@ class Limits(Section):
         ),
     )
     force: Positive | dict[str, Positive | Range] = Field(
-        default_factory=dict, description="Limit of the actuator forces [N or N m]."
+        default_factory=dict,
+        description=(
+            "Limit of the actuator forces [N or N m], at the beginning and at the end of each "
+            "engine step, as MuJoCo's force sensors read them."
+        ),
     )
     clearance: Positive | None = Field(
         default=None,

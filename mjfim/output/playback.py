@@ -79,8 +79,12 @@ def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
 
     They hold the planned motion and the feed-forward forces that belong to it.
 
-    `qpos:<joint>` and `qvel:<joint>` are planned, `qacc:<joint>` is MuJoCo's acceleration under the
-    control of the row, and `force:<joint>` what the actuators apply at the joint. The last row
+    `qpos:<joint>` and `qvel:<joint>` are planned. `qacc:<joint>` is the acceleration of this motion
+    as `limits.acceleration` limits it: the change of the velocity over the engine step that begins
+    at the row, divided by the timestep. It is not MuJoCo's `qacc`, from which implicit integrators
+    and RK4 make another change of the velocity. The last row has that of the last engine step.
+
+    `force:<joint>` is what the actuators apply at the joint, by `mj_forward`; the last row
     continues the last control.
 
     Args:
@@ -91,10 +95,9 @@ def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
     qpos, qvel, act = system.space.split(playback.state)
     rows = Trajectory(t=playback.t, qpos=qpos, qvel=qvel, act=act, ctrl=held)
 
-    qacc = np.empty_like(qvel)
+    qacc = _accelerations(playback, system)
     force = np.empty_like(qvel)
     for k, data in forward_samples(system.model_at(system.theta), rows, range(len(held))):
-        qacc[k] = data.qacc
         force[k] = data.qfrc_actuator
 
     names = [component.name for component in state_components(system.model)]
@@ -105,3 +108,20 @@ def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
     columns |= {f"qacc:{name}": qacc[:, i] for i, name in enumerate(dofs)}
     columns |= {f"force:{name}": force[:, i] for i, name in enumerate(dofs)}
     return columns
+
+
+def _accelerations(playback: Playback, system: System) -> Array:
+    """(M+1, nv) changes of the velocity over an engine step, divided by the timestep.
+
+    Those of the M periods belong to the first engine step of the period, the last one to the last
+    engine step of the last period.
+    """
+    steps = system.stated_grid.playback_steps
+    held = np.repeat(playback.ctrl, steps, axis=0)
+    simulator = BatchSimulator(system.plant.simulator.model)
+    model = system.plant.model(system.theta)
+    out = simulator.rollout([model], playback.state[:1], held[None])
+
+    _, velocity, _ = system.space.split(out.states[0])
+    change = np.diff(velocity, axis=0) / float(model.opt.timestep)
+    return np.concatenate([change[::steps], change[-1:]])

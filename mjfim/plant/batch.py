@@ -82,16 +82,26 @@ class SubstepObservations:
 
     There are w numbers per engine step, in the order of the attributes.
 
+    A force is what MuJoCo keeps in its field after the step. That is the force at the beginning of
+    the step, which a force sensor reads, and with RK4 the force of the last of its four stages.
+    Where forces change within an engine step, rollouts have further rows with the same positions,
+    velocities and accelerations and other forces: with RK4 those at the beginning of every step,
+    and always those at the end of the sample under its control.
+
     Attributes:
         positions: Addresses in qpos, after the step.
         velocities: Addresses in qvel, after the step.
         accelerations: Addresses in qvel whose change over the step, divided by the timestep, is
-            observed.
-        actuator_forces: Addresses in actuator_force, during the step.
-        joint_forces: Addresses in qfrc_actuator, during the step.
+            observed. This is what the robot does; with implicit integrators and with RK4 it
+            differs from qacc.
+        actuator_forces: Addresses in actuator_force.
+        joint_forces: Addresses in qfrc_actuator.
         derivative_substeps: Engine steps of a sample, counted from 1, at which derivatives are
             taken.
         timestep: Engine timestep [s].
+        force_rows: Engine step of a sample, counted from 0, to which each further row of a
+            rollout belongs; the last one is the end of the sample. Empty where forces are constant
+            under a constant control.
     """
 
     positions: np.ndarray
@@ -101,6 +111,7 @@ class SubstepObservations:
     joint_forces: np.ndarray
     derivative_substeps: tuple[int, ...]
     timestep: float
+    force_rows: tuple[int, ...] = ()
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -127,7 +138,21 @@ class SubstepObservations:
             (..., w) observed values.
         """
         change = qvel[..., self.accelerations] - qvel_before[..., self.accelerations]
-        parts = [qpos[..., self.positions], qvel[..., self.velocities], change / self.timestep]
+        motion = [qpos[..., self.positions], qvel[..., self.velocities], change / self.timestep]
+        if not self.fields:
+            return np.concatenate(motion, axis=-1)
+        return np.concatenate([*motion, self.forces(read)], axis=-1)
+
+    def forces(self, read: Callable[[str], Array]) -> Array:
+        """Observed forces, the last of the observed values; there is at least one.
+
+        Args:
+            read: Returns an MjData field, (..., size), by its name.
+
+        Returns:
+            (..., f) observed forces.
+        """
+        parts = []
         if len(self.actuator_forces):
             parts.append(read("actuator_force")[..., self.actuator_forces])
         if len(self.joint_forces):
@@ -144,7 +169,8 @@ class Rollouts:
         sensors: (m, N+1, nsensordata) sensor data that belong to the states, or None if not
             requested.
         finite: (m,) False where a simulation diverged.
-        observed: (m, N, substeps, w) observations at every engine step, or None if not requested.
+        observed: (m, N, rows, w) observations at every engine step of a sample, and then the
+            further rows of `SubstepObservations.force_rows`; None if not requested.
     """
 
     states: Array
@@ -287,6 +313,9 @@ class BatchSimulator:
             sensors = self._sensor_data(out["sensordata"][:, :: self.substeps])
         if observations is not None:
             observed = self._observed(observations, start, out, engine_steps)
+            if observations.force_rows:
+                forces = self._forces_between_steps(observations, models, start, out, ctrl)
+                observed = _with_force_rows(observations, observed, forces)
         return Rollouts(states=states, sensors=sensors, finite=finite, observed=observed)
 
     def _held(self, ctrl: Array) -> Array:
@@ -487,6 +516,64 @@ class BatchSimulator:
         samples = engine_steps // self.substeps
         return np.asarray(rows.reshape(len(start), samples, self.substeps, rows.shape[-1]))
 
+    def _forces_between_steps(
+        self,
+        observations: SubstepObservations,
+        models: Sequence[Any],
+        start: Array,
+        out: dict[Any, Array],
+        ctrl: Array,
+    ) -> Array:
+        """Forces by `mj_forward` for the further rows of a rollout.
+
+        Args:
+            observations: The observed quantities, with further rows.
+            models: One model for all simulations, or one for each.
+            start: (m, ns) initial states.
+            out: Records of the rollout.
+            ctrl: (m, N, nu) controls, each held over its sample.
+
+        Returns:
+            (m, N, further rows, f) forces of the f last observations.
+        """
+        m, N, nu = ctrl.shape
+        after = out[RECORDED_STATE][:, : N * self.substeps, 1:]
+        before = np.concatenate([start[:, None], after[:, :-1]], axis=1)
+        shape = (m, N, self.substeps, start.shape[1])
+
+        # The states at the beginning of the engine steps, and those at the end of the samples.
+        ends = after.reshape(shape)[:, :, -1:]
+        begun = before.reshape(shape)[:, :, : len(observations.force_rows) - 1]
+        states = np.concatenate([begun, ends], axis=2)
+        rows = states.shape[2]
+
+        # Values that are not finite belong to simulations that diverged.
+        flat = np.nan_to_num(states.reshape(-1, start.shape[1]), posinf=0.0, neginf=0.0)
+        held = np.broadcast_to(ctrl[:, :, None], (m, N, rows, nu)).reshape(-1, nu)
+        forces = self._forces_at(observations, models, flat, held)
+        return np.asarray(forces.reshape(m, N, rows, -1))
+
+    def _forces_at(
+        self, observations: SubstepObservations, models: Sequence[Any], states: Array, ctrl: Array
+    ) -> Array:
+        """(n, f) observed forces at n states, (n, ns), under controls, (n, nu)."""
+        count = len(states)
+        batch = self._batch("forces", count)
+        each = models
+        if len(models) > 1:
+            each = [model for model in models for _ in range(count // len(models))]
+        padding = [models[-1]] * (batch.nsim - count)
+        batch.set_models(each[0] if len(each) == 1 else [*each, *padding])
+
+        ids = self._load(batch, states, each)
+        batch.bind("ctrl")[:count] = ctrl
+        for name in observations.fields:
+            batch.bind(name)
+
+        with silence_mujoco_log():
+            batch.forward(ids)
+        return observations.forces(lambda name: batch.bind(name)[:count])
+
     def _sensor_data(self, data: Array) -> Array:
         """A copy of sensor data: (..., nsensordata) whose clocks count from zero."""
         copied = np.array(data)
@@ -504,6 +591,22 @@ class BatchSimulator:
         duration = engine_steps * timestep
         error = np.abs(time - START_TIME - duration)
         return np.asarray(error < 0.5 * timestep)
+
+
+def _with_force_rows(observations: SubstepObservations, observed: Array, forces: Array) -> Array:
+    """Append the further rows of a rollout.
+
+    Args:
+        observations: The observed quantities, with r further rows.
+        observed: (m, N, substeps, w) observations at the engine steps.
+        forces: (m, N, r, f) forces of the further rows.
+
+    Returns:
+        (m, N, substeps + r, w) observations.
+    """
+    further = observed[:, :, list(observations.force_rows)]
+    further[..., -forces.shape[-1] :] = forces
+    return np.concatenate([observed, further], axis=2)
 
 
 def _is_accepted(ctrl: Array) -> np.ndarray:

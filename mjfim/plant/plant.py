@@ -292,7 +292,8 @@ class Plant:
             observations: The w observed quantities.
 
         Returns:
-            The trajectory and (N, substeps, w) observations, or None if the simulation diverges.
+            The trajectory and (N, rows, w) observations, see `Rollouts`, or None if the simulation
+            diverges.
         """
         out = self.simulator.rollout(
             [self.model(theta)],

@@ -459,7 +459,7 @@ class RobotBench:
             name="robot",
         )
         qpos = out.states[0][:, : task.space.nq]
-        margins = self._margins(out.observed[0, :, 0], sent, before, qpos, controller.feedback)
+        margins = self._margins(out.observed[0], sent, before, qpos, controller.feedback)
         return recording, margins, start
 
     def _margins(
@@ -468,7 +468,7 @@ class RobotBench:
         """Smallest margins of all limits.
 
         Args:
-            observed: (n, w) observations at every engine step.
+            observed: (n, rows, w) observations at every engine step, with further rows of forces.
             sent: (M, nu) controls that were sent [unit of the actuator].
             before: (nu,) control before the motion begins [unit of the actuator].
             qpos: (n+1, nq) positions at every engine step.
@@ -479,7 +479,7 @@ class RobotBench:
         """
         constraints = self.constraints
         bounds = constraints.substeps.bounds
-        inside = bounds.margin(observed).min(axis=0, initial=np.inf) / bounds.scale
+        inside = bounds.margin(observed).min(axis=(0, 1), initial=np.inf) / bounds.scale
         rates = self._control_rates(sent, before, feedback)
 
         margins = []

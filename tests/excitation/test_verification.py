@@ -12,7 +12,7 @@ import pytest
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, verify
-from mjfim.output.playback import simulate_playback
+from mjfim.output.playback import reference_columns, simulate_playback
 from tests.support.numerics import CART_PENDULUM, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
@@ -187,6 +187,122 @@ def test_a_rate_of_the_control_holds_from_row_to_row_of_the_played_table(
         found = verify(limited, limited.initial)
         assert found.margins["control_rate"] == pytest.approx((share - 1.0) * fastest)
         assert found.is_feasible is kept
+
+
+# A link whose drive is a servo or a filtered motor, with force sensors. It is so light against its
+# damping that implicit integrators do not follow its qacc.
+LIGHT_LINK = """
+<mujoco model="link">
+  <option timestep="0.005" integrator="{integrator}"/>
+  <worldbody>
+    <body name="link">
+      <joint name="hinge" axis="0 1 0" damping="0.3" {joint}/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.2"/>
+    </body>
+  </worldbody>
+  <actuator>{drive}</actuator>
+  <sensor>
+    <actuatorfrc actuator="drive"/>
+    <jointactuatorfrc joint="hinge"/>
+  </sensor>
+</mujoco>
+"""
+DRIVES = {
+    "servo": '<position name="drive" joint="hinge" kp="4" kv="0.2" gear="2"/>',
+    "filtered": '<general name="drive" joint="hinge" dyntype="filter" dynprm="0.02" gear="2"/>',
+}
+
+
+def light_link(
+    folder: Path, integrator: str, drive: str, joint: str = "", **tables: Any
+) -> DesignTask:
+    """The light link under a sine for 0.4 s, with two engine steps in each sample."""
+    control = {"kind": "sine", "amplitude": 0.4, "frequency": 2.5}
+    defaults: dict[str, Any] = {
+        "rate": 100.0,
+        "horizon": 0.4,
+        "parameters": {"m": {"target": "body/link:mass"}},
+        "noise": {"state": 0.01},
+        "initial": {"control": control},
+    }
+    text = LIGHT_LINK.format(integrator=integrator, drive=DRIVES[drive], joint=joint)
+    return make_task(text, folder, **{**defaults, **tables})
+
+
+def largest_forces(task: DesignTask) -> tuple[float, float]:
+    """Largest force of the actuator and on the joint that MuJoCo shows in a plain loop.
+
+    They are read from the sensors and the fields after every step, and from the sensors after
+    `mj_forward` at the state after the step.
+    """
+    model = task.system.model
+    data, after = mujoco.MjData(model), mujoco.MjData(model)
+    found = []
+    for control in task.control:
+        data.ctrl[:] = after.ctrl[:] = control
+        for _ in range(task.system.grid.substeps):
+            mujoco.mj_step(model, data)
+            after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
+            mujoco.mj_forward(model, after)
+            fields = np.array([data.actuator_force[0], data.qfrc_actuator[0]])
+            found += [data.sensordata.copy(), after.sensordata.copy(), fields]
+    actuator, joint = np.abs(found).max(axis=0)
+    return float(actuator), float(joint)
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+def test_a_force_within_its_limit_is_never_shown_above_it_by_mujoco(
+    integrator: str, drive: str, tmp_path: Path
+) -> None:
+    """The margin is that to the largest force of all sensors and fields."""
+    force, _ = largest_forces(light_link(tmp_path, integrator, drive))
+    for share in (1.001, 0.999):
+        task = light_link(tmp_path, integrator, drive, limits={"force": {"drive": share * force}})
+        found = verify(task, task.initial)
+        assert found.margins["force"] == pytest.approx((share - 1.0) * force, rel=1e-6)
+        assert found.is_feasible is (share > 1.0)
+
+        # The usage over time has one value for each engine step, and the same largest force.
+        (usage,) = (used for used in found.usage if used.kind == "force")
+        assert len(usage.t) == len(usage.share) == task.samples * task.system.grid.substeps
+        assert np.abs(usage.share).max() == pytest.approx(1.0 / share, rel=1e-6)
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+def test_the_same_holds_for_the_range_of_the_force_on_a_joint(
+    integrator: str, drive: str, tmp_path: Path
+) -> None:
+    """The MJCF's range is a limit; the force is twice that of the actuator here."""
+    _, force = largest_forces(light_link(tmp_path, integrator, drive))
+    ranged = f'actuatorfrcrange="{-2 * force} {2 * force}"'
+    task = light_link(tmp_path, integrator, drive, joint=ranged)
+    assert verify(task, task.initial).margins["joint_force"] == pytest.approx(force, rel=1e-6)
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+def test_reference_csv_has_no_acceleration_above_a_limit_that_holds(
+    integrator: str, drive: str, tmp_path: Path
+) -> None:
+    """The largest acceleration of the table is that which is limited, the change of the velocity in
+    an engine step, although MuJoCo's qacc is far larger.
+    """
+    playback = {"playback_rate": 200.0}  # one row per engine step
+    task = light_link(tmp_path, integrator, drive, **playback)
+    gain = np.zeros((task.samples, 1, task.space.nx))
+    played = simulate_playback(task.system, task.initial, gain)
+    columns = reference_columns(played, task.system)
+    largest = float(np.abs(columns["qacc:hinge"]).max())
+    speed = columns["qvel:hinge"]
+    np.testing.assert_allclose(columns["qacc:hinge"][:-1], np.diff(speed) / 0.005, atol=1e-9)
+
+    limited = light_link(
+        tmp_path, integrator, drive, limits={"acceleration": 1.001 * largest}, **playback
+    )
+    found = verify(limited, limited.initial)
+    assert found.margins["acceleration"] == pytest.approx(0.001 * largest, rel=1e-6)
 
 
 # An arm with dry friction whose solver is stopped long before it has converged.

@@ -1,6 +1,10 @@
 """Play design.csv in plain MuJoCo, and compare every engine step with the limits.
 
 Nothing of the package is used here: the judge of a design must not share its mistakes.
+
+An acceleration is the change of the velocity over an engine step, divided by the timestep. A force
+is whatever MuJoCo shows: what force sensors read after a step, what the fields of MjData hold
+then, and what sensors read after `mj_forward` at the state after the step.
 """
 
 from __future__ import annotations
@@ -19,6 +23,22 @@ Range = tuple[float, float]
 # adds the rounding of the planned states, which unstable plants make larger.
 ROUNDING = 1e-9
 ROUNDING_WITH_FEEDBACK = 1e-6
+
+
+def model_with_force_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a model with a force sensor for each actuator and each joint; nothing else changes.
+
+    The sensors of the actuators come first, in the order of the actuators; then those of the
+    joints.
+    """
+    kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
+    for actuator in spec.actuators:
+        sensor = spec.add_sensor(type=kinds.mjSENS_ACTUATORFRC, objtype=objects.mjOBJ_ACTUATOR)
+        sensor.objname = actuator.name
+    for joint in spec.joints:
+        sensor = spec.add_sensor(type=kinds.mjSENS_JOINTACTFRC, objtype=objects.mjOBJ_JOINT)
+        sensor.objname = joint.name
+    return spec.compile()
 
 
 @dataclass(kw_only=True)
@@ -52,7 +72,7 @@ class Excess:
 
 
 def read_rows(path: Path) -> list[dict[str, float]]:
-    """Read the rows of design.csv; an empty field is NaN."""
+    """Read the rows of design.csv or reference.csv; an empty field is NaN."""
     with path.open(newline="", encoding="utf-8") as stream:
         rows = csv.DictReader(stream)
         return [{name: float(text or "nan") for name, text in row.items()} for row in rows]
@@ -68,7 +88,7 @@ def play(
     """Play the rows from the state of the first one, and observe every engine step.
 
     Args:
-        model: The untouched model; all joints are hinges or slides.
+        model: The model of `model_with_force_sensors`; all joints are hinges or slides.
         rows: Rows of design.csv.
         ranges: Range by kind and name of every limit; the kinds "end_position" and "end_velocity"
             are deviations of the final state from the initial one.
@@ -79,7 +99,7 @@ def play(
         The largest excess beyond every limit.
     """
     excess = Excess(ranges=ranges)
-    data = mujoco.MjData(model)
+    data, after = mujoco.MjData(model), mujoco.MjData(model)
     joints = [model.joint(i).name for i in range(model.njnt)]
     drives = [model.actuator(i).name for i in range(model.nu)]
     filtered = [drives[i] for i in range(model.nu) if model.actuator(i).actadr[0] >= 0]
@@ -105,7 +125,7 @@ def play(
 
         data.ctrl[:] = ctrl
         for _ in range(round((following["t"] - row["t"]) / model.opt.timestep)):
-            _step(model, data, joints, drives, excess)
+            _step((data, after), joints, drives, excess)
 
     for i, name in enumerate(joints):
         excess.see("end_position", name, float(data.qpos[i] - first[i]))
@@ -113,14 +133,43 @@ def play(
     return excess
 
 
+def read_reference(rows: list[dict[str, float]], ranges: dict[tuple[str, str], Range]) -> Excess:
+    """Compare every value of reference.csv with its limit.
+
+    Args:
+        rows: Rows of reference.csv.
+        ranges: Range by kind and name of every limit.
+
+    Returns:
+        The largest excess beyond every limit.
+    """
+    excess = Excess(ranges=ranges)
+    kinds = {
+        "qpos": "position",
+        "qvel": "velocity",
+        "qacc": "acceleration",
+        "force": "joint_force",
+    }
+    for row in rows:
+        for column, value in row.items():
+            field_name, _, joint = column.partition(":")
+            excess.see(kinds.get(field_name, ""), joint, value)
+    return excess
+
+
 def _step(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
+    simulations: tuple[mujoco.MjData, mujoco.MjData],
     joints: list[str],
     drives: list[str],
     excess: Excess,
 ) -> None:
-    """Do one engine step, and compare what it shows with the limits."""
+    """Do one engine step of the first simulation, and compare what it shows with the limits.
+
+    The second simulation shows the forces at the state after the step, with the control of the
+    step.
+    """
+    data, after = simulations
+    model = data.model
     velocity = data.qvel.copy()
     mujoco.mj_step(model, data)
     acceleration = (data.qvel - velocity) / model.opt.timestep
@@ -129,9 +178,16 @@ def _step(
         excess.see("position", name, float(data.qpos[i]))
         excess.see("velocity", name, float(data.qvel[i]))
         excess.see("acceleration", name, float(acceleration[i]))
-        excess.see("joint_force", name, float(data.qfrc_actuator[i]))
-    for i, name in enumerate(drives):
-        excess.see("force", name, float(data.actuator_force[i]))
+
+    after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
+    after.ctrl[:] = data.ctrl
+    mujoco.mj_forward(model, after)
+
+    fields = np.concatenate([data.actuator_force, data.qfrc_actuator])
+    limited = [("force", name) for name in drives] + [("joint_force", name) for name in joints]
+    for shown in (fields, data.sensordata, after.sensordata):
+        for (kind, name), value in zip(limited, shown.tolist(), strict=True):
+            excess.see(kind, name, value)
 
 
 def _feedback(

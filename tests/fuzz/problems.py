@@ -14,7 +14,14 @@ from mjfim.experiment.system import System
 from mjfim.output.archive import write_design
 from tests.fuzz.outcome import Case, Outcome
 from tests.fuzz.plants import Plant, Range, Rng, about_zero, random_plant
-from tests.fuzz.player import ROUNDING, ROUNDING_WITH_FEEDBACK, play, read_rows
+from tests.fuzz.player import (
+    ROUNDING,
+    ROUNDING_WITH_FEEDBACK,
+    model_with_force_sensors,
+    play,
+    read_reference,
+    read_rows,
+)
 from tests.fuzz.workers import announce
 
 # Time of one design [s]; the iterations end most of them before.
@@ -51,8 +58,10 @@ def run(case: Case, folder: Path) -> Outcome:
 
 
 def violations(plant: Plant, tables: dict[str, Any], folder: Path) -> list[str]:
-    """Play design.csv of a folder with and without feedback, and describe what is violated."""
-    model = mujoco.MjModel.from_xml_path(str(folder / "plant.xml"))
+    """Describe what is violated where design.csv of a folder is played with and without feedback,
+    and in the values of reference.csv.
+    """
+    model = model_with_force_sensors(mujoco.MjSpec.from_file(str(folder / "plant.xml")))
     rows = read_rows(folder / "design.csv")
     ranges = all_ranges(plant, tables)
     period = 1.0 / tables.get("playback_rate", tables["rate"])
@@ -60,6 +69,9 @@ def violations(plant: Plant, tables: dict[str, Any], folder: Path) -> list[str]:
     found = play(model, rows, ranges, period).sentences(ROUNDING)
     with_feedback = play(model, rows, ranges, period, feedback=True)
     found += [f"with gains: {text}" for text in with_feedback.sentences(ROUNDING_WITH_FEEDBACK)]
+
+    reference = read_reference(read_rows(folder / "reference.csv"), ranges)
+    found += [f"in reference.csv: {text}" for text in reference.sentences(ROUNDING)]
     return found
 
 

@@ -13,7 +13,7 @@ from tests.fuzz import bad_inputs, inputs
 from tests.fuzz.inputs import Ending
 from tests.fuzz.outcome import Case, KnownFailure, Outcome
 from tests.fuzz.plants import random_plant
-from tests.fuzz.player import ROUNDING, play
+from tests.fuzz.player import ROUNDING, model_with_force_sensors, play, read_reference
 from tests.fuzz.problems import random_tables
 from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
 from tests.fuzz.workers import run_cases
@@ -85,7 +85,7 @@ LARGEST = {
 @pytest.mark.parametrize("feedback", [False, True])
 def test_the_player_notices_every_kind_of_violation(limit: tuple[str, str], feedback: bool) -> None:
     """A limit just above the largest value holds; just below it is violated."""
-    model = mujoco.MjModel.from_xml_string(MASS)
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(MASS))
     state = {"qpos:slide": 0.0, "qvel:slide": 0.0}
     gains = {f"gain:motor:{name}": 0.0 for name in state}
     controls = (2.0, -2.0, np.nan)
@@ -97,9 +97,47 @@ def test_the_player_notices_every_kind_of_violation(limit: tuple[str, str], feed
         assert bool(found.sentences(ROUNDING)) is is_violated
 
 
+# A servo that starts 1 rad away from its control, with a spring. With RK4 the force of the last
+# stage is smaller than that at the beginning of the first step, 10 N m.
+SERVO = """<mujoco><option timestep="0.01" integrator="{integrator}"/><worldbody><body>
+<joint name="hinge"/><geom size="0.1" mass="1" pos="0 0 -0.2"/></body></worldbody>
+<actuator><position name="servo" joint="hinge" kp="10"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("kind", ["force", "joint_force"])
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+@pytest.mark.parametrize("away", [1.0, 0.0])
+def test_the_player_reads_the_force_at_both_ends_of_every_step(
+    kind: str, integrator: str, away: float
+) -> None:
+    """From rest the force is largest when the step begins. At 1 rad/s it is largest when the step
+    ends, about 0.1 N m after 0.01 s; the last stage of RK4 has 0.094 N m.
+    """
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(SERVO.format(integrator=integrator)))
+    first = {"t": 0.0, "ctrl:servo": 0.0, "qpos:hinge": away, "qvel:hinge": 0.0}
+    if away == 0.0:
+        first["qvel:hinge"] = 1.0
+    rows = [first, {**first, "t": 0.01}]
+    largest = 10.0 if away else 0.095
+
+    limit = {(kind, "servo" if kind == "force" else "hinge"): (-largest, largest)}
+    found = play(model, rows, limit, period=0.01).found
+    (excess,) = found.values()
+    assert abs(excess) < 1e-12 if away else 0.0 < excess < 0.1
+
+
+def test_a_value_of_reference_csv_beyond_a_limit_is_noticed() -> None:
+    row = {"t": 0.0, "qpos:a": 1.0, "qvel:a": 2.0, "qacc:a": 3.0, "force:a": 4.0}
+    kinds = ("position", "velocity", "acceleration", "joint_force")
+    for bound, kind in enumerate(kinds, start=1):
+        for factor, is_violated in ((1.001, False), (0.999, True)):
+            limit = {(kind, "a"): (-factor * bound, factor * bound)}
+            assert bool(read_reference([row], limit).sentences(ROUNDING)) is is_violated
+
+
 def test_feedback_is_played() -> None:
     """With a gain on the position, the control follows the deviation from the planned state."""
-    model = mujoco.MjModel.from_xml_string(MASS)
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(MASS))
     row = {"ctrl:motor": 0.0, "gain:motor:qpos:slide": 3.0, "gain:motor:qvel:slide": 0.0}
     rows = [
         {"t": 0.0, "qpos:slide": 0.0, "qvel:slide": 0.0, **row},
@@ -112,7 +150,7 @@ def test_feedback_is_played() -> None:
 
 
 def test_a_state_that_is_not_a_number_is_a_violation() -> None:
-    model = mujoco.MjModel.from_xml_string(MASS)
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(MASS))
     first = {"t": 0.0, "ctrl:motor": np.nan, "qpos:slide": 0.0, "qvel:slide": 0.0}
     limit = {("control", "motor"): (-1.0, 1.0)}
     assert play(model, [first, {**first, "t": 0.1}], limit, period=0.1).sentences(ROUNDING)

@@ -36,11 +36,30 @@ def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
     """(N, substeps, 9) values that SHOWN names at every engine step under ctrl: (N, nu), by a plain
     loop around mj_step.
     """
+    rows, _ = played_with_forces(model, state, ctrl, substeps)
+    return rows
+
+
+def played_with_forces(model: Any, state: Array, ctrl: Array, substeps: int) -> tuple[Array, Array]:
+    """Values that SHOWN names at every engine step, and the forces about these steps.
+
+    Returns:
+        (N, substeps, 9) values, and (N, substeps + 1, 4) forces by `mj_forward` at the beginning of
+        every engine step and at the end of the sample, all under the control of the sample.
+    """
+    forces, forward = np.empty((len(ctrl), substeps + 1, 4)), mujoco.MjData(model)
     data, rows = mujoco.MjData(model), np.empty((len(ctrl), substeps, len(SHOWN)))
     data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + model.nv])
     for k, held in enumerate(ctrl):
         data.ctrl[:] = held
-        for s in range(substeps):
+        for s in range(substeps + 1):
+            forward.qpos[:], forward.qvel[:], forward.act[:] = data.qpos, data.qvel, data.act
+            forward.ctrl[:] = held
+            mujoco.mj_forward(model, forward)
+            forces[k, s, :3] = [forward.actuator(n).force[0] for k, n in SHOWN if k == "force"]
+            forces[k, s, 3] = forward.joint("shoulder").qfrc_actuator[0]
+            if s == substeps:
+                break
             before = data.qvel.copy()
             mujoco.mj_step(model, data)
             change = (data.qvel - before) / model.opt.timestep
@@ -54,7 +73,7 @@ def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
                 }[kind](name)
                 for kind, name in SHOWN
             ]
-    return rows
+    return rows, forces
 
 
 def observations_of(task: DesignTask) -> SubstepObservations:
@@ -91,10 +110,16 @@ def test_observations_agree_with_plain_steps_at_every_engine_step(
     assert watched is not None
     trajectory, observed = watched
     np.testing.assert_array_equal(trajectory.state, plant.simulate(task.theta, task.control).state)
-    wanted = played(
+    wanted, forces = played_with_forces(
         model, task.plant.initial_state(task.theta), task.control, task.system.grid.substeps
     )
+    further, observed = observed[:, 5:], observed[:, :5]
     assert observed.shape == wanted.shape == (30, 5, len(SHOWN))
+    # with RK4 there are rows for the beginning of every step; the last row is the sample's end
+    for step, row in zip(range(6) if integrator == "RK4" else [5], range(6), strict=False):
+        np.testing.assert_allclose(further[:, row, 5:], forces[:, step], rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(further[:, row, :5], observed[:, min(step, 4), :5])
+    assert further.shape[1] == (6 if integrator == "RK4" else 1)
     for i, (kind, name) in enumerate(SHOWN):
         assert relative_error(observed[..., i], wanted[..., i]) < 1e-9, (kind, name)
     # the clamps act, where they are

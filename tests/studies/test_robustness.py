@@ -196,10 +196,24 @@ def test_gain_columns_name_the_components_on_which_they_act(tmp_path: Path) -> N
     assert header == ["t", *state, "ctrl:servo", *(f"gain:servo:{name}" for name in state)]
 
 
+def assert_last_acceleration(qacc: Array, played: Playback, data: Any) -> None:
+    """The last row has the acceleration of the last engine step, (nv,)."""
+    model = data.model
+    state = np.split(played.state[-2], [model.nq, model.nq + model.nv])
+    data.qpos[:], data.qvel[:], data.act[:] = state
+    data.ctrl[:] = played.ctrl[-1]
+    steps = round((played.t[-1] - played.t[-2]) / model.opt.timestep)
+    for _ in range(steps):
+        before = data.qvel.copy()
+        mujoco.mj_step(model, data)
+    wanted = (data.qvel - before) / model.opt.timestep
+    np.testing.assert_allclose(qacc, wanted, rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize("kind", BUILD)
 def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
-    """Accelerations and joint forces are those of mj_forward at each row, not differences; no field
-    is empty.
+    """Accelerations are changes of the velocity over the engine step of each row, joint forces
+    those of mj_forward; no field is empty.
     """
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
     played = simulate_playback(task.system, task.initial, gains(task))
@@ -215,8 +229,13 @@ def test_reference_agrees_with_mujoco(kind: str, tmp_path: Path) -> None:
         data.qpos[:], data.qvel[:], data.act[:] = task.space.split(played.state[k])
         data.ctrl[:] = played.ctrl[min(k, len(played.ctrl) - 1)]
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(qacc[k], data.qacc, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(force[k], data.qfrc_actuator, rtol=1e-9, atol=1e-12)
+        if k < len(played.ctrl):
+            mujoco.mj_step(model, data)
+            change = data.qvel - played.state[k, task.space.nq : task.space.nq + task.space.nv]
+            wanted = change / model.opt.timestep
+            np.testing.assert_allclose(qacc[k], wanted, rtol=1e-9, atol=1e-9)
+    assert_last_acceleration(qacc[-1], played, data)
     np.testing.assert_array_equal(starting(rows, "qpos:"), played.state[:, : task.space.nq])
 
 
