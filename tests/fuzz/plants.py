@@ -81,7 +81,7 @@ class Plant:
         opened = "\n".join(_body(joint, i, self.joints) for i, joint in enumerate(self.joints))
         closed = "</body>" * len(self.joints)
         drives = "\n".join(
-            f'    <{d.tag} name="{d.name}" joint="{d.joint.name}"{_words(d.attributes)}/>'
+            f'    <{d.tag} name="{d.name}" joint="{d.joint.name}"{words_of(d.attributes)}/>'
             for d in self.drives
         )
         return (
@@ -99,14 +99,14 @@ def _body(joint: Joint, i: int, joints: tuple[Joint, ...]) -> str:
     place = joints[i - 1].length if i else 0.0
     return (
         f'    <body name="link{i}" pos="{place:.17g} 0 0">\n'
-        f"      <inertial{_words(joint.inertial)}/>\n"
-        f'      <joint name="{joint.name}"{_words(joint.attributes)}/>\n'
+        f"      <inertial{words_of(joint.inertial)}/>\n"
+        f'      <joint name="{joint.name}"{words_of(joint.attributes)}/>\n'
         f'      <geom type="capsule" fromto="0 0 0 {joint.length:.17g} 0 0" '
         f'size="{0.1 * joint.length:.17g}"/>'
     )
 
 
-def _words(attributes: dict[str, str]) -> str:
+def words_of(attributes: dict[str, str]) -> str:
     """Attributes as text, with a space before each."""
     return "".join(f' {name}="{value}"' for name, value in attributes.items())
 

@@ -9,6 +9,7 @@ then, and what sensors read after `mj_forward` at the state after the step.
 
 from __future__ import annotations
 
+import copy
 import csv
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -25,8 +26,21 @@ ROUNDING = 1e-9
 ROUNDING_WITH_FEEDBACK = 1e-6
 
 
+# Name of the clearance, of which there is only one: its range is from it to twice of it.
+NEAREST = "nearest pair"
+
+# Parts of the position and of the velocity of a ball joint and of a free joint.
+TURN = (".rx", ".ry", ".rz")
+PLACE = (".x", ".y", ".z")
+QUATERNION = (".qw", ".qx", ".qy", ".qz")
+PARTS = {
+    int(mujoco.mjtJoint.mjJNT_BALL): (QUATERNION, TURN),
+    int(mujoco.mjtJoint.mjJNT_FREE): ((*PLACE, *QUATERNION), (*PLACE, *TURN)),
+}
+
+
 def model_with_force_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a model with a force sensor for each actuator and each joint; nothing else changes.
+    """Compile a model with a force sensor for each actuator, slide and hinge; nothing else changes.
 
     The sensors of the actuators come first, in the order of the actuators; then those of the
     joints.
@@ -35,7 +49,8 @@ def model_with_force_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
     for actuator in spec.actuators:
         sensor = spec.add_sensor(type=kinds.mjSENS_ACTUATORFRC, objtype=objects.mjOBJ_ACTUATOR)
         sensor.objname = actuator.name
-    for joint in spec.joints:
+    scalar = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+    for joint in (joint for joint in spec.joints if joint.type in scalar):
         sensor = spec.add_sensor(type=kinds.mjSENS_JOINTACTFRC, objtype=objects.mjOBJ_JOINT)
         sensor.objname = joint.name
     return spec.compile()
@@ -88,10 +103,11 @@ def play(
     """Play the rows from the state of the first one, and observe every engine step.
 
     Args:
-        model: The model of `model_with_force_sensors`; all joints are hinges or slides.
+        model: The model of `model_with_force_sensors`.
         rows: Rows of design.csv.
         ranges: Range by kind and name of every limit; the kinds "end_position" and "end_velocity"
-            are deviations of the final state from the initial one.
+            are deviations of the final state from the initial one, and "clearance" is the smallest
+            distance of two geoms.
         period: Time from row to row, over which the rate of a control is taken [s].
         feedback: True adds the gains times the deviation from the planned state.
 
@@ -100,24 +116,18 @@ def play(
     """
     excess = Excess(ranges=ranges)
     data, after = mujoco.MjData(model), mujoco.MjData(model)
-    joints = [model.joint(i).name for i in range(model.njnt)]
-    drives = [model.actuator(i).name for i in range(model.nu)]
-    filtered = [drives[i] for i in range(model.nu) if model.actuator(i).actadr[0] >= 0]
-    columns = [f"qpos:{j}" for j in joints] + [f"qvel:{j}" for j in joints]
-    columns += [f"act:{name}" for name in filtered]
-    controls = [f"ctrl:{name}" for name in drives]
-
-    first = np.array([rows[0][name] for name in columns])
-    data.qpos[:], data.qvel[:], data.act[:] = np.split(first, [model.nq, model.nq + model.nv])
+    layout = Layout.of(model)
+    least = ranges.get(("clearance", NEAREST))
+    proximity = None if least is None else Proximity(model, 2.0 * least[0])
+    start = layout.planned(rows[0])
+    data.qpos[:], data.qvel[:], data.act[:] = start
     before: np.ndarray | None = None
 
     for row, following in pairwise(rows):
-        ctrl = np.array([row[name] for name in controls])
+        ctrl = np.array([row[f"ctrl:{name}"] for name in layout.drives])
         if feedback:
-            ctrl += _feedback(
-                row, drives, columns, np.concatenate([data.qpos, data.qvel, data.act])
-            )
-        for i, name in enumerate(drives):
+            ctrl += layout.gain(row) @ layout.deviation(layout.planned(row), data)
+        for i, name in enumerate(layout.drives):
             excess.see("control", name, float(ctrl[i]))
             if before is not None:
                 excess.see("control_rate", name, float((ctrl[i] - before[i]) / period))
@@ -125,11 +135,14 @@ def play(
 
         data.ctrl[:] = ctrl
         for _ in range(round((following["t"] - row["t"]) / model.opt.timestep)):
-            _step((data, after), joints, drives, excess)
+            _step((data, after), layout, excess)
+            if proximity is not None:
+                excess.see("clearance", NEAREST, proximity(data.qpos))
 
-    for i, name in enumerate(joints):
-        excess.see("end_position", name, float(data.qpos[i] - first[i]))
-        excess.see("end_velocity", name, float(data.qvel[i] - first[model.nq + i]))
+    moved = -layout.deviation(start, data)
+    for i, name in enumerate(layout.freedoms):
+        excess.see("end_position", name, float(moved[i]))
+        excess.see("end_velocity", name, float(moved[model.nv + i]))
     return excess
 
 
@@ -157,10 +170,70 @@ def read_reference(rows: list[dict[str, float]], ranges: dict[tuple[str, str], R
     return excess
 
 
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Names of the columns of design.csv, and where MuJoCo keeps them.
+
+    Attributes:
+        model: The model.
+        drives: Names of the controls.
+        scalar: Names of the slides and hinges, with their numbers.
+        freedoms: Names of the degrees of freedom.
+        columns: Columns of qpos, of qvel and of act.
+    """
+
+    model: mujoco.MjModel
+    drives: list[str]
+    scalar: list[tuple[str, int]]
+    freedoms: list[str]
+    columns: tuple[list[str], list[str], list[str]]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel) -> Layout:
+        """The layout of a model."""
+        joints = [(model.joint(i).name, i) for i in range(model.njnt)]
+        drives = [model.actuator(i).name for i in range(model.nu)]
+        filtered = [name for name in drives if model.actuator(name).actadr[0] >= 0]
+        positions, freedoms = [], []
+        for name, i in joints:
+            position, velocity = PARTS.get(int(model.jnt_type[i]), (("",), ("",)))
+            positions += [f"qpos:{name}{part}" for part in position]
+            freedoms += [f"{name}{part}" for part in velocity]
+        return cls(
+            model=model,
+            drives=drives,
+            scalar=[(name, i) for name, i in joints if int(model.jnt_type[i]) not in PARTS],
+            freedoms=freedoms,
+            columns=(
+                positions,
+                [f"qvel:{name}" for name in freedoms],
+                [f"act:{name}" for name in filtered],
+            ),
+        )
+
+    def planned(self, row: dict[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Position, velocity and activation of a row."""
+        qpos, qvel, act = (np.array([row[name] for name in part]) for part in self.columns)
+        return qpos, qvel, act
+
+    def deviation(
+        self, planned: tuple[np.ndarray, np.ndarray, np.ndarray], data: mujoco.MjData
+    ) -> np.ndarray:
+        """(2 nv + na,) planned state minus the state of a simulation; rotations as vectors."""
+        qpos, qvel, act = planned
+        moved = np.zeros(self.model.nv)
+        mujoco.mj_differentiatePos(self.model, moved, 1.0, data.qpos, qpos)
+        return np.concatenate([moved, qvel - data.qvel, act - data.act])
+
+    def gain(self, row: dict[str, float]) -> np.ndarray:
+        """(nu, 2 nv + na) gains of a row."""
+        names = [f"qpos:{name}" for name in self.freedoms] + [*self.columns[1], *self.columns[2]]
+        return np.array([[row[f"gain:{drive}:{name}"] for name in names] for drive in self.drives])
+
+
 def _step(
     simulations: tuple[mujoco.MjData, mujoco.MjData],
-    joints: list[str],
-    drives: list[str],
+    layout: Layout,
     excess: Excess,
 ) -> None:
     """Do one engine step of the first simulation, and compare what it shows with the limits.
@@ -174,26 +247,43 @@ def _step(
     mujoco.mj_step(model, data)
     acceleration = (data.qvel - velocity) / model.opt.timestep
 
-    for i, name in enumerate(joints):
-        excess.see("position", name, float(data.qpos[i]))
-        excess.see("velocity", name, float(data.qvel[i]))
-        excess.see("acceleration", name, float(acceleration[i]))
+    for name, i in layout.scalar:
+        q, v = model.jnt_qposadr[i], model.jnt_dofadr[i]
+        excess.see("position", name, float(data.qpos[q]))
+        excess.see("velocity", name, float(data.qvel[v]))
+        excess.see("acceleration", name, float(acceleration[v]))
 
     after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
     after.ctrl[:] = data.ctrl
     mujoco.mj_forward(model, after)
 
-    fields = np.concatenate([data.actuator_force, data.qfrc_actuator])
-    limited = [("force", name) for name in drives] + [("joint_force", name) for name in joints]
+    dofs = [int(model.jnt_dofadr[i]) for _, i in layout.scalar]
+    fields = np.concatenate([data.actuator_force, data.qfrc_actuator[dofs]])
+    limited = [("force", name) for name in layout.drives]
+    limited += [("joint_force", name) for name, _ in layout.scalar]
     for shown in (fields, data.sensordata, after.sensordata):
         for (kind, name), value in zip(limited, shown.tolist(), strict=True):
             excess.see(kind, name, value)
 
 
-def _feedback(
-    row: dict[str, float], drives: list[str], columns: list[str], measured: np.ndarray
-) -> np.ndarray:
-    """(nu,) gains of a row times the deviation from its planned state."""
-    gain = np.array([[row[f"gain:{drive}:{name}"] for name in columns] for drive in drives])
-    planned = np.array([row[name] for name in columns])
-    return gain @ (planned - measured)
+class Proximity:
+    """Smallest distance between the geoms that MuJoCo lets collide.
+
+    Contacts are found by MuJoCo itself: in a copy of the model in which they begin at a larger
+    distance.
+    """
+
+    def __init__(self, model: mujoco.MjModel, reach: float) -> None:
+        """Prepare the copy. reach: distance below which geoms are seen [m]."""
+        self._model = copy.copy(model)
+        self._model.geom_margin[:] = reach
+        self._model.geom_gap[:] = 0.0
+        self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self._data = mujoco.MjData(self._model)
+        self._reach = reach
+
+    def __call__(self, qpos: np.ndarray) -> float:
+        """Smallest distance at a position [m], the reach where nothing is nearer."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(self._model, self._data)
+        return float(self._data.contact.dist.min(initial=self._reach))

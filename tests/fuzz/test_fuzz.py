@@ -13,7 +13,16 @@ from tests.fuzz import bad_inputs, inputs
 from tests.fuzz.inputs import Ending
 from tests.fuzz.outcome import Case, KnownFailure, Outcome
 from tests.fuzz.plants import random_plant
-from tests.fuzz.player import ROUNDING, model_with_force_sensors, play, read_reference
+from tests.fuzz.player import (
+    NEAREST,
+    PLACE,
+    QUATERNION,
+    ROUNDING,
+    TURN,
+    model_with_force_sensors,
+    play,
+    read_reference,
+)
 from tests.fuzz.problems import random_tables
 from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
 from tests.fuzz.workers import run_cases
@@ -147,6 +156,44 @@ def test_feedback_is_played() -> None:
     limit = {("control", "motor"): (-2.9, 2.9)}
     assert not play(model, rows, limit, period=0.1).sentences(ROUNDING)
     assert play(model, rows, limit, period=0.1, feedback=True).sentences(ROUNDING)
+
+
+# A ball of 1 kg on a free joint, with a thruster, above a floor.
+FLOATING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
+<geom type="plane" size="1 1 1"/><body pos="0 0 0.5"><freejoint name="free"/>
+<geom size="0.1" mass="1"/></body></worldbody>
+<actuator><motor name="push" joint="free" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
+
+
+def floating_rows(**last: float) -> list[dict[str, float]]:
+    """Rows of a ball that stays at a height of 0.5 m; `last` changes the planned last state."""
+    parts = (*PLACE, *TURN)
+    row = {f"qpos:free{part}": 0.0 for part in (*PLACE, *QUATERNION)}
+    row |= {f"qvel:free{part}": 0.0 for part in parts} | {"ctrl:push": 0.0}
+    row |= {f"gain:push:{field}:free{part}": 0.0 for field in ("qpos", "qvel") for part in parts}
+    row |= {"qpos:free.z": 0.5, "qpos:free.qw": 1.0, "gain:push:qpos:free.rx": 3.0}
+    return [{**row, "t": 0.0}, {**row, "t": 0.1, **last}, {**row, "t": 0.2}]
+
+
+def test_feedback_on_a_free_joint_takes_the_rotation_vector() -> None:
+    """Turned by 1 rad about x, the gain of 3 per rad asks for a control of 3."""
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(FLOATING))
+    turned = {"qpos:free.qw": float(np.cos(0.5)), "qpos:free.qx": float(np.sin(0.5))}
+    for bound, is_violated in ((3.001, False), (2.999, True)):
+        limit = {("control", "push"): (-bound, bound)}
+        found = play(model, floating_rows(**turned), limit, period=0.1, feedback=True)
+        assert bool(found.sentences(ROUNDING)) is is_violated
+
+
+def test_the_player_measures_distances() -> None:
+    """The ball is 0.4 m above the floor, also where contacts are disabled."""
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(FLOATING))
+    for flags in (0, int(mujoco.mjtDisableBit.mjDSBL_CONTACT)):
+        model.opt.disableflags = flags
+        for least, is_violated in ((0.399, False), (0.401, True)):
+            limit = {("clearance", NEAREST): (least, 2.0 * least)}
+            found = play(model, floating_rows(), limit, period=0.1)
+            assert bool(found.sentences(ROUNDING)) is is_violated
 
 
 def test_a_state_that_is_not_a_number_is_a_violation() -> None:
