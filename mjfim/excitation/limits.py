@@ -9,9 +9,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError, listed, unknown
 from mjfim.experiment.task_tables import Limits
-from mjfim.model.coordinates import ScalarJoint, actuator_names
+from mjfim.model.coordinates import ScalarJoint, actuator_names, joint_names
 
 Range = tuple[float, float]
 
@@ -67,12 +67,14 @@ class _KindOfLimit:
         stated: Numbers of the experiment file: one for all names, or a table by name.
         addresses: Address of each joint or actuator that can have such a limit, by name.
         model_ranges: Ranges of the MJCF, by name.
+        excluded: What the joints or actuators are that cannot have such a limit, by name.
     """
 
     kind: str
     stated: float | Mapping[str, float | Range]
     addresses: Mapping[str, int]
     model_ranges: Mapping[str, Range]
+    excluded: Mapping[str, str]
 
 
 def limits_of(
@@ -90,8 +92,8 @@ def limits_of(
         The limits; where MJCF and file both have a range, the intersection of the two.
 
     Raises:
-        ExperimentError: A name is unknown, a range is inverted, or a stated range excludes that of
-            the MJCF.
+        ExperimentError: A name is unknown, a range is inverted, a stated range excludes that of the
+            MJCF, or a stated limit applies to nothing.
     """
     joints = {c.name: c for c in coordinates}
     scalar_actuators = {
@@ -102,37 +104,56 @@ def limits_of(
     dofs = {name: c.v for name, c in joints.items()}
     inputs = {name: i for i, name in enumerate(controls)}
 
+    turning, several = _joints_without_limits(model), _actuators_without_limits(model)
     kinds = (
         _KindOfLimit(
             kind="position",
             stated=stated.position,
             addresses={name: c.q for name, c in joints.items()},
             model_ranges=_position_ranges(model, coordinates),
+            excluded=turning,
         ),
-        _KindOfLimit(kind="velocity", stated=stated.velocity, addresses=dofs, model_ranges={}),
         _KindOfLimit(
-            kind="acceleration", stated=stated.acceleration, addresses=dofs, model_ranges={}
+            kind="velocity",
+            stated=stated.velocity,
+            addresses=dofs,
+            model_ranges={},
+            excluded=turning,
+        ),
+        _KindOfLimit(
+            kind="acceleration",
+            stated=stated.acceleration,
+            addresses=dofs,
+            model_ranges={},
+            excluded=turning,
         ),
         _KindOfLimit(
             kind="control",
             stated=stated.control,
             addresses=inputs,
             model_ranges=_control_ranges(model, controls),
+            excluded={},
         ),
         _KindOfLimit(
-            kind="control_rate", stated=stated.control_rate, addresses=inputs, model_ranges={}
+            kind="control_rate",
+            stated=stated.control_rate,
+            addresses=inputs,
+            model_ranges={},
+            excluded={},
         ),
         _KindOfLimit(
             kind="force",
             stated=stated.force,
             addresses={n: int(model.actuator_outadr[i]) for n, i in scalar_actuators.items()},
             model_ranges=_force_ranges(model, scalar_actuators),
+            excluded=several,
         ),
         _KindOfLimit(
             kind="joint_force",
             stated={},
             addresses=dofs,
             model_ranges=_joint_force_ranges(model, joints),
+            excluded=turning,
         ),
     )
     return tuple(limit for kind in kinds for limit in _limits_of_kind(kind))
@@ -183,12 +204,23 @@ def _stated_ranges(kind: _KindOfLimit) -> dict[str, Range]:
     A single number r is the range [-r, r]; without a table it holds for all names.
 
     Raises:
-        ExperimentError: A name is unknown.
+        ExperimentError: A name is unknown or cannot have such a limit, or no name can have it.
     """
     names, stated = list(kind.addresses), kind.stated
+    if not names and not isinstance(stated, Mapping):
+        listing = "; ".join(f"{name!r} is {what}" for name, what in kind.excluded.items())
+        raise ExperimentError(
+            f"limits.{kind.kind} applies to nothing in this model: {listing}. It limits "
+            f"{_applies_to(kind.kind)} only; remove the key"
+        )
     table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
 
     for name in table:
+        if name in kind.excluded:
+            raise ExperimentError(
+                f"limits.{kind.kind}: {name!r} is {kind.excluded[name]}; this key limits "
+                f"{_applies_to(kind.kind)} only; valid: {listed(sorted(names))}"
+            )
         if name not in names:
             element = "joint" if kind.kind in JOINT_KINDS else "actuator"
             raise ExperimentError(f"limits.{kind.kind}: {unknown(element, name, names)}")
@@ -196,6 +228,52 @@ def _stated_ranges(kind: _KindOfLimit) -> dict[str, Range]:
         name: value if isinstance(value, tuple) else (-value, value)
         for name, value in table.items()
     }
+
+
+def _applies_to(kind: str) -> str:
+    """What a kind of limit applies to, in words."""
+    return "slides and hinges" if kind in JOINT_KINDS else "actuators with a single force"
+
+
+def _joints_without_limits(model: Any) -> dict[str, str]:
+    """What the ball and free joints are, by name."""
+    words = {
+        int(mujoco.mjtJoint.mjJNT_BALL): "a ball joint",
+        int(mujoco.mjtJoint.mjJNT_FREE): "a free joint",
+    }
+    kinds = zip(joint_names(model), model.jnt_type.tolist(), strict=True)
+    return {name: words[kind] for name, kind in kinds if kind in words}
+
+
+def _actuators_without_limits(model: Any) -> dict[str, str]:
+    """What the actuators with several forces are, by name."""
+    counts = zip(actuator_names(model), model.actuator_outnum.tolist(), strict=True)
+    return {name: f"an actuator with {count} forces" for name, count in counts if count != 1}
+
+
+def unlimited_elements(model: Any, stated: Limits) -> tuple[str, ...]:
+    """Find the limits that are stated for all names, but do not apply to some of them.
+
+    Args:
+        model: MjModel.
+        stated: The `[limits]` table of the experiment file.
+
+    Returns:
+        Sentences that name the key and what it does not limit.
+    """
+    joints, actuators = _joints_without_limits(model), _actuators_without_limits(model)
+    sentences = []
+    for kind, excluded in (
+        ("velocity", joints),
+        ("acceleration", joints),
+        ("force", actuators),
+    ):
+        if excluded and not isinstance(getattr(stated, kind), Mapping):
+            named = listed([f"{what[2:]} {name}" for name, what in excluded.items()])
+            sentences.append(
+                f"limits.{kind} does not apply to the {named}: it limits {_applies_to(kind)} only"
+            )
+    return tuple(sentences)
 
 
 def _position_ranges(model: Any, coordinates: tuple[ScalarJoint, ...]) -> dict[str, Range]:
@@ -263,17 +341,20 @@ def unsupported_ranges(model: Any) -> tuple[str, ...]:
         model: MjModel.
 
     Returns:
-        Descriptions of limited ball joints, tendons and activations, with their names.
+        Descriptions of limited ball joints, tendons, actuator forces on tendons and activations,
+        with their names.
     """
     kinds = mujoco.mjtObj
     is_ball = model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)
     balls = _names(model, kinds.mjOBJ_JOINT, is_ball & (model.jnt_limited != 0))
     tendons = _names(model, kinds.mjOBJ_TENDON, model.tendon_limited)
+    pulled = _names(model, kinds.mjOBJ_TENDON, model.tendon_actfrclimited)
     actuators = _names(model, kinds.mjOBJ_ACTUATOR, model.actuator_actlimited)
 
     return (
         *(f"ball joint {name}" for name in balls),
         *(f"tendon {name}" for name in tendons),
+        *(f"the actuator force on tendon {name}" for name in pulled),
         *(f"the activation of {name}" for name in actuators),
     )
 

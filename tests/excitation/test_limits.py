@@ -133,7 +133,7 @@ def test_every_range_of_the_model_is_a_limit() -> None:
     [
         (
             {"position": {"ball": (-1, 1)}},
-            r"limits\.position: unknown joint 'ball'.*; valid: lift, turn",
+            r"limits\.position: 'ball' is a ball joint.*; valid: lift, turn",
         ),
         (
             {"velocity": {"turm": 1.0}},
@@ -155,7 +155,7 @@ def test_every_range_of_the_model_is_a_limit() -> None:
         ),
         (
             {"acceleration": {"ball": 1.0}},
-            r"limits\.acceleration: unknown joint 'ball'; valid: lift, turn",
+            r"limits\.acceleration: 'ball' is a ball joint.*; valid: lift, turn",
         ),
         (
             {"control_rate": {"lift": 1.0}},

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import pytest
@@ -10,11 +12,15 @@ import pytest
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.limits import unsupported_ranges
+from mjfim.excitation.evaluation import open_boundary_warnings
+from mjfim.excitation.limits import limits_of, unsupported_ranges
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.task_tables import Limits
+from mjfim.model.coordinates import control_names, scalar_joints
 from mjfim.output import folders
 from tests.support.cli import loads, misused, names, run, write_experiment
+from tests.support.limits import floating_task
 from tests.support.numerics import CART_PENDULUM, make_task
 
 MOTOR = (
@@ -307,7 +313,9 @@ LOOSE = """
       </body>
     </body>
   </worldbody>
-  <tendon><fixed name="rope" range="-1 1"><joint joint="elbow" coef="1"/></fixed></tendon>
+  <tendon>
+    <fixed name="rope" range="-1 1" actuatorfrcrange="-2 2"><joint joint="elbow" coef="1"/></fixed>
+  </tendon>
   <actuator>
     <general name="muscle" joint="elbow" dyntype="filter" dynprm="0.1"
              actlimited="true" actrange="0 1"/>
@@ -321,8 +329,38 @@ def test_ranges_of_the_mjcf_that_are_no_limits_are_named() -> None:
     assert unsupported_ranges(model) == (
         "ball joint wrist",
         "tendon rope",
+        "the actuator force on tendon rope",
         "the activation of muscle",
     )
+
+
+def test_a_limit_of_all_joints_names_those_without_it(tmp_path: Path) -> None:
+    task = floating_task(tmp_path, limits={"velocity": 9.0, "force": 50.0})
+    told = [w for w in open_boundary_warnings(task) if "limits." in w]
+    assert told == [
+        "limits.velocity does not apply to the free joint float: it limits slides and hinges only"
+    ]
+    task = floating_task(tmp_path, limits={"velocity": {"elbow": 9.0}})
+    assert [w for w in open_boundary_warnings(task) if "limits.velocity" in w] == []
+
+
+# A ball on a free joint with a thruster.
+BALL = """<mujoco><worldbody><body><freejoint name="free"/><geom size="0.1"/></body></worldbody>
+<actuator><motor name="push" joint="free" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"velocity": 1.0}, "limits.velocity applies to nothing in this model: 'free' is a free"),
+        ({"velocity": {"free": 1.0}}, "limits.velocity: 'free' is a free joint; this key limits"),
+        ({"position": {"free": (-1.0, 1.0)}}, "limits.position: 'free' is a free joint"),
+    ],
+)
+def test_a_limit_that_applies_to_nothing_is_refused(limits: dict[str, Any], message: str) -> None:
+    model = mujoco.MjModel.from_xml_string(BALL)
+    with pytest.raises(ExperimentError, match=re.escape(message)):
+        limits_of(model, scalar_joints(model), control_names(model), Limits(**limits))
 
 
 def test_a_jump_at_rest_is_warned_about(tmp_path: Path) -> None:

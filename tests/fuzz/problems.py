@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import mjfim
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_design
+from mjfim.records.design import Design
 from tests.fuzz.outcome import Case, Outcome
 from tests.fuzz.plants import Plant, Range, Rng, about_zero, random_plant
 from tests.fuzz.player import (
@@ -28,63 +31,109 @@ from tests.fuzz.workers import announce
 SECONDS = 15.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """A design problem.
+
+    Attributes:
+        xml: The MJCF.
+        tables: Tables of the experiment file.
+        ranges: Range of every limit by kind and name.
+        description: What was random in it, in words.
+    """
+
+    xml: str
+    tables: dict[str, Any]
+    ranges: dict[tuple[str, str], Range]
+    description: str
+
+
 def run(case: Case, folder: Path) -> Outcome:
     """Design an experiment for a random problem, and judge what the design claims."""
     rng = case.rng
     plant = random_plant(rng)
     tables = random_tables(rng, plant)
-    description = describe(plant, tables)
-    announce(description)
+    problem = Problem(
+        xml=plant.xml,
+        tables=tables,
+        ranges=all_ranges(plant, tables),
+        description=describe(plant, tables),
+    )
+    return attempt(case, folder, problem)
 
-    (folder / "plant.xml").write_text(plant.xml, encoding="utf-8")
+
+def attempt(
+    case: Case,
+    folder: Path,
+    problem: Problem,
+    omissions: Callable[[Design], list[str]] = lambda design: [],
+) -> Outcome:
+    """Design an experiment for a problem, and judge what the design claims.
+
+    Args:
+        case: The case.
+        folder: Empty folder for its files.
+        problem: The problem.
+        omissions: Describes what a design does not say although it should.
+    """
+    announce(problem.description)
+    (folder / "plant.xml").write_text(problem.xml, encoding="utf-8")
+    source = str(folder / "fuzz.toml")
     try:
-        experiment = mjfim.Experiment(**tables, directory=folder, source=str(folder / "fuzz.toml"))
+        experiment = mjfim.Experiment(**problem.tables, directory=folder, source=source)
         design = mjfim.design(experiment, threads=1)
     except MjfimError as error:
         text = str(error)
         complaint = "" if text.strip() else "the message of the refusal is empty"
-        return Outcome(
-            case=case, group="refused", description=f"{description}; {text}", complaint=complaint
-        )
+        description = f"{problem.description}; {text}"
+        return Outcome(case=case, group="refused", description=description, complaint=complaint)
 
     # Without a design inside the limits nothing is claimed, but a limit has to be named.
     if not design.within_limits:
-        return Outcome(case=case, group="infeasible", description=description)
+        return Outcome(case=case, group="infeasible", description=problem.description)
 
     system = System.resolve(experiment, threads=1)
     write_design(folder, design, system)
-    complaint = "; ".join(violations(plant, tables, folder))
-    return Outcome(case=case, group="claimed", description=description, complaint=complaint)
+    found = [*violations(problem, folder), *omissions(design)]
+    return Outcome(
+        case=case, group="claimed", description=problem.description, complaint="; ".join(found)
+    )
 
 
-def violations(plant: Plant, tables: dict[str, Any], folder: Path) -> list[str]:
+def violations(problem: Problem, folder: Path) -> list[str]:
     """Describe what is violated where design.csv of a folder is played with and without feedback,
     and in the values of reference.csv.
     """
     model = model_with_force_sensors(mujoco.MjSpec.from_file(str(folder / "plant.xml")))
     rows = read_rows(folder / "design.csv")
-    ranges = all_ranges(plant, tables)
-    period = 1.0 / tables.get("playback_rate", tables["rate"])
+    period = 1.0 / problem.tables.get("playback_rate", problem.tables["rate"])
 
-    found = play(model, rows, ranges, period).sentences(ROUNDING)
-    with_feedback = play(model, rows, ranges, period, feedback=True)
+    found = play(model, rows, problem.ranges, period).sentences(ROUNDING)
+    with_feedback = play(model, rows, problem.ranges, period, feedback=True)
     found += [f"with gains: {text}" for text in with_feedback.sentences(ROUNDING_WITH_FEEDBACK)]
 
-    reference = read_reference(read_rows(folder / "reference.csv"), ranges)
+    reference = read_reference(read_rows(folder / "reference.csv"), problem.ranges)
     found += [f"in reference.csv: {text}" for text in reference.sentences(ROUNDING)]
+    return found
+
+
+def narrowed(
+    ranges: dict[tuple[str, str], Range], stated: dict[str, dict[str, Any]]
+) -> dict[tuple[str, str], Range]:
+    """Ranges of the MJCF, narrowed by those that the file states, by kind and name."""
+    found = dict(ranges)
+    for kind, table in stated.items():
+        for name, value in table.items():
+            low, high = value if isinstance(value, tuple) else (-value, value)
+            lower, upper = found.get((kind, name), (-np.inf, np.inf))
+            found[kind, name] = (max(low, lower), min(high, upper))
     return found
 
 
 def all_ranges(plant: Plant, tables: dict[str, Any]) -> dict[tuple[str, str], Range]:
     """Range of every limit by kind and name: where MJCF and file state one, both hold."""
-    ranges = dict(plant.ranges)
-    for kind, stated in tables["limits"].items():
-        if kind == "bandwidth":
-            continue
-        for name, value in stated.items():
-            low, high = value if isinstance(value, tuple) else (-value, value)
-            lower, upper = ranges.get((kind, name), (-np.inf, np.inf))
-            ranges[kind, name] = (max(low, lower), min(high, upper))
+    stated = {kind: table for kind, table in tables["limits"].items() if kind != "bandwidth"}
+    ranges = narrowed(plant.ranges, stated)
 
     boundary = tables["boundary"]
     if boundary.get("end", "free") != "free":
@@ -143,7 +192,7 @@ def _limits(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
             "velocity": speed,
             "acceleration": speed / horizon * rng.uniform(3.0, 30.0),
         }
-        _state_some(rng, limits, joint.name, wanted, (0.5, 0.4, 0.3))
+        state_some(rng, limits, joint.name, wanted, (0.5, 0.4, 0.3))
 
     for drive in plant.drives:
         effort = drive.joint.effort / abs(float(drive.attributes["gear"]))
@@ -152,14 +201,14 @@ def _limits(rng: Rng, plant: Plant, horizon: float) -> dict[str, Any]:
             "control_rate": drive.control / horizon * rng.uniform(2.0, 40.0),
             "force": about_zero(rng, effort),
         }
-        _state_some(rng, limits, drive.name, wanted, (0.4, 0.3, 0.3))
+        state_some(rng, limits, drive.name, wanted, (0.4, 0.3, 0.3))
 
     if rng.random() < 0.15:
         limits["bandwidth"] = float(rng.uniform(2.0, 6.0)) / horizon
     return limits
 
 
-def _state_some(
+def state_some(
     rng: Rng,
     limits: dict[str, Any],
     name: str,

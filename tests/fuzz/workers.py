@@ -35,12 +35,17 @@ def run_case(case: Case, folder: Path) -> Outcome:
         case: The case.
         folder: Empty folder for its files.
     """
-    from tests.fuzz import inputs, kills, problems
+    from tests.fuzz import inputs, kills, mechanism_problems, problems
 
     begin = time.monotonic()
-    run = {"problem": problems.run, "input": inputs.run, "kill": kills.run}[case.kind]
+    runs = {
+        "problem": problems.run,
+        "input": inputs.run,
+        "kill": kills.run,
+        "mechanism": mechanism_problems.run,
+    }
     try:
-        outcome = run(case, folder)
+        outcome = runs[case.kind](case, folder)
     except Exception:
         lines = traceback.format_exc().strip().splitlines()
         outcome = Outcome(
