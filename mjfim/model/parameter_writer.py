@@ -31,13 +31,24 @@ if TYPE_CHECKING:
 MOMENT_ROUNDING = 1e-6
 
 
+class Workspace:
+    """Memory in which MuJoCo computes derived constants of a model.
+
+    Attributes:
+        data: MjData of the models that are written; None until it is needed.
+    """
+
+    def __init__(self) -> None:
+        self.data: Any = None
+
+
 class ParameterWriter:
     """Writes values theta: (p,) of a set of parameters into models."""
 
-    def __init__(self, parameters: ParameterSet) -> None:
-        """Prepare the writer for a set of parameters."""
+    def __init__(self, parameters: ParameterSet, workspace: Workspace) -> None:
+        """Prepare the writer for a set of parameters and the memory in which it works."""
         self._parameters = parameters
-        self._scratch: Any = None
+        self._workspace = workspace
 
     def model(self, base: PlantModel | Any, theta: Array) -> Any:
         """A private copy of the base model with theta written into it.
@@ -87,10 +98,10 @@ class ParameterWriter:
             else:
                 self._write_orientation(model, kind, row, values)
 
-        if self._scratch is None:
-            self._scratch = mujoco.MjData(model)
+        if self._workspace.data is None:
+            self._workspace.data = mujoco.MjData(model)
         with silence_mujoco_log():
-            mujoco.mj_setConst(model, self._scratch)
+            mujoco.mj_setConst(model, self._workspace.data)
 
         if mocap is not None:
             mocap.put(model, mocap.start)

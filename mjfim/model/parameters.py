@@ -13,7 +13,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
-from mjfim.model.parameter_writer import ParameterWriter
+from mjfim.model.parameter_writer import ParameterWriter, Workspace
 from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath
 from mjfim.model.targets import (
     InertiaField,
@@ -155,10 +155,19 @@ class ParameterSet:
     def __len__(self) -> int:
         return len(self.parameters)
 
-    @cached_property
+    @property
     def writer(self) -> ParameterWriter:
-        """Writes values of the parameters into models."""
-        return ParameterWriter(self)
+        """Writes values of the parameters into models.
+
+        It refers to these parameters and is not kept, because the two would refer to each other,
+        and the memory of both would wait for Python's garbage collector.
+        """
+        return ParameterWriter(self, self._workspace)
+
+    @cached_property
+    def _workspace(self) -> Workspace:
+        """Memory in which the writer works."""
+        return Workspace()
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -33,7 +33,6 @@ class Plant:
         parameters: The p parameters theta.
         outputs: Output map h without bias and delay.
         simulator: Steps the model copies.
-        derivatives: Derivatives of F and h, by differences of MuJoCo steps.
         space: Layout of the state and of its tangent space.
         nominal_initial_state: (ns,) initial state where no parameter moves it.
         initial_state_derivative: (nx, p) derivative of the initial state by theta [x-unit /
@@ -79,11 +78,21 @@ class Plant:
         self.bias_derivative = parameters.bias_derivative(len(outputs))
         self.nu = int(source.model.nu)
         self.dt = substeps * float(source.model.opt.timestep)
-        self.derivatives = Derivatives(self)
 
+        self._step_factors: Array | None = None
         self._smooth = smooth
         self._cached_models: dict[bytes, Any] = {}
         self._reusable_models: list[Any] = []
+
+    @property
+    def derivatives(self) -> Derivatives:
+        """Derivatives of F and h, by differences of MuJoCo steps.
+
+        They refer to this plant and are not kept, because the two would refer to each other: the
+        memory of a plant that nothing uses any more is then free at once, without a search of
+        Python's garbage collector.
+        """
+        return Derivatives(self, self._step_factors)
 
     @property
     def smooth(self) -> Plant:
@@ -119,7 +128,7 @@ class Plant:
             return self
 
         other = copy.copy(self)
-        other.derivatives = Derivatives(other, factors)
+        other._step_factors = factors
         return other
 
     def with_initial_state(self, state: Array) -> Plant:
@@ -130,8 +139,6 @@ class Plant:
         """
         other = copy.copy(self)
         other.nominal_initial_state = np.array(state, dtype=np.float64)
-        other.derivatives = copy.copy(self.derivatives)
-        other.derivatives.plant = other
         return other
 
     def initial_state(self, theta: Array) -> Array:

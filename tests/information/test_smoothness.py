@@ -12,6 +12,7 @@ import pytest
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.information.smoothness import DISAGREEMENT_TOLERANCE, disagreement, roughness
+from mjfim.plant.rollout_derivatives import RolloutDerivatives
 from mjfim.records.check import Roughness
 from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
 
@@ -221,12 +222,14 @@ def test_a_model_that_diverges_under_the_longer_step_is_infinitely_rough(
     tmp_path, monkeypatch
 ) -> None:
     task = slider(tmp_path, 'frictionloss="1.5"')
-    whole = task.plant.derivatives.sensitivity
+    whole = RolloutDerivatives.sensitivity
 
-    def sensitivity(theta: Array, curve: object, step: object = None) -> object:
-        return whole(theta, curve) if step is None else None
+    def sensitivity(
+        derivatives: RolloutDerivatives, theta: Array, curve: object, step: object = None
+    ) -> object:
+        return whole(derivatives, theta, curve) if step is None else None
 
-    monkeypatch.setattr(task.plant.derivatives, "sensitivity", sensitivity)
+    monkeypatch.setattr(RolloutDerivatives, "sensitivity", sensitivity)
     found = along(task)
     assert found.error == np.inf
     assert found.parameter == "mass, drag"

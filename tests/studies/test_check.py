@@ -17,6 +17,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.residuals import FitProblem
 from mjfim.information.fisher import FisherInformation
+from mjfim.plant.rollout_derivatives import RolloutDerivatives
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import as_json
 from mjfim.studies.check import check, check_recordings, check_task
@@ -176,13 +177,13 @@ def test_dry_friction_is_flagged_with_its_sample_and_cause(tmp_path) -> None:
 
 def test_a_wrong_sensitivity_is_caught_by_the_recursion(tmp_path, monkeypatch) -> None:
     task = cart_task(tmp_path)
-    right = task.plant.derivatives.sensitivity
+    right = RolloutDerivatives.sensitivity
 
     def wrong(*arguments, **options):
         found = right(*arguments, **options)
         return replace(found, psi=found.psi * 1.01)
 
-    monkeypatch.setattr(task.plant.derivatives, "sensitivity", wrong)
+    monkeypatch.setattr(RolloutDerivatives, "sensitivity", wrong)
     tested = check_task(task).self_test
     assert tested.recursion == pytest.approx(0.01, rel=0.05)
     assert not tested.passed
