@@ -1,23 +1,36 @@
-"""Kills at a random time: no corrupt file at a final name, no process that outlives its parent."""
+"""Kills at a random time.
+
+No file at a final name is corrupt, no process outlives its parent, and the same call again gives
+what an undisturbed call gives.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
-import shutil
 import signal
 import subprocess
-import tempfile
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from tests.fuzz.kill_calls import (
+    CALLS,
+    LONGEST_CALL,
+    OUTPUT,
+    START_OF_PYTHON,
+    Call,
+    Reference,
+    environment,
+    prepare,
+    reference,
+    results_of,
+)
 from tests.fuzz.outcome import Case, Outcome
 from tests.fuzz.result_files import faults_of, is_temporary
 from tests.fuzz.workers import announce
-from tests.support.cli import PROCESS, write_experiment
-from tests.support.cli import run as run_here
-from tests.support.paths import ROOT
 
 # Time after which no process of a killed call may be alive [s].
 ORPHAN_TIME = 5.0
@@ -26,85 +39,200 @@ ORPHAN_TIME = 5.0
 # pictures on a busy machine.
 END_TIME = 30.0
 
-# Time in which Python starts, before the first line of the package can handle a signal [s].
-START_OF_PYTHON = 1.0
+# Time within which a call has to end after the second signal [s]: 5 s, and the rest for a busy
+# machine.
+SECOND_END_TIME = 10.0
 
-# Longest time before the kill [s], about the time that each call takes or longer.
-LONGEST = {"design": 15.0, "design in a pool": 20.0, "identify": 8.0, "montecarlo": 14.0}
+# Longest time between two signals [s].
+LONGEST_GAP = 5.0
 
-# Words of the calls. The designs would never end by themselves.
-CALLS = {
-    "design": ("design", "long.toml", "-o", "out"),
-    "design in a pool": ("design", "limited.toml", "-o", "out"),
-    "identify": ("identify", "study.toml", "run.csv", "-o", "out"),
-    "montecarlo": ("montecarlo", "study.toml", "design.npz", "-o", "out", "--trials", "800"),
-}
+# Time of the kill, at most, relative to the time that the undisturbed call takes.
+LATEST = 1.05
 
-SIGNALS = ("SIGKILL", "SIGINT", "SIGTERM")
+# Signals to the call, one after the other; WORKER is SIGKILL to one of its worker processes.
+WORKER = "worker"
+KILLS = (
+    ("SIGKILL",),
+    ("SIGKILL",),
+    ("SIGINT",),
+    ("SIGINT",),
+    ("SIGTERM",),
+    ("SIGINT", "SIGINT"),
+    ("SIGINT", "SIGTERM"),
+    ("SIGTERM", "SIGINT"),
+    ("SIGINT", "SIGKILL"),
+    (WORKER,),
+    (WORKER,),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kill:
+    """What is random in a case.
+
+    Attributes:
+        name: Name of the call.
+        signals: Names of the signals.
+        share: Time of the first signal, relative to the time of the undisturbed call.
+        gap: Time between two signals [s].
+    """
+
+    name: str
+    signals: tuple[str, ...]
+    share: float
+    gap: float
+
+    @classmethod
+    def of(cls, case: Case) -> Kill:
+        """The kill of a case."""
+        rng = case.rng
+        signals = KILLS[rng.integers(len(KILLS))]
+        names = [name for name, call in CALLS.items() if call.has_workers or signals != (WORKER,)]
+        return cls(
+            name=names[rng.integers(len(names))],
+            signals=signals,
+            share=LATEST * float(rng.random()),
+            gap=LONGEST_GAP * float(rng.random()),
+        )
+
+    def __str__(self) -> str:
+        later = f" and {self.signals[1]} {self.gap:.2f} s later" if len(self.signals) > 1 else ""
+        return f"{self.name}, {self.signals[0]} after {100 * self.share:.0f} %{later}"
+
+    @property
+    def group(self) -> str:
+        """Name of the kind of kill for the counts."""
+        return "+".join(self.signals)
 
 
 def run(case: Case, folder: Path) -> Outcome:
-    """Start a call, kill it after a random time, and look at what is left."""
-    rng = case.rng
-    name = str(rng.choice(list(CALLS)))
-    kill = str(rng.choice(SIGNALS))
-    seconds = LONGEST[name] * float(rng.random())
-    description = f"{name}, {kill} after {seconds:.2f} s"
-    announce(description)
+    """Start a call, kill it after a random time, look at what is left, and repeat the call."""
+    kill = Kill.of(case)
+    announce(str(kill))
     if os.name != "posix":
-        return Outcome(case=case, group="skipped", description=f"{description}: not on this system")
+        return Outcome(case=case, group="skipped", description=f"{kill}: not on this system")
 
-    for file in valid_study().iterdir():
-        shutil.copy(file, folder)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with (folder / "stderr").open("wb") as errors:
-        # A new session makes the children recognisable: they stay in its process group.
-        process = subprocess.Popen(
-            [*PROCESS, *CALLS[name]],
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=errors,
-            env=environment,
-            start_new_session=True,
-        )
-    try:
+    call, undisturbed = CALLS[kill.name], reference(kill.name)
+    prepare(folder)
+    seconds = kill.share * undisturbed.seconds
+    with _started(call, folder) as process:
         is_killed = _send(process, kill, seconds)
         complaints = [*_ending(process, kill, seconds), *_orphans(process.pid)]
-    finally:
-        _end(process)
 
-    text = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
-    if "Traceback" in text and seconds >= START_OF_PYTHON:
-        complaints.append("Traceback: " + "\n".join(text.splitlines()[-4:]))
-    complaints += _files(folder / "out", kill)
+    told = _told(folder)
+    starts = _start(call, undisturbed)
+    if "Traceback" in told and seconds >= starts:
+        complaints.append("Traceback: " + "\n".join(told.splitlines()[-4:]))
+    complaints += _files(folder / OUTPUT, has_ended_itself="SIGKILL" not in kill.signals)
+    if kill.signals == (WORKER,):
+        complaints += _differences(folder, undisturbed)
+    complaints += [f"again: {fault}" for fault in _again(call, folder, undisturbed)]
     return Outcome(
         case=case,
-        group=kill if is_killed else "ended before",
-        description=description,
+        group=kill.group if is_killed else "ended before",
+        description=f"{kill} = {seconds:.2f} s",
         complaint="; ".join(complaints),
     )
 
 
-def _send(process: subprocess.Popen[bytes], kill: str, seconds: float) -> bool:
-    """Send a signal to a process after some seconds; False if it has ended before."""
+@contextlib.contextmanager
+def _started(call: Call, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a call in a session of its own; end everything that it has started at the end.
+
+    In a new session, the children are recognised by their process group.
+    """
+    with (folder / "stderr").open("wb") as errors:
+        process = subprocess.Popen(
+            call.command(),
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            env=environment(),
+            start_new_session=True,
+        )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def _told(folder: Path) -> str:
+    """What a call wrote on stderr."""
+    return (folder / "stderr").read_text(encoding="utf-8", errors="replace")
+
+
+def _start(call: Call, undisturbed: Reference) -> float:
+    """Time in which a call cannot handle a signal yet [s].
+
+    A script begins with the imports of all that it needs.
+    """
+    return 0.8 * undisturbed.seconds if call.script else START_OF_PYTHON
+
+
+def _send(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> bool:
+    """Send all signals; False if the process has ended before the first one."""
+    if not _runs_on(process, seconds):
+        return False
+    if kill.signals == (WORKER,):
+        return _kill_worker(process)
+
+    process.send_signal(signal.Signals[kill.signals[0]])
+    for name in kill.signals[1:]:
+        if _runs_on(process, kill.gap):
+            process.send_signal(signal.Signals[name])
+    return True
+
+
+def _runs_on(process: subprocess.Popen[bytes], seconds: float) -> bool:
+    """Wait, and return whether a process is still running after some seconds."""
     try:
         process.wait(seconds)
     except subprocess.TimeoutExpired:
-        process.send_signal(signal.Signals[kill])
         return True
     return False
 
 
-def _ending(process: subprocess.Popen[bytes], kill: str, seconds: float) -> list[str]:
-    """Describe what is wrong with the end of a process that got a signal after some seconds."""
+def _kill_worker(process: subprocess.Popen[bytes]) -> bool:
+    """Kill the first worker of a process that there is; False if the process ends before."""
+    while process.poll() is None:
+        rows = _table("pid=,ppid=,stat=,args=")
+        own = [row for row in rows if row[1] == str(process.pid) and not row[2].startswith("Z")]
+        workers = [int(row[0]) for row in own if "spawn_main" in row[3]]
+        if workers:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(workers[-1], signal.SIGKILL)
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def _table(columns: str) -> list[list[str]]:
+    """Columns of all processes; the last column may hold blanks."""
+    listing = subprocess.run(
+        ["ps", "-A", "-ww", "-o", columns], capture_output=True, text=True, check=True
+    ).stdout
+    count = columns.count("=")
+    rows = [line.split(None, count - 1) for line in listing.splitlines()]
+    return [row for row in rows if len(row) == count]
+
+
+def _ending(process: subprocess.Popen[bytes], kill: Kill, seconds: float) -> list[str]:
+    """Describe what is wrong with the end of a process that got signals after some seconds."""
+    limit = END_TIME if len(kill.signals) == 1 else SECOND_END_TIME
+    limit = LONGEST_CALL if kill.signals == (WORKER,) else limit
     try:
-        code = process.wait(END_TIME)
+        code = process.wait(limit)
     except subprocess.TimeoutExpired:
-        return [f"no end {END_TIME:g} s after {kill}"]
-    is_fatal = kill == "SIGKILL" or seconds < START_OF_PYTHON
-    allowed = (0, 1, -signal.Signals[kill]) if is_fatal else (0, 1)
-    return [] if code in allowed else [f"exit code {code} after {kill}"]
+        return [f"no end {limit:g} s after {kill.signals[-1]}"]
+
+    # Python itself cannot handle a signal while it starts.
+    is_fatal = seconds < _start(CALLS[kill.name], reference(kill.name))
+    fatal = [name for name in kill.signals if name == "SIGKILL" or (is_fatal and name != WORKER)]
+    allowed = (0, 1, *(-signal.Signals[name] for name in fatal))
+    return [] if code in allowed else [f"exit code {code} after {kill.group}"]
 
 
 def _orphans(group: int) -> list[str]:
@@ -119,21 +247,11 @@ def _orphans(group: int) -> list[str]:
 
 def _alive(group: int) -> list[str]:
     """The commands of the processes of a group; ended ones that nobody has waited for count not."""
-    listing = subprocess.run(
-        ["ps", "-A", "-o", "pgid=,stat=,args="], capture_output=True, text=True, check=True
-    ).stdout
-    rows = [line.split(None, 2) for line in listing.splitlines()]
+    rows = _table("pgid=,stat=,args=")
     return [row[-1][:100] for row in rows if row[0] == str(group) and not row[1].startswith("Z")]
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End everything that a call has started."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-
-
-def _files(folder: Path, kill: str) -> list[str]:
+def _files(folder: Path, *, has_ended_itself: bool) -> list[str]:
     """Describe the files that are not whole, and temporary files that should have been removed."""
     found: list[str] = []
     for path in sorted(folder.rglob("*")):
@@ -142,29 +260,47 @@ def _files(folder: Path, kill: str) -> list[str]:
         # Only SIGKILL leaves no time to remove a temporary file.
         if not is_temporary(path):
             found += faults_of(path)
-        elif kill != "SIGKILL":
+        elif has_ended_itself:
             found.append(f"{path.name} is a temporary file that stayed")
     return found
 
 
-@functools.cache
-def valid_study() -> Path:
-    """Folder with a study, its design and its recording, and with studies that run for long."""
-    folder = Path(tempfile.mkdtemp(dir=Path.cwd()))
-    long = write_experiment(folder, tolerance="1e-12", max_iterations="200\nstarts = 10000")
-    text = long.read_text(encoding="utf-8")
-    long.rename(folder / "long.toml")
+def _again(call: Call, folder: Path, undisturbed: Reference) -> list[str]:
+    """Repeat a call, and describe in what it differs from one that nobody disturbed."""
+    try:
+        done = subprocess.run(
+            call.command(again=True),
+            cwd=folder,
+            env=environment(),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_CALL,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return [f"no end after {LONGEST_CALL:g} s"]
 
-    # Only the initial controls of a design under hard limits run in worker processes.
-    limits = "\n[limits]\nposition = { slide = [-1.0, 1.0] }\ncontrol = { force = [-5.0, 5.0] }\n"
-    (folder / "limited.toml").write_text(text + limits, encoding="utf-8")
+    if done.returncode != undisturbed.code:
+        code, wanted = done.returncode, undisturbed.code
+        return [f"exit code {code} instead of {wanted}: {done.stderr[-600:]}"]
+    return [*_files(folder / OUTPUT, has_ended_itself=True), *_differences(folder, undisturbed)]
 
-    study = write_experiment(folder)
-    made = run_here("design", study, "-o", folder / "made", "--threads", 1)
-    npz = folder / "made" / "design.npz"
-    simulated = run_here("simulate", study, npz, "-o", folder / "run.csv")
-    if made.exit_code not in (0, 1) or simulated.exit_code:
-        raise RuntimeError(f"the valid study fails: {made.stderr} {simulated.stderr}")
-    shutil.move(npz, folder / "design.npz")
-    shutil.rmtree(folder / "made")
-    return folder
+
+def _differences(folder: Path, undisturbed: Reference) -> list[str]:
+    """Describe the results that differ from those of an undisturbed call."""
+    found, wanted = results_of(folder), undisturbed.files
+    faults = [f"{name} is missing" for name in wanted if name not in found]
+    faults += [f"{name} is left over" for name in found if name not in wanted]
+    both = [name for name in wanted if name in found]
+    return faults + [
+        _difference(name, wanted[name], found[name]) for name in both if found[name] != wanted[name]
+    ]
+
+
+def _difference(name: str, wanted: Any, found: Any) -> str:
+    """Describe in what a file differs, shortly."""
+    if isinstance(wanted, list) and isinstance(found, list) and name.endswith(".json"):
+        keys = [one[0] for one, two in zip(wanted, found, strict=False) if one != two]
+        return f"{name} differs in {', '.join(map(str, keys[:5]))}"
+    return f"{name} differs"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -20,36 +18,10 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.output.archive import write_design
 from mjfim.records.events import Event
+from tests.support.contents import contents
 from tests.support.limits import ARM, cart_inside, floating_task
 from tests.support.numerics import filtered_task, make_task
 from tests.support.paths import ROOT
-
-
-def without_times(value: Any) -> Any:
-    """JSON values without the measured times, in the order of the file."""
-    if isinstance(value, dict):
-        return [(key, without_times(entry)) for key, entry in value.items() if key != "seconds"]
-    if isinstance(value, list):
-        return [without_times(entry) for entry in value]
-    return value
-
-
-def contents(folder: Path) -> dict[str, Any]:
-    """Every file of a folder: its bytes, or its arrays and JSON values without measured times."""
-    found: dict[str, Any] = {}
-
-    for file in sorted(folder.iterdir()):
-        if file.suffix == ".json":
-            found[file.name] = without_times(json.loads(file.read_text(encoding="utf-8")))
-        elif file.suffix == ".npz":
-            with np.load(file) as arrays:
-                rest = {key: arrays[key].tobytes() for key in arrays if key != "record"}
-                record = without_times(json.loads(str(arrays["record"])))
-            found[file.name] = (rest, record)
-        else:
-            found[file.name] = file.read_bytes()
-
-    return found
 
 
 def study(
