@@ -1,19 +1,30 @@
-"""Pool of worker processes that can be asked to stop and to return their best result so far."""
+"""Pool of worker processes that can be asked to stop and to return their best result so far.
+
+A task that cannot end in time offers its best result so far, see `offer_result`. A worker process
+that is killed from outside loses nothing but time: its tasks are done again in the parent process.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import itertools
 import multiprocessing
 import os
+import pickle
+import shutil
 import signal
+import tempfile
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager, suppress
 from multiprocessing import connection
-from multiprocessing.synchronize import Event
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 from threadpoolctl import threadpool_limits
 
@@ -22,6 +33,7 @@ from mjfim.errors import ExperimentError
 from mjfim.interruption import SIGNALS, hurried
 
 T = TypeVar("T")
+Order = TypeVar("Order")
 
 # Time for which the parent process waits for running tasks after a request to stop [s]. The tasks
 # check the request after each iterate. A second Ctrl-C ends the waiting.
@@ -32,6 +44,12 @@ TERMINATION_SECONDS = 2.0 * GRACE
 
 # Period at which the parent process checks its stop token while it waits for a task [s].
 POLL_INTERVAL = 0.2
+
+# What the user reads after a worker process was killed.
+LOST_SENTENCE = (
+    "a worker process was ended from outside (killed, perhaps because the memory was full); its "
+    "work was done again without worker processes"
+)
 
 # Largest number of threads that can be asked for; more would only use memory.
 MAX_THREADS = 1024
@@ -86,34 +104,75 @@ class Pool(ProcessPoolExecutor):
 
     Attributes:
         is_abandoned: True if tasks are not waited for when the pool is shut down.
+        has_lost_worker: True after a worker process was ended from outside, which ends the others,
+            too.
     """
 
     def __init__(self, count: int | None = None) -> None:
         context = multiprocessing.get_context("spawn")
-        with _safe_path():
-            self._stop = context.Event()
         processes = min(count or cores(), cores())
+
+        # The request to stop has no lock: a process that is killed while it holds a lock would
+        # block all others.
+        self._stop = context.RawValue(ctypes.c_bool, False)
+
+        # Tasks that cannot end in time write their results so far into this folder, which exists
+        # after a request to stop only.
+        self._exchange = Path(tempfile.gettempdir()) / f"mjfim-{uuid.uuid4().hex}"
+        self._next_number = itertools.count()
+        self._numbers: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
 
         # The workers end when nobody holds the writing end of this pipe any more.
         lifeline, self._hold = context.Pipe(duplex=False)
         self.is_abandoned = False
-        super().__init__(processes, context, _initialize_worker, (self._stop, lifeline))
+        self.has_lost_worker = False
+        arguments = (self._stop, lifeline, self._exchange)
+        with _safe_path():
+            super().__init__(processes, context, _initialize_worker, arguments)
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Submit a task; the arguments are those of `concurrent.futures.Executor.submit`.
 
         A process that is started for the task ignores Ctrl-C from the beginning.
         """
+        number = next(self._next_number)
         with _interrupts_blocked(), _safe_path():
-            return super().submit(fn, *args, **kwargs)
+            future = super().submit(_run_task, number, fn, *args, **kwargs)
+        self._numbers[future] = number
+        return future
 
     def stop(self) -> None:
         """Ask all running and later tasks to return their best result so far."""
-        self._stop.set()
+        # Nobody else may write what is read here.
+        with suppress(OSError):
+            self._exchange.mkdir(mode=0o700, exist_ok=True)
+        self._stop.value = True
 
     def resume(self) -> None:
         """Withdraw the request to stop. No task may be running."""
-        self._stop.clear()
+        self._stop.value = False
+        shutil.rmtree(self._exchange, ignore_errors=True)
+
+    def offered(self, future: Future[T]) -> list[T]:
+        """Read what a running task has offered as its best result so far after `stop`.
+
+        Args:
+            future: The task.
+
+        Returns:
+            The result; empty where the task has none yet.
+        """
+        try:
+            content = (self._exchange / f"{self._numbers[future]}.pickle").read_bytes()
+        except (OSError, KeyError):
+            return []
+        return [pickle.loads(content)]
+
+    def give_up(self) -> None:
+        """End the workers after one of them was ended from outside."""
+        self.has_lost_worker = True
+        self.is_abandoned = True
+        self._hold.close()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers; the arguments are those of `concurrent.futures.Executor.shutdown`.
@@ -123,11 +182,17 @@ class Pool(ProcessPoolExecutor):
         if self.is_abandoned:
             self._hold.close()
         super().shutdown(wait, cancel_futures=cancel_futures)
+        shutil.rmtree(self._exchange, ignore_errors=True)
 
 
 # Stop token of the pool to which this process belongs. In a worker process, `_initialize_worker`
 # replaces it.
 _pool_token = StopToken()
+
+# Number of the task that this worker process runs, None between tasks and in other processes; and
+# the last offer of a result, with the number of its task.
+_task: int | None = None
+_offer: tuple[int, object] | None = None
 
 
 def pool_stop_token() -> StopToken:
@@ -145,8 +210,64 @@ def workers_of(executor: Executor | None) -> int:
     return 1 if executor is None else int(getattr(executor, "_max_workers", 1))
 
 
+def offer_result(result: object) -> None:
+    """Offer the best result so far of the running task.
+
+    After a request to stop, it counts as the result of the task if the task does not end in time,
+    as where a single iterate takes long. Outside a pool's worker process this has no effect.
+
+    Args:
+        result: A result as the task returns it; it can be pickled, and is not changed later.
+    """
+    global _offer
+    if _task is not None:
+        _offer = (_task, result)
+
+
+def run_in_order(
+    executor: Executor,
+    function: Callable[[Order], T],
+    orders: Sequence[Order],
+    budget: Budget,
+    here: Callable[[Order], T],
+) -> Iterator[T]:
+    """Carry out orders in the processes of an executor, within a budget.
+
+    If a worker process is ended from outside, the orders that have no result are carried out in
+    this process.
+
+    Args:
+        executor: Executor that runs the tasks.
+        function: Carries out an order in a worker process; it can be pickled.
+        orders: The orders.
+        budget: As for `results_in_order`.
+        here: Carries out an order in this process, and stops at the request of the budget's token.
+
+    Yields:
+        The result of every order that was not cancelled, in the given order.
+
+    Raises:
+        Exception: The error of a task that failed.
+    """
+    futures = [_submitted(executor, function, order) for order in orders]
+    yield from results_in_order(executor, futures, budget, lambda index: here(orders[index]))
+
+
+def _submitted(executor: Executor, function: Callable[[Order], T], order: Order) -> Future[T]:
+    """Submit a task; in an executor whose processes have ended, it has failed at once."""
+    try:
+        return executor.submit(function, order)
+    except BrokenExecutor as error:
+        future: Future[T] = Future()
+        future.set_exception(error)
+        return future
+
+
 def results_in_order(
-    executor: Executor, futures: Sequence[Future[T]], budget: Budget
+    executor: Executor,
+    futures: Sequence[Future[T]],
+    budget: Budget,
+    again: Callable[[int], T] | None = None,
 ) -> Iterator[T]:
     """Yield the results of tasks in the order of their submission, within a budget.
 
@@ -155,6 +276,8 @@ def results_in_order(
         futures: Submitted tasks.
         budget: When it is exhausted, tasks that have not begun are cancelled, except the first
             one. After a request to stop, all running tasks return their best result so far.
+        again: Does a task again in this process, by its index, where its process was ended from
+            outside; None if that is an error.
 
     Yields:
         The result of every task that was not cancelled.
@@ -168,12 +291,19 @@ def results_in_order(
             # When the budget is exhausted, a task that has not begun is cancelled. The first task
             # is kept, because without it there might be no result at all.
             is_first = len(waiting) == len(futures)
-            if not is_first and budget.exhausted is not None and waiting[0].cancel():
+            is_over = not is_first and budget.exhausted is not None
+            if is_over and (waiting[0].cancel() or _is_lost(waiting[0])):
                 waiting.pop(0)
                 continue
 
             done, _ = wait(waiting[:1], timeout=POLL_INTERVAL)
-            if done:
+            if done and again is not None and _is_lost(waiting[0]):
+                if isinstance(executor, Pool):
+                    executor.give_up()
+                index = len(futures) - len(waiting)
+                waiting.pop(0)
+                yield again(index)
+            elif done:
                 yield waiting.pop(0).result()
 
         # After a request to stop, the remaining tasks return their best results so far.
@@ -187,6 +317,11 @@ def results_in_order(
             collect_finished(executor, waiting)
 
 
+def _is_lost(future: Future[T]) -> bool:
+    """Return whether a task failed because a worker process was ended from outside."""
+    return future.done() and isinstance(future.exception(), BrokenExecutor)
+
+
 def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T]:
     """Stop all tasks and collect their results so far.
 
@@ -195,7 +330,8 @@ def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T
         futures: Submitted tasks; those that have not begun are cancelled.
 
     Returns:
-        Results of the tasks that ended without an error within `GRACE` seconds, in the given order.
+        Results of the tasks that ended without an error within `GRACE` seconds, and what the others
+        have offered until then, in the given order.
     """
     waiting = list(futures)
     for future in waiting:
@@ -203,7 +339,14 @@ def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T
 
     if isinstance(executor, Pool):
         executor.stop()
-    done, running = _wait_for_all(waiting)
+    _, running = _wait_for_all(waiting)
+
+    found: list[T] = []
+    for future in waiting:
+        if future in running:
+            found += executor.offered(future) if isinstance(executor, Pool) else []
+        elif not future.cancelled() and future.exception() is None:
+            found.append(future.result())
 
     # The request is withdrawn, so that the pool can be used again, unless a task is still running.
     # Such a task does not look at the request, so nobody waits for it any longer.
@@ -212,9 +355,7 @@ def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T
             executor.is_abandoned = True
         else:
             executor.resume()
-
-    ended = [future for future in waiting if future in done and not future.cancelled()]
-    return [future.result() for future in ended if future.exception() is None]
+    return found
 
 
 def _wait_for_all(futures: Sequence[Future[T]]) -> tuple[set[Future[T]], set[Future[T]]]:
@@ -265,21 +406,53 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _initialize_worker(stop: Event, lifeline: connection.Connection) -> None:
+def _run_task(number: int, function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
+    """Run a task in a worker process."""
+    global _task, _offer
+    _task = number
+    try:
+        return function(*args, **kwargs)
+    finally:
+        _task = _offer = None
+
+
+def _initialize_worker(
+    stop: ctypes.c_bool, lifeline: connection.Connection, exchange: Path
+) -> None:
     """Prepare a new worker process.
 
-    It ignores Ctrl-C, its token follows the pool's event, and it ends with its parent process.
+    It ignores Ctrl-C, its token follows that of the pool, and it ends with its parent process.
 
     Args:
-        stop: The pool's event.
+        stop: The request to stop, in memory that all processes of the pool share.
         lifeline: Connection that ends when the pool gives up its workers.
+        exchange: Folder for results so far.
     """
     global _pool_token
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _pool_token = StopToken(also=stop.is_set)
+    _pool_token = StopToken(also=lambda: stop.value)
 
     _run_in_background(_end_with_parent, lifeline)
+    _run_in_background(_hand_over, stop, exchange)
     _delay_termination()
+
+
+def _hand_over(stop: ctypes.c_bool, exchange: Path) -> None:
+    """Write what the running task has offered, whenever a stop is requested."""
+    written: tuple[int, object] | None = None
+    while True:
+        time.sleep(POLL_INTERVAL)
+        offer = _offer
+        if not stop.value or offer is None or offer is written:
+            continue
+
+        # The folder is removed when nobody reads from it any more.
+        number, result = offer
+        with suppress(OSError):
+            temporary = exchange / f"{number}.part"
+            temporary.write_bytes(pickle.dumps(result))
+            temporary.replace(exchange / f"{number}.pickle")
+        written = offer
 
 
 def _run_in_background(function: Callable[..., None], *arguments: object) -> None:

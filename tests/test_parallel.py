@@ -73,6 +73,57 @@ def test_a_stopped_pool_can_be_used_again_once_nothing_runs() -> None:
         assert pool.submit(wait_for_stop, 0.1).result(timeout=30.0) == (False, first[1])
 
 
+def offer_and_go_on(result: int) -> int:
+    """Offer a result, then do not look at the request to stop for a minute."""
+    workers.offer_result(result)
+    time.sleep(60.0)
+    return -1
+
+
+@pytest.mark.slow
+def test_a_task_that_does_not_end_in_time_hands_over_its_best_so_far(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As an optimisation whose single iterate takes longer than anybody waits."""
+    monkeypatch.setattr(workers, "GRACE", 2.0)
+    stop = StopToken()
+    with mjfim.Pool(1) as pool:
+        assert pool.submit(identity).result()
+        futures = [pool.submit(offer_and_go_on, 7)]
+        threading.Timer(1.0, stop.request).start()
+        begin = time.monotonic()
+        found = list(workers.results_in_order(pool, futures, Budget(stop=stop)))
+    assert found == [7]
+    assert time.monotonic() - begin < 8.0
+    assert not pool._exchange.exists()
+
+
+def end_worker(number: int) -> int:
+    """End this process as the system does where the memory is full, for the number 1."""
+    if number == 1:
+        time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+@pytest.mark.slow
+def test_the_work_of_a_killed_worker_is_done_again() -> None:
+    here = []
+
+    def again(number: int) -> int:
+        here.append(number)
+        return number
+
+    with mjfim.Pool(2) as pool:
+        assert list(workers.run_in_order(pool, end_worker, [0, 1, 2], Budget(), again)) == [0, 1, 2]
+        assert pool.has_lost_worker
+        assert 1 in here
+
+        # Later work does not need the pool any more.
+        assert list(workers.run_in_order(pool, end_worker, [3], Budget(), again)) == [3]
+    assert here[-1] == 3
+
+
 def test_finished_tasks_are_collected_in_order_and_the_others_are_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -23,7 +23,7 @@ from mjfim.interruption import (
     Interruption,
     current_interruption,
 )
-from mjfim.parallel import MAX_THREADS
+from mjfim.parallel import LOST_SENTENCE, MAX_THREADS, Pool
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.serialization import as_json as records_as_json
 
@@ -140,6 +140,19 @@ def keep_result(folder: Path | None = None) -> None:
     interruption = current_interruption()
     if interruption is not None:
         interruption.keep(folder)
+
+
+@contextmanager
+def worker_processes(count: int) -> Iterator[Pool]:
+    """Yield a pool of worker processes; say at the end if one of them was killed.
+
+    Args:
+        count: Largest number of processes.
+    """
+    with Pool(count) as pool:
+        yield pool
+    if pool.has_lost_worker:
+        errors.print(f"mjfim: {LOST_SENTENCE}", markup=False)
 
 
 def replace_unencodable_characters() -> None:

@@ -22,6 +22,7 @@ from mjfim.cli.common import (
     print_result,
     progress,
     verb,
+    worker_processes,
     writing,
 )
 from mjfim.excitation.design import design_budget, design_task
@@ -32,7 +33,6 @@ from mjfim.experiment.task_tables import MAX_STARTS
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.summaries import describe_design
 from mjfim.output.text import render
-from mjfim.parallel import Pool
 from mjfim.records.events import Callback
 
 
@@ -51,7 +51,7 @@ def several(task: DesignTask) -> Iterator[Executor | None]:
         yield None
         return
 
-    with Pool(min(count, task.plant.simulator.threads)) as pool:
+    with worker_processes(min(count, task.plant.simulator.threads)) as pool:
         yield pool
 
 

@@ -20,6 +20,7 @@ from mjfim.cli.common import (
     out,
     progress,
     verb,
+    worker_processes,
     writing,
 )
 from mjfim.errors import ExperimentError, unknown
@@ -30,7 +31,7 @@ from mjfim.output.archive import write_design
 from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
 from mjfim.output.summaries import describe_robustness
 from mjfim.output.text import render
-from mjfim.parallel import Pool, cores
+from mjfim.parallel import cores
 from mjfim.records.robustness import RobotConditions, Robustness
 from mjfim.studies.robustness import assess_robustness, default_latency
 
@@ -115,7 +116,7 @@ def robustness(
         design_folder = design_with_reserve(stated, shares, output / "design")
 
     begun = time.perf_counter()
-    with Pool(min(jobs or cores(), runs)) as pool, progress("playing") as show:
+    with worker_processes(min(jobs or cores(), runs)) as pool, progress("playing") as show:
         result = assess_robustness(
             stated,
             design_folder,

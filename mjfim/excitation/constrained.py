@@ -22,7 +22,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import RELAXED, ModelVariant
-from mjfim.parallel import one_blas_thread, pool_stop_token
+from mjfim.parallel import offer_result, one_blas_thread, pool_stop_token
 from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 from mjfim.signals import independent_curves
@@ -194,6 +194,9 @@ class _Search:
                 status = iterate.status
                 point = self._exact_point(iterate)
                 result = self._updated(result, iterate, point)
+
+                # The next iterate may take longer than anybody waits for after Ctrl-C.
+                offer_result(replace(result, status=Status.INTERRUPTED))
                 if iterate.repaired:
                     continue
 

@@ -23,9 +23,9 @@ from mjfim.excitation.feasibility import shrink_until_feasible
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.verification import verify
-from mjfim.parallel import results_in_order, workers_of
+from mjfim.parallel import run_in_order, workers_of
 from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 
@@ -411,10 +411,13 @@ class Multistart:
 
     def _run_in_workers(self, searches: Sequence[ConstrainedSearch], executor: Executor) -> Runs:
         """Run searches side by side; the iterates of each are reported when it has ended."""
-        futures = [executor.submit(run_in_worker, search) for search in searches]
         results: list[RunResult] = []
 
-        for result in results_in_order(executor, futures, self.budget):
+        def here(search: ConstrainedSearch) -> RunResult:
+            """Run a search whose process was ended from outside."""
+            return consume(search.run(), None)
+
+        for result in run_in_order(executor, run_in_worker, searches, self.budget, here):
             results.append(result)
 
             for row in result.history:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
-from mjfim.parallel import results_in_order, workers_of
+from mjfim.parallel import run_in_order, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
@@ -280,10 +280,12 @@ class _MethodRun:
             replace(self.search, part=(i, count), steps=self.search.steps / count, threads=1)
             for i in range(count)
         ]
-        futures: list[Future[SearchResult]] = [
-            executor.submit(run_baseline, part) for part in parts
-        ]
-        results = list(results_in_order(executor, futures, Budget(stop=self.stop)))
+
+        def here(part: BaselineSearch) -> SearchResult:
+            """Run a part whose process was ended from outside."""
+            return run_baseline(part, None, self.stop)
+
+        results = list(run_in_order(executor, run_baseline, parts, Budget(stop=self.stop), here))
         if not results:
             return None
 

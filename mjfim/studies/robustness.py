@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from mjfim.errors import (
 from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.parallel import pool_stop_token, results_in_order
+from mjfim.parallel import pool_stop_token, run_in_order
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.robustness import (
     CONFIDENCE,
@@ -256,8 +257,9 @@ def _play_all(
     Without an executor, one robot is played after another in this process.
     """
     if executor is not None:
-        futures = [executor.submit(_run_in_worker, study, number) for number in range(count)]
-        for finished in results_in_order(executor, futures, Budget(stop=stop)):
+        play = partial(_run_in_worker, study)
+        here = partial(_run_until_stopped, bench, stop=stop)
+        for finished in run_in_order(executor, play, range(count), Budget(stop=stop), here):
             if finished is not None:
                 yield finished
         return
