@@ -87,6 +87,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
     Yields:
         Temporary path in the folder of the final file, with an equal suffix.
+
+    Raises:
+        OSError: The file cannot be written; the error names the final file.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,6 +111,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
         if guard is not None:
             guard.before_replacing(temporary, path)
         os.replace(temporary, path)
+    except OSError as error:
+        # The error of a full disk names no file, other errors name the temporary one.
+        if error.filename in (None, name):
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
         _open_files.discard(temporary)

@@ -50,6 +50,8 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
         # The drift under the control, and under one control for each component that is moved.
         rows = drift(np.vstack([control, control + np.diag(steps)]))
         B = (rows[1:] - rows[0]).T / steps
+        if not np.isfinite(B).all():
+            break
 
         # The Gauss-Newton step makes the linearised drift as small as possible.
         control = control - np.linalg.lstsq(B, rows[0])[0]
@@ -84,6 +86,8 @@ def _require_held(system: System, state: Array, drift: Array, key: str, place: s
     model = system.model
     name = joint_names(model)[int(model.dof_jntid[worst])]
     fault = f"still accelerates by {acceleration[worst]:.3g} per s²"
+    if not np.isfinite(drift).all():
+        fault = "diverges within one sample"
     if moves:
         fault = f"moves at {speed[worst]:.3g} per s"
     raise ExperimentError(

@@ -20,6 +20,7 @@ from mjfim.recordings.spec import Positive, RecordingSpec, Section
 
 ONLY_IN_PYTHON = ("function",)  # Keys of a parameter that a file cannot state.
 RESERVED = ("directory", "source")  # Attributes of an experiment that are no keys of the file.
+MAX_FILE_SIZE = 64 * 2**20  # Largest size of an experiment file [characters].
 DIALECT = "https://json-schema.org/draft/2020-12/schema"  # Dialect of the JSON schema.
 
 
@@ -155,13 +156,18 @@ class Experiment(Section):
         path = Path(path)
 
         try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
+            values = tomllib.loads(_read_text(path))
         except OSError as error:
             raise ExperimentError(
                 f"{path}: cannot read the experiment file: {error.strerror}"
             ) from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ExperimentError(f"{path}: not valid TOML: {error}") from None
+        except RecursionError:
+            raise ExperimentError(
+                f"{path}: lists or tables are nested too deeply; an experiment file needs three "
+                "levels"
+            ) from None
 
         _refuse_python_keys(path, values)
         return Experiment(**values, directory=path.parent, source=str(path))
@@ -193,6 +199,27 @@ class Experiment(Section):
                 values[key] = value
 
         return Experiment(**{"directory": self.directory, "source": self.source, **values})
+
+
+def _read_text(path: Path) -> str:
+    """The text of an experiment file.
+
+    Args:
+        path: The file. Devices have no end, so that it is not read beyond the largest size.
+
+    Raises:
+        ExperimentError: The file is too large.
+        OSError: The file cannot be read.
+        UnicodeDecodeError: The file is not UTF-8.
+    """
+    with path.open(encoding="utf-8") as stream:
+        text = stream.read(MAX_FILE_SIZE + 1)
+    if len(text) > MAX_FILE_SIZE:
+        raise ExperimentError(
+            f"{path}: more than {MAX_FILE_SIZE >> 20} million characters; this is no experiment "
+            "file"
+        )
+    return text
 
 
 def json_schema() -> dict[str, Any]:

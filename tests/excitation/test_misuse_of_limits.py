@@ -7,15 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import open_boundary_warnings
+from mjfim.excitation.holding_control import holding_control
 from mjfim.excitation.limits import limits_of, unsupported_ranges
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names, scalar_joints
 from mjfim.output import folders
@@ -209,6 +212,21 @@ def test_a_fault_is_reported_with_file_and_key_before_any_optimisation(
     misused(result, "study.toml: ", *fragments)
     assert "iteration" not in result.stderr
     assert names(tmp_path) == {"study.toml", "cart_pendulum.xml", "cart_pendulum.csv"}
+
+
+def test_a_control_that_holds_is_found_where_others_diverge(tmp_path: Path) -> None:
+    path = write_experiment(tmp_path)
+    model = tmp_path / "cart_pendulum.xml"
+    strong = '<general name="force" joint="slide" gainprm="1e306"/>'
+    text = model.read_text(encoding="utf-8").replace(MOTOR[0], strong)
+    model.write_text(text, encoding="utf-8")
+
+    system = System.resolve(Experiment.from_file(path))
+    state = system.plant.initial_state(system.theta)
+    hold = holding_control(system, state, np.zeros(1), key="boundary.start", place="the start")
+    assert hold.tolist() == [0.0]
+    with pytest.raises(ExperimentError, match="no control holds the start: .* diverges within"):
+        holding_control(system, state, np.ones(1), key="boundary.start", place="the start")
 
 
 def with_control_weight(folder: Path, lines: str) -> Path:

@@ -15,6 +15,7 @@ import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment import schema
 from mjfim.experiment.schema import Experiment, json_schema
 from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Signal
 from mjfim.experiment.task_tables import Cost, Descent, Limits, Robust
@@ -977,6 +978,20 @@ def test_not_toml(data: bytes, fragment: str, tmp_path: Path) -> None:
         Experiment.from_file(path)
     assert str(caught.value).startswith(f"{path}: not valid TOML: ")
     assert fragment in str(caught.value)
+
+
+def test_a_file_that_is_nested_too_deeply(tmp_path: Path) -> None:
+    path = tmp_path / "deep.toml"
+    path.write_text("x = " + "[" * 5000 + "]" * 5000, encoding="utf-8")
+    with pytest.raises(ExperimentError, match=r"deep\.toml: lists or tables are nested too deeply"):
+        Experiment.from_file(path)
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without an end")
+def test_a_file_without_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schema, "MAX_FILE_SIZE", 1 << 20)
+    with pytest.raises(ExperimentError, match="more than 1 million characters"):
+        Experiment.from_file("/dev/zero")
 
 
 def test_no_file(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import io
 import json
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -79,13 +79,17 @@ class Call:
         words: Its words.
         spoiled: What was spoiled, in words.
         refused: True if nothing but a refusal (exit code 2) is right.
-        inputs: Names of the files that the call reads, which it must not change.
+        fails: True if exit code 0 is wrong.
+        accepted: True if a refusal is wrong.
+        room: Largest size of a file that can be written [bytes]; None for no limit.
     """
 
     words: list[str]
     spoiled: str
     refused: bool = False
-    inputs: list[str] = field(default_factory=list)
+    fails: bool = False
+    accepted: bool = False
+    room: int | None = None
 
 
 def toml_of(value: Any) -> str:

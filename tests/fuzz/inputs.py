@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import re
@@ -16,6 +17,7 @@ from pathlib import Path
 from mjfim.atomic_io import replacing
 from mjfim.output import plots
 from tests.fuzz.bad_inputs import Call, bad_input
+from tests.fuzz.faults import fault
 from tests.fuzz.outcome import TIME_LIMITS, Case, Outcome
 from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
 from tests.fuzz.workers import announce
@@ -50,12 +52,13 @@ class Ending:
 
 
 def run(case: Case, folder: Path) -> Outcome:
-    """Spoil one thing, call the command line, and judge how it ends."""
+    """Spoil something, call the command line, and judge how it ends."""
     rng = case.rng
+    spoil = fault if case.kind == "fault" else bad_input
     for name in STUDY:
         shutil.copy(valid_study() / name, folder)
-    call = bad_input(rng, folder)
-    is_new = rng.random() < NEW_PROCESS
+    call = spoil(rng, folder)
+    is_new = rng.random() < NEW_PROCESS or call.room is not None
     description = f"{call.words[0] if call.words else ''}: {call.spoiled}"
     announce(description)
 
@@ -124,6 +127,7 @@ def in_new_process(call: Call, folder: Path) -> Ending:
         stderr=subprocess.PIPE,
         text=True,
         errors="replace",
+        preexec_fn=None if call.room is None else functools.partial(_limit_files, call.room),
     ) as process:
         try:
             results, errors = process.communicate(timeout=TIME_LIMITS["input"] - 5.0)
@@ -132,6 +136,14 @@ def in_new_process(call: Call, folder: Path) -> Ending:
             results, errors = process.communicate()
             return Ending(code=process.returncode, errors=errors, fault="no end within the limit")
     return Ending(code=process.returncode, errors=errors, results=results)
+
+
+def _limit_files(room: int) -> None:
+    """Limit the size of the files that this process writes. room: the limit [bytes]."""
+    with contextlib.suppress(ImportError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
 
 
 def judge(call: Call, ending: Ending) -> list[str]:
@@ -147,8 +159,12 @@ def judge(call: Call, ending: Ending) -> list[str]:
 
     if ending.code == 1 and not (errors or ending.results.strip()):
         found.append(f"exit code {ending.code} without a message")
+    if ending.code == 0 and call.fails:
+        found.append("exit code 0, although it cannot succeed")
     if ending.code == 2:
         found += _judge_refusal(errors)
+        if call.accepted:
+            found.append(f"refused: {errors[-300:]}")
     elif call.refused:
         found.append(f"accepted: exit code {ending.code} in place of a refusal: {errors[-200:]}")
     return found

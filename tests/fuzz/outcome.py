@@ -7,10 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 # Kinds of cases; the place of a kind in this list is part of the seed of its random numbers.
-KINDS = ("problem", "input", "kill", "mechanism")
+KINDS = ("problem", "input", "kill", "mechanism", "fault")
 
 # Time after which a case has failed [s]. It includes the time that a busy machine takes from it.
-TIME_LIMITS = {"problem": 180.0, "input": 60.0, "kill": 180.0, "mechanism": 180.0}
+TIME_LIMITS = {
+    "problem": 180.0,
+    "input": 60.0,
+    "kill": 180.0,
+    "mechanism": 180.0,
+    "fault": 60.0,
+}
 
 
 @dataclass(frozen=True, kw_only=True)

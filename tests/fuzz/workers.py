@@ -43,6 +43,7 @@ def run_case(case: Case, folder: Path) -> Outcome:
         "input": inputs.run,
         "kill": kills.run,
         "mechanism": mechanism_problems.run,
+        "fault": inputs.run,
     }
     try:
         outcome = runs[case.kind](case, folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import errno
 import json
 import os
 import shutil
@@ -393,6 +394,24 @@ def test_replacing_replaces(tmp_path: Path) -> None:
             temporary.write_text(text, encoding="utf-8")
         assert path.read_text(encoding="utf-8") == text
     assert [p.name for p in path.parent.iterdir()] == ["x.csv"]
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_an_error_while_writing_names_the_file(full: bool, tmp_path: Path) -> None:
+    """The error of a full disk names no file, that of a missing file names the temporary one."""
+    path = tmp_path / "x.json"
+
+    def write() -> None:
+        """Fail while the file is written."""
+        with replacing(path) as temporary:
+            if full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            temporary.unlink()
+            temporary.open(encoding="utf-8").close()
+
+    with pytest.raises(OSError, match="No s") as caught:
+        write()
+    assert caught.value.filename == str(path)
 
 
 def test_files_of_killed_processes_are_removed_and_those_of_others_stay(tmp_path: Path) -> None:
