@@ -225,7 +225,7 @@ def test_a_control_that_holds_is_found_where_others_diverge(tmp_path: Path) -> N
     state = system.plant.initial_state(system.theta)
     hold = holding_control(system, state, np.zeros(1), key="boundary.start", place="the start")
     assert hold.tolist() == [0.0]
-    with pytest.raises(ExperimentError, match="no control holds the start: .* diverges within"):
+    with pytest.raises(ExperimentError, match=r"no control holds the start: .* diverges within"):
         holding_control(system, state, np.ones(1), key="boundary.start", place="the start")
 
 
