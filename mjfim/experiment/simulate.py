@@ -42,10 +42,12 @@ def simulate_system(
 ) -> Recording:
     """Simulate a recording of a resolved system. See `simulate`."""
     rng = np.random.default_rng(seed)
-    outputs, finite = system.plant.measure(system.parameters.true[None], trajectory.ctrl)
+    true = system.parameters.true
+    outputs, finite = system.plant.measure(true[None], trajectory.ctrl)
     if not finite[0]:
+        why = system.plant.why_diverged(true, trajectory.ctrl)
         raise SimulationDivergedError(
-            "the simulation diverges at the true parameters under this control"
+            f"the simulation diverges at the true parameters under this control: {why}"
         )
 
     noisy = outputs[0] + system.noise.sample(len(outputs[0]), rng)

@@ -33,6 +33,7 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from mjfim.parallel import one_blas_thread
+from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
 from mjfim.plant.noise import Noise
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
@@ -289,8 +290,28 @@ def _require_finite_cost(
     if not np.isfinite(cost):
         values = dict(zip(task.system.parameters.names, task.start, strict=True))
         extreme = describe_extreme_value(task.recordings, task.system.channels.control_columns)
-        cause = f"; {extreme}; is it a fault of the log?" if extreme else ""
+        why = _why_diverged(problem, task.start)
+        cause = f"; {extreme}; is it a fault of the log?" if extreme else f": {why}"
         raise SimulationDivergedError(f"the simulation diverges at the start {values}{cause}")
+
+
+def _why_diverged(problem: FitProblem, theta: Array) -> str:
+    """Why the simulation of a segment from its start diverges, as a clause for a message.
+
+    Args:
+        problem: Problem with the segments.
+        theta: (p,) parameters [theta-unit].
+    """
+    plant = problem.system.plant
+    model = plant.model(theta)
+    substeps = plant.simulator.substeps
+
+    for segment in problem.segments:
+        end = segment.begin + segment.samples
+        ctrl = problem.recordings[segment.recording].ctrl[segment.begin : end]
+        if find_divergence(model, segment.start, ctrl, substeps) is not None:
+            return explain_divergence(model, segment.start, ctrl, substeps)
+    return NO_WARNING
 
 
 def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:

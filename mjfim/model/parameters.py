@@ -28,8 +28,9 @@ from mjfim.model.targets import (
 from mjfim.model.variants import MocapPlacement
 
 # Fields of a body that change its inertial frame, so that the body must not be compiled as
-# "simple".
-FRAME_FIELDS = {"pos", "ipos", "inertia", "mass", "rot", *INERTIAL_FIELDS}
+# "simple". Mass and principal inertias are not among them: a body stays simple whatever they are,
+# and MuJoCo gives a body that only slides another constraint weight if it is not simple.
+FRAME_FIELDS = {"pos", "ipos", "rot", *INERTIAL_FIELDS}
 
 # Fields that are outside the model: the initial state and the measurement.
 FIELDS_OUTSIDE_MODEL = (InitialStateField, OutputBiasField, OutputDelayField)

@@ -18,6 +18,7 @@ from mjfim.optimize.lq import TangentCurve
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.derivatives import Derivatives
+from mjfim.plant.divergence import explain_divergence
 from mjfim.plant.outputs import Outputs
 from mjfim.records.trajectory import Trajectory
 
@@ -283,10 +284,24 @@ class Plant:
         )
         if not out.finite[0]:
             raise SimulationDivergedError(
-                "the simulation diverges under this control; a smaller amplitude or timestep may "
-                "help"
+                f"the simulation diverges under this control: {self.why_diverged(theta, ctrl)}"
             )
         return self.trajectory(out.states[0], ctrl)
+
+    def why_diverged(self, theta: Array, ctrl: Array) -> str:
+        """Explain why an open-loop simulation from the initial state diverges.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            ctrl: (N, nu) controls.
+
+        Returns:
+            MuJoCo's warning and what may help, as a clause for a message.
+        """
+        start = self.initial_state(theta)
+        return explain_divergence(
+            self.model(theta), start, np.asarray(ctrl), self.simulator.substeps
+        )
 
     def observe(
         self, theta: Array, ctrl: Array, observations: SubstepObservations

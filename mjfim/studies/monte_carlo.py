@@ -358,10 +358,12 @@ def _exact_outputs(system: System, curve: Trajectory) -> tuple[Array, Array]:
     Returns:
         (N+1, ny) outputs [y-unit], and (N+1, ny, p) their derivative [y-unit / theta-unit].
     """
-    exact = system.plant.derivatives.predict(system.parameters.true, curve.ctrl)
+    true = system.parameters.true
+    exact = system.plant.derivatives.predict(true, curve.ctrl)
     if exact is None:
+        why = system.plant.why_diverged(true, curve.ctrl)
         raise SimulationDivergedError(
-            "the simulation diverges at the true parameters under this control"
+            f"the simulation diverges at the true parameters under this control: {why}"
         )
     return exact
 

@@ -910,7 +910,36 @@ def test_bodies_whose_inertial_frame_moves_are_found() -> None:
         "site/f:pos",
         "joint/g:damping",
     ]
-    assert moved_bodies([one(p) for p in paths]) == {"a", "b", "c", "d"}
+    # A body stays simple with another mass and with other principal inertias.
+    assert moved_bodies([one(p) for p in paths]) == {"a", "b"}
+
+
+# A ball that can only slide: MuJoCo gives such a body another constraint weight than others.
+SLIDING_BALL = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1" friction=".5"/>
+    <body name="ball" pos="0 0 .2">
+      <joint name="x" type="slide" axis="1 0 0" armature=".2"/>
+      <joint name="z" type="slide" axis="0 0 1" armature=".3" range="-.11 .15" limited="true"/>
+      <inertial pos="0 0 0" mass="2" diaginertia=".01 .011 .012"/>
+      <geom name="ball" type="sphere" size=".1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="x"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_body_that_only_slides_touches_the_floor_as_in_the_users_model(tmp_path) -> None:
+    """Parameters of its mass do not change the stiffness of contacts and limits."""
+    target = {"mass": {"target": "body/ball:mass"}, "inertia": {"target": "body/ball:inertia[0]"}}
+    task = make_task(SLIDING_BALL, tmp_path, rate=100.0, parameters=target, noise={"state": 0.1})
+    plain = rollout(mujoco.MjModel.from_xml_string(SLIDING_BALL))
+
+    for model in (task.system.model_at(task.theta), task.plant.model(task.theta)):
+        np.testing.assert_allclose(rollout(model), plain, rtol=1e-7, atol=1e-7)
 
 
 def test_the_model_at_theta_has_the_right_dynamics_for_simple_bodies(tmp_path) -> None:

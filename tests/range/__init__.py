@@ -1,0 +1,1 @@
+"""Numerical range: extreme masses, integrators, timesteps, horizons, judged by plain MuJoCo."""
