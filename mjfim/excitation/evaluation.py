@@ -75,7 +75,7 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
         min_eigenvalue=information.accumulated_eigenvalue(point.sensitivity),
         criterion=point.criterion.value,
         cost=point.cost,
-        growth=largest_amplification(A),
+        growth=largest_amplification(A, weights.state_sizes),
     )
 
 

@@ -293,6 +293,19 @@ class DesignTask:
         return self.reference
 
     @cached_property
+    def sizes(self) -> Array:
+        """(nx+nu,) sizes of state and control along the initial trajectory [x-unit, u-unit].
+
+        They are the natural sizes of the model where it diverges, or hardly moves.
+        """
+        sizes = self.plant.sizes
+        shown = self.reference
+        if shown is None:
+            start = np.tile(self.plant.initial_state(self.theta), (self.samples + 1, 1))
+            shown = self.plant.trajectory(start, self.control)
+        return sizes.along(shown, sizes.position / self.horizon)
+
+    @cached_property
     def problem(self) -> DesignProblem:
         """The cost in the form that Algorithm 1 of the paper needs."""
         running = RunningCost(

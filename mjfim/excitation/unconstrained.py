@@ -83,12 +83,22 @@ def regulator_for(task: DesignTask) -> Regulator:
         task: The task.
 
     Returns:
-        A regulator with unit weights on state and control, and without feedback where deviations
-        grow less than `FEEDBACK_THRESHOLD`.
+        A regulator with unit weights on state and control in units of their sizes, and without
+        feedback where deviations grow less than `FEEDBACK_THRESHOLD`.
     """
-    Q = np.eye(task.space.nx) * task.dt
-    R = np.eye(len(task.controls)) * task.dt
-    return Regulator(Q=Q, R=R, terminal=Q / task.dt, feedback_threshold=FEEDBACK_THRESHOLD)
+    nx = task.space.nx
+    state_sizes, control_sizes = task.sizes[:nx], task.sizes[nx:]
+
+    # The sum over samples is a mean over time, so that the weight of the last state has no unit.
+    share = 1.0 / task.samples
+    last = np.diag(state_sizes**-2.0)
+    return Regulator(
+        Q=last * share,
+        R=np.diag(control_sizes**-2.0) * share,
+        terminal=last,
+        feedback_threshold=FEEDBACK_THRESHOLD,
+        state_sizes=state_sizes,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

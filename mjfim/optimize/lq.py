@@ -96,17 +96,21 @@ class LinearRecursion:
         return np.asarray(solution).reshape(rhs.shape)
 
 
-def largest_amplification(A: Array) -> float:
+def largest_amplification(A: Array, sizes: Array | None = None) -> float:
     """Largest amplification of a deviation of the state.
 
     Deviations from the first to any sample and from any to the last sample are examined.
 
     Args:
         A: (N, nx, nx) transition matrices.
+        sizes: (nx,) sizes of the state's components, in which deviations are measured [x-unit];
+            default: 1.
 
     Returns:
         The largest spectral norm of the products of these transition matrices; at least 1.
     """
+    if sizes is not None:
+        A = A * (sizes / sizes[:, None])
     N, nx, _ = A.shape
     recursion = LinearRecursion(A)
     zero = np.zeros((N, nx))

@@ -291,6 +291,8 @@ class Regulator:
         period: Number of iterates after which K is renewed.
         feedback_threshold: Amplification of deviations along the open-loop trajectory, up to which
             the projection needs no feedback and K is zero. With 0 there is always feedback.
+        state_sizes: (nx,) sizes of the state's components, in which deviations are measured
+            [x-unit]; default: 1.
     """
 
     Q: Array
@@ -298,6 +300,7 @@ class Regulator:
     terminal: Array
     period: int = 10
     feedback_threshold: float = 0.0
+    state_sizes: Array | None = None
 
     def gain(self, expansion: Expansion) -> Array:
         """Gain about the trajectory of an expansion.
@@ -308,10 +311,11 @@ class Regulator:
         Returns:
             K: (N, nu, nx).
         """
-        threshold = self.feedback_threshold
-        if threshold and largest_amplification(expansion.A) <= threshold:
-            N, nx, nu = expansion.B.shape
-            return np.zeros((N, nu, nx))
+        if self.feedback_threshold:
+            growth = largest_amplification(expansion.A, self.state_sizes)
+            if growth <= self.feedback_threshold:
+                N, nx, nu = expansion.B.shape
+                return np.zeros((N, nu, nx))
 
         return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
 

@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE
 from mjfim.records.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from mjfim.plant.plant import Plant
-
-# Magnitude of a control [u-unit] below which its difference step is absolute instead of relative.
-MIN_CONTROL_SIZE = 1e-3
 
 
 class DifferenceSteps:
@@ -44,16 +42,15 @@ class DifferenceSteps:
     def difference_sizes(self, trajectory: Trajectory) -> Array:
         """Magnitudes of state and control along a trajectory, to which steps are relative.
 
+        They are the largest values along the trajectory, or the natural sizes of the model where it
+        hardly moves. A rotation has the magnitude 1.
+
         Args:
             trajectory: The trajectory.
 
         Returns:
-            (nx+nu,) magnitudes, 1 for positions and at least 1 for velocities and activations
-            [x-unit, u-unit].
+            (nx+nu,) magnitudes [x-unit, u-unit].
         """
-        position = np.ones(self.plant.space.nv)
-        velocity = np.maximum(1.0, np.abs(trajectory.qvel).max(axis=0, initial=0.0))
-        activation = np.maximum(1.0, np.abs(trajectory.act).max(axis=0, initial=0.0))
-        largest = np.abs(trajectory.ctrl).max(axis=0)
-        control = np.where(largest > MIN_CONTROL_SIZE, largest, 1.0)
-        return np.concatenate([position, velocity, activation, control])
+        sizes = self.plant.sizes
+        least_speed = LEAST_MOVE_PER_SAMPLE * sizes.position / self.plant.dt
+        return sizes.along(trajectory, least_speed)

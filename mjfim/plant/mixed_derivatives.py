@@ -167,7 +167,8 @@ class MixedDerivatives(StepDerivatives):
 
         Means over the pairs give A and B.
         """
-        steps = accuracy.coordinate_step * self.difference_sizes(trajectory)
+        sizes = self.difference_sizes(trajectory)
+        steps, nx = accuracy.coordinate_step * sizes, self.plant.space.nx
         moved = self._move_samples(*all_samples(trajectory), steps, accuracy.central)
         pairs = []
         for number, w in enumerate(directions):
@@ -175,7 +176,7 @@ class MixedDerivatives(StepDerivatives):
             # them.
             wanted = observations if number == 0 else None
             state_direction = psi @ w
-            epsilon = self._direction_step(accuracy, state_direction, w)
+            epsilon = self._direction_step(accuracy, state_direction / sizes[:nx], w)
             pairs.append(self._pair(theta, moved, state_direction, w, epsilon, wanted))
 
         sensor_firsts = [pair.sensor_first for pair in pairs if pair.sensor_first is not None]
@@ -259,7 +260,8 @@ class MixedDerivatives(StepDerivatives):
         The steps at the origin, from the moved samples at theta, serve all directions.
         """
         plant, smooth = self.plant, self.plant.smooth
-        steps = accuracy.coordinate_step * self.difference_sizes(trajectory)
+        sizes = self.difference_sizes(trajectory)
+        steps, nx = accuracy.coordinate_step * sizes, self.plant.space.nx
         moved = self._move_samples(*all_samples(trajectory), steps, False)
         count = len(moved.widths)
 
@@ -280,7 +282,7 @@ class MixedDerivatives(StepDerivatives):
         mixed = []
         for w in directions:
             state_direction = psi @ w
-            epsilon = self._direction_step(accuracy, state_direction, w)
+            epsilon = self._direction_step(accuracy, state_direction / sizes[:nx], w)
             mixed.append(
                 self._one_sided_difference(theta, moved, origin, state_direction, w, epsilon)
             )
@@ -382,16 +384,16 @@ class MixedDerivatives(StepDerivatives):
         )
 
     def _direction_step(
-        self, accuracy: DifferenceAccuracy, state_direction: Array, w: Array
+        self, accuracy: DifferenceAccuracy, relative_direction: Array, w: Array
     ) -> float:
         """Step along (psi w, w).
 
-        It is relative to the larger of the two parts: the state direction psi w: (N+1, nx), and w
-        divided by `parameter_scale`.
+        It is relative to the larger of the two parts: the state direction psi w in units of the
+        sizes of the state: (N+1, nx), and w divided by `parameter_scale`.
         """
         in_model = self.plant.parameters.changes_model
         relative = np.where(in_model, np.abs(w / self.parameter_scale), 0.0).max(initial=0.0)
-        largest = max(np.abs(state_direction).max(initial=0.0), relative, TINY)
+        largest = max(np.abs(relative_direction).max(initial=0.0), relative, TINY)
         return float(accuracy.direction_step / largest)
 
 

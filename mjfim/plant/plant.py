@@ -20,6 +20,7 @@ from mjfim.plant.delay import OutputDelay
 from mjfim.plant.derivatives import Derivatives
 from mjfim.plant.divergence import explain_divergence
 from mjfim.plant.outputs import Outputs
+from mjfim.plant.state_sizes import StateSizes
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of compiled models at single parameter values that a plant keeps.
@@ -34,6 +35,7 @@ class Plant:
         parameters: The p parameters theta.
         outputs: Output map h without bias and delay.
         simulator: Steps the model copies.
+        sizes: Natural sizes of states and controls.
         space: Layout of the state and of its tangent space.
         nominal_initial_state: (ns,) initial state where no parameter moves it.
         initial_state_derivative: (nx, p) derivative of the initial state by theta [x-unit /
@@ -79,6 +81,7 @@ class Plant:
         self.bias_derivative = parameters.bias_derivative(len(outputs))
         self.nu = int(source.model.nu)
         self.dt = substeps * float(source.model.opt.timestep)
+        self.sizes = StateSizes.of(source.model, self.space, self.dt)
 
         self._step_factors: Array | None = None
         self._smooth = smooth

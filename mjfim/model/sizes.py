@@ -1,0 +1,146 @@
+"""Natural sizes of a model's coordinates and controls, to which small numbers are relative.
+
+A rotation has the size of one radian whatever the robot. All other sizes follow from the lengths,
+masses and ranges of the model, so that they scale with its units.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+
+# Share of its size by which a slow coordinate moves in one sample. Slower motions count as rest.
+LEAST_MOVE_PER_SAMPLE = 0.01
+
+
+def model_length(model: Any) -> float:
+    """Length of the largest moving tree of a model [m].
+
+    It is the largest sum of the offsets of bodies from the root of their tree to a centre of mass,
+    and the radius of gyration about it. Places in the world and geoms without mass do not matter.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    from_root = np.zeros(model.nbody)
+    longest = 0.0
+
+    for body in range(1, model.nbody):
+        if not model.body_weldid[body]:
+            continue
+        parent = int(model.body_parentid[body])
+        if model.body_weldid[parent]:
+            offset = float(np.linalg.norm(model.body_pos[body]))
+            from_root[body] = from_root[parent] + offset
+
+        mass = float(model.body_mass[body])
+        if mass > 0.0:
+            gyration = float(np.sqrt(model.body_inertia[body].max() / mass))
+            centre = float(np.linalg.norm(model.body_ipos[body]))
+            longest = max(longest, from_root[body] + centre + gyration)
+
+    # MuJoCo's extent is the size of the geoms and sites, where nothing that moves has a mass.
+    return longest or float(model.stat.extent)
+
+
+def translations(model: Any) -> np.ndarray:
+    """(nv,) True for the degrees of freedom that are translations.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    found = np.zeros(model.nv, dtype=bool)
+    for joint in range(model.njnt):
+        first = int(model.jnt_dofadr[joint])
+        kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+        if kind == mujoco.mjtJoint.mjJNT_SLIDE:
+            found[first] = True
+        elif kind == mujoco.mjtJoint.mjJNT_FREE:
+            found[first : first + 3] = True
+    return found
+
+
+def position_sizes(model: Any) -> Array:
+    """Natural size of each degree of freedom.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+
+    Returns:
+        (nv,) sizes: the model's length for translations, 1 for rotations [m, rad].
+    """
+    return np.where(translations(model), model_length(model), 1.0)
+
+
+def control_sizes(model: Any, time: float) -> Array:
+    """Natural size of each control, where no trajectory shows it.
+
+    It is the range of the control or of the force; else the control that moves the joint of a servo
+    by its natural size, or accelerates the joint by its natural size in a natural time.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        time: Natural time of the motion [s].
+
+    Returns:
+        (nu,) positive sizes [u-unit].
+    """
+    sizes = np.ones(model.nu)
+    for actuator in range(model.nactuator):
+        control = int(model.actuator_ctrladr[actuator])
+        count = int(model.actuator_ctrlnum[actuator])
+        sizes[control : control + count] = _control_size(model, actuator, control, time)
+    return sizes
+
+
+def force_sizes(model: Any, time: float) -> Array:
+    """Force that accelerates each degree of freedom by its natural size in a natural time, squared.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        time: Natural time of the motion [s].
+
+    Returns:
+        (nv,) forces [N or N m].
+    """
+    inertia = 1.0 / np.maximum(model.dof_invweight0, mujoco.mjMINVAL)
+    return np.asarray(inertia * position_sizes(model) / time**2)
+
+
+def _control_size(model: Any, actuator: int, control: int, time: float) -> float:
+    """Natural size of a control of one actuator, see `control_sizes`."""
+    stated = np.abs(model.actuator_ctrlrange[control]).max(initial=0.0)
+    if stated > 0.0:
+        return float(stated)
+
+    gain = abs(float(model.actuator_gainprm[actuator, 0])) or 1.0
+    bias = np.abs(model.actuator_biasprm[actuator])
+    length = _transmission_size(model, actuator)
+
+    # A servo for positions or velocities.
+    if bias[1] > 0.0:
+        return float(length * bias[1] / gain)
+    if bias[2] > 0.0:
+        return float(length / time * bias[2] / gain)
+
+    output = int(model.actuator_outadr[actuator])
+    force = float(np.abs(model.actuator_forcerange[output]).max())
+    if not force > 0.0:
+        force = length / time**2 / max(float(model.actuator_acc0[output]), mujoco.mjMINVAL)
+    return force / gain
+
+
+def _transmission_size(model: Any, actuator: int) -> float:
+    """Natural size of the length that an actuator acts on [m or rad, times the gear]."""
+    joint_like = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    if int(model.actuator_trntype[actuator]) not in [int(kind) for kind in joint_like]:
+        return model_length(model)
+
+    output = int(model.actuator_outadr[actuator])
+    gear = float(np.abs(model.actuator_gear[output]).max()) or 1.0
+    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    return gear * float(position_sizes(model)[dof])

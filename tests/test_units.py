@@ -1,0 +1,116 @@
+"""No result depends on units: experiments in other units of length, mass and time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.excitation.design import design
+from mjfim.experiment.schema import Experiment
+from tests.support.rescaling import Rescaled, Units, rescale
+
+CART = """
+<mujoco model="cart_pendulum">
+  <option timestep="0.01" integrator="implicitfast"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="cart">
+      <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+      <joint name="slide" type="slide" axis="1 0 0" damping="0.1"/>
+      <body name="pendulum">
+        <joint name="hinge" type="hinge" axis="0 -1 0" damping="0.4" armature="0.02"/>
+        <body name="bob" pos="0 0 0.8">
+          <inertial pos="0 0 0" mass="1.5" diaginertia="1e-3 1e-3 1e-3"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="force" joint="slide"/></actuator>
+  <keyframe><key name="hanging" qpos="0 3.141592653589793"/></keyframe>
+</mujoco>
+"""
+
+EXPERIMENT: dict[str, Any] = {
+    "model": "cart.xml",
+    "rate": 50.0,
+    "horizon": 1.6,
+    "initial": {
+        "keyframe": "hanging",
+        "control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.8},
+    },
+    "parameters": {
+        "m": {"target": "body/bob:mass", "guess": 1.3, "true": 1.5, "unit": "kg"},
+        "l": {"target": "body/bob:pos[2]", "guess": 0.75, "true": 0.8, "unit": "m"},
+        "c": {"target": "joint/hinge:damping", "guess": 0.5, "true": 0.4, "unit": "N m s/rad"},
+        "d": {"target": "joint/slide:damping", "guess": 0.15, "true": 0.1, "unit": "N s/m"},
+    },
+    "noise": {"qpos:slide": 0.002, "qpos:hinge": 0.002, "qvel:hinge": 0.02},
+    "cost": {"control": 1e-3},
+    "descent": {"max_iterations": 3, "coarse": 1},
+}
+LIMITS = {
+    "position": {"slide": (-0.3, 0.5)},
+    "velocity": {"hinge": 3.0},
+    "control": {"force": (-5.0, 5.0)},
+}
+
+
+def stated(folder: Path, **tables: Any) -> Experiment:
+    """The cart-pendulum in its own units."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cart.xml").write_text(CART)
+    return Experiment(**{**EXPERIMENT, **tables}, directory=folder, source="cart")
+
+
+# Powers of two, which change no digit of a number. Masses also by a million and a millionth.
+BIG, SMALL = 2.0**10, 2.0**-10
+SCALES = {
+    "long": Units(length=BIG),
+    "short": Units(length=SMALL),
+    "heavy": Units(mass=BIG**2),
+    "light": Units(mass=SMALL**2),
+    "slow": Units(time=BIG),
+    "quick": Units(time=SMALL),
+    "long, light, slow": Units(length=BIG, mass=SMALL, time=BIG),
+    "short, heavy, quick": Units(length=SMALL, mass=BIG, time=SMALL),
+}
+
+
+def in_units(rescaled: Rescaled, found: Any) -> dict[str, Any]:
+    """Numbers of a design in the units of the original experiment."""
+    units = rescaled.units
+    control = np.array(list(rescaled.controls.values()))
+    coordinates = [units.factor(unit) for unit in rescaled.coordinates.values()]
+    state = np.array([*coordinates, *(np.array(coordinates) / units.time)])
+    parameters = [units.factor(p["unit"]) for p in EXPERIMENT["parameters"].values()]
+
+    return {
+        "state": found.trajectory.state / state,
+        "control": found.trajectory.ctrl / control,
+        "gain": found.final.gain * state / control[:, None],
+        "std": found.final.std / parameters,
+        "cost": found.final.cost * units.time,
+        "growth": found.final.growth,
+        "status": found.status,
+        "warnings": len(found.warnings),
+        "iterations": found.iterations,
+    }
+
+
+@pytest.mark.parametrize("tables", [{}, {"limits": LIMITS, "cost": {"control": 0.0}}])
+@pytest.mark.parametrize("name", SCALES)
+def test_a_design_is_the_same_in_all_units(tmp_path, name: str, tables: dict[str, Any]) -> None:
+    original = stated(tmp_path / "original", **tables)
+    expected = in_units(rescale(original, Units(), tmp_path / "own"), design(original))
+
+    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
+    found = in_units(rescaled, design(rescaled.experiment))
+
+    # Powers of two are exact; only linear algebra that mixes units may round differently.
+    for key, value in expected.items():
+        if key in ("status", "warnings", "iterations"):
+            assert found[key] == value
+        else:
+            np.testing.assert_allclose(found[key], value, rtol=1e-9, atol=1e-9, err_msg=key)
