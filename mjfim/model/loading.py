@@ -39,8 +39,13 @@ def load_spec(path: Path) -> Any:
 def _engine_path(path: Path) -> str:
     """Return a path as MuJoCo needs it, in UTF-8 whatever the locale is.
 
-    Raises ModelError if the path is not UTF-8.
+    Raises ModelError if the path is not UTF-8, or if it has a backslash that is no separator.
     """
+    if os.sep == "/" and "\\" in str(path):
+        raise ModelError(
+            f"{path}: MuJoCo takes a backslash for the separator of folders; rename the file or "
+            "its folders"
+        )
     try:
         return os.fsencode(path).decode("utf-8")
     except UnicodeDecodeError:

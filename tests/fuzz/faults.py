@@ -249,9 +249,8 @@ def odd_numbers(rng: Rng, folder: Path) -> Call:
     for name in names:
         columns[name] = [value if rng.random() < share else v for v in columns[name]]
     kind, words = _write_log(rng, folder, columns)
-    is_measured = any(not np.isfinite(columns[name]).all() for name in ("t", "ctrl:force"))
+    refused = any(np.isinf(columns[name]).any() for name in ("t", "ctrl:force"))
     what = "all columns" if len(names) > 1 else names[0]
-    refused = is_measured and abs(value) == np.inf
     return Call(words=words, spoiled=f"{kind}: {value:g} in {what}", refused=refused)
 
 
@@ -472,15 +471,19 @@ def odd_name(rng: Rng, folder: Path) -> Call:
     """Inputs and outputs with odd names; nothing else is wrong, so that they must work."""
     name = str(pick(rng, ODD_NAMES))
     is_folder = rng.random() < 0.5
+    name = name if is_folder else name.replace("/", "_")
     place = folder / name if is_folder else folder
     place.mkdir(parents=True, exist_ok=True)
-    (folder / name).parent.mkdir(exist_ok=True)
     prefix = f"./{name}/" if is_folder else "./"
     if is_folder:
         for file in [path for path in folder.iterdir() if path.is_file()]:
             shutil.move(file, place)
         words = ["identify", f"{prefix}study.toml", f"{prefix}run.csv", "-o", f"{prefix}out"]
-        return Call(words=words, spoiled=f"a folder {name[:20]!r}", accepted=True)
+        # MuJoCo takes a backslash for a separator.
+        works = "\\" not in name
+        return Call(
+            words=words, spoiled=f"a folder {name[:20]!r}", accepted=works, refused=not works
+        )
 
     shutil.move(folder / "study.toml", folder / f"{name}.toml")
     shutil.move(folder / "run.csv", folder / f"{name}.csv")

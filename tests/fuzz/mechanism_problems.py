@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mjfim.records.design import Design
+from tests.fuzz.bad_inputs import pick
 from tests.fuzz.mechanisms import Mechanism, random_mechanism
 from tests.fuzz.outcome import Case, Outcome
 from tests.fuzz.plants import Range, Rng, about_zero
@@ -23,6 +24,7 @@ def run(case: Case, folder: Path) -> Outcome:
         tables=tables,
         ranges=all_ranges(mechanism, tables),
         description=describe(mechanism, tables),
+        ignored=tables["limits"].get("ignored", ()),
     )
     return attempt(case, folder, problem, lambda design: omissions(mechanism, tables, design))
 
@@ -52,7 +54,7 @@ def all_ranges(mechanism: Mechanism, tables: dict[str, Any]) -> dict[tuple[str, 
 
     stated: dict[str, dict[str, Any]] = {}
     for kind, value in tables["limits"].items():
-        if kind in ("bandwidth", "clearance"):
+        if kind in ("bandwidth", "clearance", "ignored"):
             continue
         names = scalar if kind in by_joint else drives
         stated[kind] = value if isinstance(value, dict) else dict.fromkeys(names, value)
@@ -106,6 +108,8 @@ def random_tables(rng: Rng, mechanism: Mechanism) -> dict[str, Any]:
     }
     if substeps > 1 and rng.random() < 0.3:
         tables["playback_rate"] = 1.0 / mechanism.timestep
+    if rng.random() < 0.15:
+        tables["descent"] |= pick(rng, ({"fourier": (1.0 / horizon,)}, {"repeats": (2,)}))
     if rng.random() < 0.1:
         for parameter in tables["parameters"].values():
             parameter["prior"] = 1e-3
@@ -141,6 +145,8 @@ def _limits(rng: Rng, mechanism: Mechanism, horizon: float) -> dict[str, Any]:
     if mechanism.collides and rng.random() < 0.6:
         shortest = min(link.length for link in mechanism.links)
         limits["clearance"] = float(shortest * rng.uniform(0.001, 0.1))
+        if len(mechanism.links) > 2 and rng.random() < 0.3:
+            limits["ignored"] = (("link0", "link2"),)
     if rng.random() < 0.1:
         limits["bandwidth"] = float(rng.uniform(2.0, 5.0)) / horizon
     return limits
@@ -172,6 +178,7 @@ def describe(mechanism: Mechanism, tables: dict[str, Any]) -> str:
     boundary = tables["boundary"]
     ends = f"{boundary.get('start', 'given')} to {boundary.get('end', 'free')}"
     words = [*mechanism.features, ends, f"limits on {', '.join(sorted(tables['limits']))}"]
+    words += [key for key in ("fourier", "repeats") if key in tables["descent"]]
     if "robust" in tables:
         words.append("robust")
     return "; ".join(words)

@@ -133,6 +133,9 @@ class _Builder:
         self.collides = not self.is_loop and rng.random() < 0.45
         self.can_rest = self.gravity == 0.0
 
+        # Gravity compensation, which actuators provide where joints say so.
+        self.is_compensated = self.gravity > 0.0 and self.chance(0.3)
+
     def chance(self, probability: float) -> bool:
         """True with a probability."""
         return bool(self.rng.random() < probability)
@@ -176,7 +179,8 @@ class _Builder:
         """Settings of the engine."""
         integrator = str(self.rng.choice(INTEGRATORS))
         cone = str(self.rng.choice(["pyramidal", "elliptic"]))
-        self.features.append(f"{integrator} {self.timestep:g} s, gravity {self.gravity:g}")
+        gravity = f"gravity {self.gravity:g}{', compensated' * self.is_compensated}"
+        self.features.append(f"{integrator} {self.timestep:g} s, {gravity}")
         return (
             f'  <option timestep="{self.timestep}" integrator="{integrator}" cone="{cone}" '
             f'gravity="0 0 {-self.gravity:.17g}"/>\n'
@@ -235,8 +239,9 @@ class _Builder:
         thin = 0.05 * link.mass * link.length**2
         solid = "" if self.collides else ' contype="0" conaffinity="0"'
         size = link.length * rng.uniform(0.05, 0.12)
+        lifted = ' gravcomp="1"' if self.is_compensated else ""
         return (
-            f'    <body name="{name}" pos="{place:.17g} 0 0"{turn}>\n'
+            f'    <body name="{name}" pos="{place:.17g} 0 0"{turn}{lifted}>\n'
             f'      <inertial pos="{0.5 * link.length:.17g} 0 0" mass="{link.mass:.17g}" '
             f'diaginertia="{thin:.17g} {2 * thin:.17g} {2 * thin:.17g}"/>\n'
             f'      <joint name="{link.name}"{words_of(self._joint(i))}/>\n'
@@ -254,6 +259,8 @@ class _Builder:
             if self.is_loop:
                 axis = np.array([0.0, 1.0, 0.0])
             attributes["axis"] = " ".join(f"{number:.17g}" for number in axis)
+        if self.is_compensated and link.kind != "free" and self.chance(0.7):
+            attributes["actuatorgravcomp"] = "true"
         rate = float(rng.choice([0.1, 1.0, 5.0]))
         attributes["damping"] = f"{link.inertia * rate:.17g}"
         if link.kind != "free":

@@ -99,6 +99,8 @@ def play(
     ranges: dict[tuple[str, str], Range],
     period: float,
     feedback: bool = False,
+    *,
+    ignored: tuple[tuple[str, str], ...] = (),
 ) -> Excess:
     """Play the rows from the state of the first one, and observe every engine step.
 
@@ -110,6 +112,7 @@ def play(
             distance of two geoms.
         period: Time from row to row, over which the rate of a control is taken [s].
         feedback: True adds the gains times the deviation from the planned state.
+        ignored: Pairs of bodies whose distance does not matter.
 
     Returns:
         The largest excess beyond every limit.
@@ -118,7 +121,7 @@ def play(
     data, after = mujoco.MjData(model), mujoco.MjData(model)
     layout = Layout.of(model)
     least = ranges.get(("clearance", NEAREST))
-    proximity = None if least is None else Proximity(model, 2.0 * least[0])
+    proximity = None if least is None else Proximity(model, 2.0 * least[0], ignored)
     start = layout.planned(rows[0])
     data.qpos[:], data.qvel[:], data.act[:] = start
     before: np.ndarray | None = None
@@ -273,17 +276,29 @@ class Proximity:
     distance.
     """
 
-    def __init__(self, model: mujoco.MjModel, reach: float) -> None:
-        """Prepare the copy. reach: distance below which geoms are seen [m]."""
+    def __init__(
+        self, model: mujoco.MjModel, reach: float, ignored: tuple[tuple[str, str], ...]
+    ) -> None:
+        """Prepare the copy.
+
+        Args:
+            model: The model.
+            reach: Distance below which geoms are seen [m].
+            ignored: Pairs of bodies whose distance does not matter.
+        """
         self._model = copy.copy(model)
         self._model.geom_margin[:] = reach
         self._model.geom_gap[:] = 0.0
         self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         self._data = mujoco.MjData(self._model)
         self._reach = reach
+        self._ignored = [{model.body(name).id for name in pair} for pair in ignored]
 
     def __call__(self, qpos: np.ndarray) -> float:
         """Smallest distance at a position [m], the reach where nothing is nearer."""
         self._data.qpos[:] = qpos
         mujoco.mj_fwdPosition(self._model, self._data)
-        return float(self._data.contact.dist.min(initial=self._reach))
+        contacts = self._data.contact
+        bodies = self._model.geom_bodyid[contacts.geom]
+        counted = [set(pair) not in self._ignored for pair in bodies.tolist()]
+        return float(contacts.dist[counted].min(initial=self._reach))
