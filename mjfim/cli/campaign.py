@@ -36,6 +36,7 @@ from mjfim.output.campaign_settings import (
 )
 from mjfim.output.summaries import describe_campaign
 from mjfim.output.text import render
+from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
@@ -177,11 +178,11 @@ class CampaignRun:
         """
 
         def record(design: Design, number: int) -> Recording:
-            """Simulate the recording of a round, and write it."""
-            system = self.task.system
+            """Simulate the recording of a round, write it, and read it as --resume does."""
+            system, path = self.task.system, self.folder.round(number) / "recording.csv"
             recording = simulate_system(system, design.trajectory, seed + number - 1)
-            write_recording(self.folder.round(number) / "recording.csv", recording, system)
-            return recording
+            write_recording(path, recording, system)
+            return read_recording(path, system.channels)
 
         settings = campaign_settings(self.task.experiment, seed)
 

@@ -112,9 +112,10 @@ def design(
         render(describe_design(result, task.system.units)),
     )
     if found is not None:
+        errors.print(f"mjfim: {found}" if not found.reached else f"{found}", markup=False)
+    if found is not None and found.reached:
         errors.print(
-            f"{found}\nto use this horizon further, state horizon = {found.horizon:g} in "
-            f"{experiment}",
+            f"to use this horizon further, state horizon = {found.horizon:g} in {experiment}",
             markup=False,
         )
     errors.print(f"wrote {output}/ (to see the motion: mjfim replay {output})", markup=False)

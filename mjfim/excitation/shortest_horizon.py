@@ -83,7 +83,7 @@ class ShortestExperiment(SavedRecord):
 
     Attributes:
         experiment: The experiment as stated, with its new horizon and those repeats that divide it.
-        design: Its design, which reaches every target.
+        design: Its design, which reaches every target where `reached` is true.
         tried: All durations in the order in which they were tried.
         tolerance: Largest difference of the horizon from the shortest possible one, where `closed`
             is true [s].
@@ -106,6 +106,14 @@ class ShortestExperiment(SavedRecord):
         return float(self.experiment.horizon or 0.0)
 
     @property
+    def reached(self) -> bool:
+        """True where the design reaches every target.
+
+        False only where the search was stopped before any duration reached them.
+        """
+        return any(tried.reached for tried in self.tried)
+
+    @property
     def missed(self) -> Tried | None:
         """The longest of the shorter durations that do not reach the targets."""
         missing = [tried for tried in self.tried if not tried.reached]
@@ -126,6 +134,13 @@ class ShortestExperiment(SavedRecord):
         }
 
     def __str__(self) -> str:
+        if not self.reached:
+            closest = min(self.tried, key=lambda tried: tried.ratio)
+            return (
+                "the search was interrupted before any horizon reached the wanted accuracy; the "
+                f"best so far is {closest}"
+            )
+
         below = "nothing shorter was tried"
         if self.missed is not None:
             below = f"too short is {self.missed}"
@@ -166,12 +181,13 @@ def shortest_experiment(
         stop: Token that ends the search with the shortest experiment so far, as Ctrl-C does.
 
     Returns:
-        The shortest experiment.
+        The shortest experiment. If the search was stopped before any duration reached the targets,
+        that with the smallest ratio of a standard deviation to its target.
 
     Raises:
         OutOfReachError: Even the longest horizon does not reach the targets.
         ExperimentError: No parameter states a target, or an argument is out of range.
-        NoResultError: The search was stopped before any duration reached the targets.
+        NoResultError: The search was stopped before there was any design.
     """
     if tolerance is not None and not tolerance > 0.0:
         raise ExperimentError(f"shortest_experiment: tolerance {tolerance:g} s; it must be > 0")
@@ -229,21 +245,33 @@ class _HorizonSearch:
         largest = self.grid.round_down(longest * rate)
         first = min(self.grid.round_up(self.base.samples), largest)
         found, below = smallest_feasible(self.ratio, first, largest, self.grid, self.slack)
-        if found is None and self.stop.requested:
-            raise NoResultError("stopped before any duration reached the wanted accuracy")
+        has_reached = found is not None
         if found is None:
-            self._raise_out_of_reach(largest)
+            found = self._best_so_far(largest)
 
         # The bracket is closed where its lower end was tried, or where no shorter design exists.
-        is_shortest = found <= self.grid.minimum
+        is_shortest = has_reached and found <= self.grid.minimum
         is_narrow = below is not None and found - below <= self.slack(found)
         return ShortestExperiment(
             experiment=self.at(found),
             design=self.designs[found],
             tried=tuple(self.tried.values()),
             tolerance=self.slack(found) / rate,
-            closed=is_shortest or is_narrow,
+            closed=(is_shortest or is_narrow) and not self.stop.requested,
         )
+
+    def _best_so_far(self, largest: int) -> int:
+        """Number of samples whose design is closest to the targets, of a search that was stopped.
+
+        Raises:
+            OutOfReachError: The search was not stopped.
+            NoResultError: There is no design.
+        """
+        if not self.stop.requested:
+            self._raise_out_of_reach(largest)
+        if not self.designs:
+            raise NoResultError("stopped before there was a design")
+        return min(self.designs, key=lambda samples: self.tried[samples].ratio)
 
     def slack(self, samples: int) -> int:
         """Tolerance at a number of samples [samples].
@@ -266,7 +294,7 @@ class _HorizonSearch:
 
     def ratio(self, samples: int) -> float | None:
         """Largest ratio of a predicted to a target standard deviation; None if stopped early."""
-        tried = self._try(samples)
+        tried = None if self.stop.requested else self._try(samples)
         if tried is None:
             return None
 
@@ -290,7 +318,7 @@ class _HorizonSearch:
         the first one does not reach the targets.
 
         Returns:
-            The better outcome; None where a design was stopped.
+            The better outcome; None where the first design was stopped.
         """
         near = min(self.designs, key=lambda n: abs(np.log(n / samples)), default=None)
         tried = self._design(samples, near)
@@ -299,7 +327,7 @@ class _HorizonSearch:
 
         again = self._design(samples, None)
         if again is None:
-            return None
+            return tried
         return again if again.ratio <= tried.ratio else tried
 
     def _design(self, samples: int, near: int | None) -> Tried | None:
@@ -325,7 +353,7 @@ class _HorizonSearch:
                 budget=design_budget(task, self.stop),
             )
             if design.status is Status.INTERRUPTED:
-                return None
+                return self._interrupted(samples, design)
             require_reachable(task, design, self.targets)
         except MjfimError as error:
             # An error at the first horizon ends the search; later ones only exclude their horizon.
@@ -341,6 +369,22 @@ class _HorizonSearch:
         self._keep_better(samples, design, ratio)
         name = task.parameters.names[parameter]
         return Tried(horizon=horizon, ratio=ratio, parameter=name)
+
+    def _interrupted(self, samples: int, design: Design) -> Tried | None:
+        """Use the design of a number of samples whose search was stopped.
+
+        Returns:
+            The outcome where the design keeps the limits and reaches the targets, or where no
+            earlier design has an outcome; else None.
+        """
+        is_feasible = all(margin >= 0.0 for margin in design.limits.values())
+        ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
+        if not is_feasible or (not ratio <= 1.0 and self.designs):
+            return None
+
+        self._keep_better(samples, design, ratio)
+        name = self.base.parameters.names[parameter]
+        return Tried(horizon=samples / self.experiment.rate, ratio=ratio, parameter=name)
 
     def _keep_better(self, samples: int, design: Design, ratio: float) -> None:
         """Keep a design where it has the smallest ratio so far for its number of samples."""

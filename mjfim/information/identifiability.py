@@ -5,6 +5,7 @@ Random trajectories show whether another control would help.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -133,7 +134,12 @@ class IdentifiabilityTest:
         """(n, p) whitened rows of G at the measured samples."""
         return self.noise.whitened_rows(sensitivity.G)
 
-    def along(self, trajectory: Trajectory, sensitivity: Sensitivity) -> Identifiability:
+    def along(
+        self,
+        trajectory: Trajectory,
+        sensitivity: Sensitivity,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Identifiability:
         """Test identifiability along a trajectory.
 
         Random trajectories are tested only if this trajectory leaves a doubt.
@@ -141,6 +147,7 @@ class IdentifiabilityTest:
         Args:
             trajectory: The trajectory.
             sensitivity: Its sensitivities to the parameters.
+            stop: Asked before every random trajectory; true leaves out the rest of them.
 
         Returns:
             The null spaces.
@@ -154,9 +161,15 @@ class IdentifiabilityTest:
             return _with_groups(self, quick, quick)
 
         J, error = _rows_and_error(self, trajectory, sensitivity)
-        return _identifiability(self, trajectory, J, error, single_steps)
+        return _identifiability(self, trajectory, J, error, single_steps, stop)
 
-    def of_rows(self, trajectory: Trajectory, J: Array, error: Array) -> Identifiability:
+    def of_rows(
+        self,
+        trajectory: Trajectory,
+        J: Array,
+        error: Array,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Identifiability:
         """Test identifiability from rows of G.
 
         Random trajectories are tested only if these rows leave a doubt.
@@ -165,13 +178,13 @@ class IdentifiabilityTest:
             trajectory: One of the trajectories to which the rows belong.
             J: (n, p) whitened rows of G.
             error: (n, p) their change with a longer difference step.
+            stop: Asked before every random trajectory; true leaves out the rest of them.
 
         Returns:
             The null spaces.
         """
-        return _identifiability(
-            self, trajectory, J, error, _single_step_null_space(self, [trajectory])
-        )
+        single_steps = _single_step_null_space(self, [trajectory])
+        return _identifiability(self, trajectory, J, error, single_steps, stop)
 
 
 def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
@@ -202,6 +215,7 @@ def _identifiability(
     J: Array,
     error: Array,
     single_steps: Array | None,
+    stop: Callable[[], bool],
 ) -> Identifiability:
     """Null space of given rows, and the part of it that remains with random trajectories.
 
@@ -211,18 +225,19 @@ def _identifiability(
         J: (n, p) whitened rows of G.
         error: (n, p) their change with a longer difference step.
         single_steps: (t, k) directions without effect on single steps, or None.
+        stop: Asked before every random trajectory; true leaves out the rest of them.
     """
     along_trajectory = _null_space(test, [J], [error], single_steps)
-    if not along_trajectory.count:
+    if not along_trajectory.count or stop():
         return _with_groups(test, along_trajectory, along_trajectory)
 
-    tried = list(test.probes(PROBES))
+    tried = list(itertools.takewhile(lambda _: not stop(), test.probes(PROBES)))
     known = _single_step_null_space(test, [trajectory, *tried])
     stack, errors = [J], [error]
 
     # Whole motions are differentiated only if single steps do not explain the null space.
     if known is None or along_trajectory.count > known.shape[1]:
-        for probe in tried:
+        for probe in itertools.takewhile(lambda _: not stop(), tried):
             fine = test.plant.derivatives.sensitivity(test.theta, probe)
             if fine is None:
                 continue

@@ -174,6 +174,7 @@ class CampaignFolder:
                 theta=design.theta,
                 predicted=np.where(np.isnan(std), np.inf, std),
                 control=trajectory.ctrl,
+                design=design,
             )
 
     # ---- additions to the folder

@@ -736,6 +736,9 @@ def _eigenvalue_sentence(check: Check) -> str:
 def _self_test_sentence(check: Check) -> str:
     """Return the result of the derivative self-test."""
     test = check.self_test
+    if not test.finished:
+        return "derivative self-test not finished, because the check was interrupted"
+
     passed = "passed" if test.passed else "FAILED"
     agreement = "agree" if test.roughness is None else "disagree"
     return (

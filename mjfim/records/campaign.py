@@ -41,12 +41,14 @@ class EarlierRound:
         theta: (p,) parameters at which the round was designed [theta-unit]; None without a design.
         predicted: (p,) predicted standard deviations [theta-unit]; None without a design.
         control: (N, nu) control of the design [unit of the actuator]; None without a design.
+        design: The design, where all of it is known.
     """
 
     recordings: tuple[Recording, ...]
     theta: Array | None = None
     predicted: Array | None = None
     control: Array | None = None
+    design: Design | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,7 +63,7 @@ class Round:
         control: (N, nu) control of the design [unit of the actuator].
         recordings: Recordings of this round.
         estimate: Estimate from all recordings up to this round.
-        design: The design; None if it was made in an earlier session.
+        design: The design; None where it is not known.
         warnings: Sentences for the user.
     """
 
@@ -142,7 +144,7 @@ class Campaign(SavedRecord):
 
     @property
     def designs(self) -> tuple[Design, ...]:
-        """The designs made in this session."""
+        """The designs of the rounds, where they are known."""
         return tuple(r.design for r in self.rounds if r.design is not None)
 
     @property

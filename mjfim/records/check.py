@@ -141,18 +141,21 @@ class SelfTest:
         recursion: Difference between psi by rollouts and psi by `psi_{k+1} = A psi + E`.
         slope: Difference between DJ . zeta and finite differences of J(P(xi + gamma zeta)).
         likely_cause: Likely cause, in words, if `recursion` or `slope` is too large; else empty.
+        finished: False where the test was stopped; errors that were not computed are NaN.
     """
 
     roughness: Roughness | None
     recursion: float
     slope: float
     likely_cause: str = ""
+    finished: bool = True
 
     @property
     def passed(self) -> bool:
         """True if all derivatives agree."""
         return (
-            self.roughness is None
+            self.finished
+            and self.roughness is None
             and not self.recursion > RECURSION_TOLERANCE
             and not self.slope > SLOPE_TOLERANCE
         )
@@ -161,6 +164,7 @@ class SelfTest:
         """Return the contents of `self_test` in check.json."""
         return {
             "passed": self.passed,
+            "finished": self.finished,
             "recursion": self.recursion,
             "slope": self.slope,
             "suspect": self.likely_cause,
@@ -189,6 +193,8 @@ class Check(SavedRecord):
         verdict: Sentences for the user.
         combined: Accuracies of the identifiable combinations; their `std_initial` and `std_final`
             are equal.
+        missing: What was not computed because the check was stopped, in words; empty where it is
+            complete.
     """
 
     source: str
@@ -204,6 +210,7 @@ class Check(SavedRecord):
     self_test: SelfTest
     verdict: tuple[str, ...]
     combined: tuple[CombinationAccuracy, ...] = ()
+    missing: tuple[str, ...] = ()
 
     file_stem: ClassVar[str] = "check"
     made_by: ClassVar[str] = "`mjfim check EXPERIMENT -o DIR`"
@@ -238,7 +245,8 @@ class Check(SavedRecord):
 
         stated = [row for row in self.rows if row.stated and not row.nuisance]
         reached = all(row.repetitions == 1 for row in stated)
-        return self.self_test.passed and separable and not self.not_excited and reached
+        passed = self.self_test.passed and not self.missing
+        return passed and separable and not self.not_excited and reached
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of check.json."""
@@ -251,6 +259,8 @@ class Check(SavedRecord):
         ]
         return {
             "ok": self.ok,
+            "complete": not self.missing,
+            "missing": list(self.missing),
             "verdict": list(self.verdict),
             "source": self.source,
             "horizon": self.horizon,

@@ -139,7 +139,7 @@ class _CampaignRun:
             The reason for which the campaign ended.
         """
         for earlier in done:
-            if not self._add_round(earlier):
+            if not self._add_round(earlier, earlier.design):
                 return CampaignStatus.INTERRUPTED
 
         while not self._targets_reached() and len(self.rounds) < self.count:
@@ -236,7 +236,7 @@ class _CampaignRun:
 
         Args:
             recorded: Recordings of the round, and what is known about their design.
-            design: The design, where it was made in this campaign.
+            design: The design, where it is known.
             remarks: Remarks about the design.
 
         Returns:

@@ -5,12 +5,13 @@ It needs no fit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
@@ -59,6 +60,7 @@ def check(
     trajectory: Trajectory | None = None,
     *,
     threads: int | None = None,
+    stop: StopToken | None = None,
 ) -> Check:
     """Check which parameters can be identified, at the parameter values that a design uses.
 
@@ -69,6 +71,7 @@ def check(
         recordings: Recordings that are checked instead of the initial control.
         trajectory: Trajectory, of a design for example, whose control is checked instead.
         threads: Threads of MuJoCo; None for all cores.
+        stop: Ends the check early, as Ctrl-C does; the record then says what is missing.
 
     Raises:
         RecordingError: Recordings are unusable, or given together with a trajectory.
@@ -78,14 +81,16 @@ def check(
         raise RecordingError("check either recordings or a designed trajectory, not both")
 
     if recordings:
-        return check_recordings(System.resolve(experiment, threads=threads), recordings)
+        return check_recordings(System.resolve(experiment, threads=threads), recordings, stop)
 
     require_design_keys(experiment, "check without recordings")
-    return check_task(DesignTask.resolve(experiment, threads=threads), trajectory)
+    return check_task(DesignTask.resolve(experiment, threads=threads), trajectory, stop)
 
 
 @one_blas_thread()
-def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
+def check_task(
+    task: DesignTask, trajectory: Trajectory | None = None, stop: StopToken | None = None
+) -> Check:
     """Check the initial control of a task, or the control of a trajectory.
 
     See `check`.
@@ -98,19 +103,26 @@ def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
-    identifiability = task.identifiability_test.along(curve, point.sensitivity)
-    return _Assessment(
-        task=task,
-        source=source,
-        duration=float(curve.t[-1]),
-        identifiability=identifiability,
-        data=_common_information(task, [point.information - task.information.prior]),
-        tested=_test_derivatives(task, problem, point, identifiability),
-    ).check()
+    # From here on, there is something to report when the check is stopped.
+    with stop_on_interrupt(stop) as token:
+        stage = _Stages(token)
+        test = task.identifiability_test
+        identifiability = stage.identifiability(test.along, curve, point.sensitivity)
+        return _Assessment(
+            task=task,
+            source=source,
+            duration=float(curve.t[-1]),
+            identifiability=identifiability,
+            data=_common_information(task, [point.information - task.information.prior]),
+            tested=stage.test_derivatives(task, problem, point, identifiability),
+            missing=tuple(stage.missing),
+        ).check()
 
 
 @one_blas_thread()
-def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
+def check_recordings(
+    system: System, recordings: Sequence[Recording], stop: StopToken | None = None
+) -> Check:
     """Check which parameters recordings identify; derivatives are tested along the longest one.
 
     See `check`.
@@ -127,17 +139,22 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     # Rows of G at the times of the measurements, and the error of their finite differences.
     recorded = fit.sensitivity_rows(fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
-    identifiability = task.identifiability_test.of_rows(task.initial, J, error)
-
     count = len(recordings)
-    return _Assessment(
-        task=task,
-        source=f"{count} recording{'s' if count > 1 else ''}",
-        duration=float(sum(recording.t[-1] for recording in fit.recordings)),
-        identifiability=identifiability,
-        data=_common_information(task, [rows.T @ rows for rows, _ in recorded]),
-        tested=_test_derivatives(task, problem, point, identifiability),
-    ).check()
+
+    # From here on, there is something to report when the check is stopped.
+    with stop_on_interrupt(stop) as token:
+        stage = _Stages(token)
+        test = task.identifiability_test
+        identifiability = stage.identifiability(test.of_rows, task.initial, J, error)
+        return _Assessment(
+            task=task,
+            source=f"{count} recording{'s' if count > 1 else ''}",
+            duration=float(sum(recording.t[-1] for recording in fit.recordings)),
+            identifiability=identifiability,
+            data=_common_information(task, [rows.T @ rows for rows, _ in recorded]),
+            tested=stage.test_derivatives(task, problem, point, identifiability),
+            missing=tuple(stage.missing),
+        ).check()
 
 
 def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
@@ -151,13 +168,49 @@ def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, Desig
     return problem, problem.point(curve, CENTRAL_DIFFERENCES)
 
 
-def _test_derivatives(
-    task: DesignTask, problem: DesignProblem, point: DesignPoint, identifiability: Identifiability
-) -> SelfTest:
-    """Test the derivatives at a point, with a criterion of the identifiable combinations."""
-    information = replace(problem.information, basis=identifiability.basis)
-    visible = replace(problem, information=information)
-    return self_test(task, visible, visible.reevaluated(point))
+class _Stages:
+    """Stages of a check that are left out after a request to stop.
+
+    Attributes:
+        missing: What was left out, in words.
+    """
+
+    def __init__(self, stop: StopToken) -> None:
+        self.missing: list[str] = []
+        self._stop = stop
+
+    def identifiability(
+        self, test: Callable[..., Identifiability], *arguments: object
+    ) -> Identifiability:
+        """Test identifiability; random controls are tried only where there is a doubt.
+
+        Args:
+            test: The test, which asks before every random control whether it has to stop.
+            *arguments: Its arguments.
+        """
+        found = test(*arguments, self._is_stopped)
+        if found.along_trajectory.count and self._is_stopped():
+            self.missing.append("what other controls would show")
+        return found
+
+    def test_derivatives(
+        self,
+        task: DesignTask,
+        problem: DesignProblem,
+        point: DesignPoint,
+        identifiability: Identifiability,
+    ) -> SelfTest:
+        """Test the derivatives at a point, with a criterion of the identifiable combinations."""
+        information = replace(problem.information, basis=identifiability.basis)
+        visible = replace(problem, information=information)
+        tested = self_test(task, visible, visible.reevaluated(point), self._is_stopped)
+        if not tested.finished:
+            self.missing.append("the test of the derivatives")
+        return tested
+
+    def _is_stopped(self) -> bool:
+        """Whether a stop is requested."""
+        return self._stop.requested
 
 
 def _common_information(task: DesignTask, matrices: Sequence[Array]) -> Array:
@@ -183,6 +236,7 @@ class _Assessment:
         identifiability: Combinations that can be identified.
         data: (p, p) information of the checked data [1 / theta-unit^2], without priors.
         tested: Test of the derivatives.
+        missing: What was left out after a request to stop, in words.
     """
 
     task: DesignTask
@@ -191,6 +245,7 @@ class _Assessment:
     identifiability: Identifiability
     data: Array
     tested: SelfTest
+    missing: tuple[str, ...]
 
     def check(self) -> Check:
         """The record for the user."""
@@ -225,6 +280,7 @@ class _Assessment:
             confounded=confounded,
             tested=self.tested,
             source=self.source,
+            missing=self.missing,
         )
         return Check(
             source=self.source,
@@ -240,6 +296,7 @@ class _Assessment:
             self_test=self.tested,
             verdict=tuple(verdict.sentences()),
             combined=combined,
+            missing=self.missing,
         )
 
     def _information(self) -> FisherInformation:
@@ -369,6 +426,7 @@ class _Verdict:
         confounded: Strongly correlated pairs.
         tested: Test of the derivatives.
         source: Name of the checked data.
+        missing: What was left out after a request to stop, in words.
     """
 
     rows: Sequence[ParameterCheck]
@@ -377,9 +435,12 @@ class _Verdict:
     confounded: Sequence[ConfoundedPair]
     tested: SelfTest
     source: str
+    missing: Sequence[str]
 
     def sentences(self) -> Iterator[str]:
         """Sentences for the user, the most serious first."""
+        if self.missing:
+            yield f"interrupted, so this check is incomplete; it lacks {join_names(self.missing)}"
         yield from self._about_derivatives()
         yield from self._about_identifiability()
 
@@ -396,7 +457,7 @@ class _Verdict:
         tested = self.tested
         if tested.roughness is not None:
             yield f"{tested.roughness}"
-        elif not tested.passed:
+        elif tested.finished and not tested.passed:
             yield (
                 f"the derivatives do not agree (psi recursion {tested.recursion:.1e}, slope "
                 f"{tested.slope:.1e}); {tested.likely_cause}. Shorten horizon or timestep, or "
@@ -448,7 +509,7 @@ class _Verdict:
                 f"{self.source} alone; the worst is {worst.name}: {needed} {worst.wanted:.3g}. A "
                 "designed excitation (`mjfim design`) needs fewer"
             )
-        elif self.tested.passed and not unknown and not self.not_excited:
+        elif self.tested.passed and not self.missing and not unknown and not self.not_excited:
             yield (
                 f"every identifiable parameter reaches its wanted sigma with {self.source}: "
                 "nothing more is needed"

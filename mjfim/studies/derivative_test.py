@@ -7,6 +7,7 @@ projection operator.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -32,13 +33,19 @@ SLOPE_STEPS = (1e-3, 1e-4)
 LEAST_SLOPE = 1e-300
 
 
-def self_test(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> SelfTest:
+def self_test(
+    task: DesignTask,
+    problem: DesignProblem,
+    point: DesignPoint,
+    stop: Callable[[], bool] = lambda: False,
+) -> SelfTest:
     """Test the derivatives about one trajectory.
 
     Args:
         task: Task whose model is tested.
         problem: Cost whose slope is tested.
         point: Trajectory with the cost there, computed with central differences.
+        stop: Asked before each of the three tests; true leaves out the rest of them.
 
     Raises:
         SimulationDivergedError: The trajectory diverges when the parameters change a little.
@@ -48,14 +55,19 @@ def self_test(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> S
         raise SimulationDivergedError("the trajectory diverges when the parameters change a little")
 
     model = task.system.model_at(task.theta)
+    tested = SelfTest(roughness=None, recursion=np.nan, slope=np.nan, finished=False)
+    if stop():
+        return tested
     rough = roughness(
         task.plant, task.system.noise, model, task.theta, trajectory, point.sensitivity
     )
-    tested = SelfTest(
-        roughness=rough,
-        recursion=recursion_error(task, trajectory, point.sensitivity),
-        slope=slope_error(task, problem, point),
-    )
+    tested = replace(tested, roughness=rough)
+    if stop():
+        return tested
+    tested = replace(tested, recursion=recursion_error(task, trajectory, point.sensitivity))
+    if stop():
+        return tested
+    tested = replace(tested, slope=slope_error(task, problem, point), finished=True)
 
     # The result of the roughness test names its cause. The likely cause of any other failure is the
     # first constraint that acts.

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,6 +20,7 @@ from mjfim.output import archive, plots
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, FitEvent
+from mjfim.studies import derivative_test
 from tests.support.cli import (
     DESIGN,
     ESTIMATE_DATA,
@@ -80,6 +82,32 @@ def test_two_presses_during_an_estimation_keep_its_data(
     assert names(tmp_path / "fit") == {*ESTIMATE_DATA, MANIFEST}
     assert "holds only a part of the results" in result.stderr
     assert "interrupted" in read(tmp_path / "fit" / "estimate.json")["status"]
+
+
+def test_an_interrupted_check_is_written_and_marked_as_incomplete(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The accuracies are there; what is missing is named, and nothing is called sufficient."""
+    whole = derivative_test.recursion_error
+
+    def recursion_error(*arguments: Any) -> float:
+        interrupt()
+        return whole(*arguments)
+
+    monkeypatch.setattr(derivative_test, "recursion_error", recursion_error)
+    result = run("check", study, "-o", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "this check is incomplete; it lacks the test of the derivatives" in result.stdout
+    assert "nothing more is needed" not in result.stdout
+
+    found = read(tmp_path / "out" / "check.json")
+    assert (found["ok"], found["complete"]) == (False, False)
+    assert not found["self_test"]["passed"] and not found["self_test"]["finished"]
+    monkeypatch.undo()
+    stated = mjfim.check(mjfim.Experiment.from_file(study))
+    loaded = mjfim.Check.load(tmp_path / "out")
+    assert [row.std for row in loaded.rows] == [row.std for row in stated.rows]
+    assert loaded.missing and not stated.missing
 
 
 @pytest.mark.slow

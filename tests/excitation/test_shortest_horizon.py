@@ -20,6 +20,7 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, fitted
 from mjfim.excitation.target_accuracy import largest_ratio_to_target, target_accuracies
 from mjfim.excitation.task import DesignTask
+from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, StudyEvent
 from tests.support.paths import MODELS
 
@@ -159,6 +160,17 @@ def test_a_stopped_search_returns_the_shortest_so_far() -> None:
     assert found.horizon == 1.5 and not found.closed and "interrupted" in str(found)
     with pytest.raises(NoResultError):
         mjfim.shortest_experiment(wanting(SIGMA), stop=stop)
+
+
+def test_a_search_that_is_stopped_in_its_first_design_returns_it() -> None:
+    """It says how far the design is from the targets."""
+    stop = StopToken()
+    wanted = wanting({"m": 1e-6})
+    found = mjfim.shortest_experiment(wanted, callback=lambda event: stop.request(), stop=stop)
+    assert not found.reached and not found.closed
+    assert found.horizon == 1.5 and found.design.status is Status.INTERRUPTED
+    assert "before any horizon reached the wanted accuracy" in str(found)
+    assert "σ of m is" in str(found)
 
 
 def test_a_duration_without_a_measurement_does_not_reach() -> None:
