@@ -273,6 +273,16 @@ class Limits(Section):
         ),
     )
 
+    @model_validator(mode="after")
+    def _ignored_with_clearance(self) -> Limits:
+        """Refuse pairs that are ignored where distances are not limited."""
+        if self.ignored and self.clearance is None:
+            raise ValueError(
+                "ignored can only be given together with clearance: without it distances are not "
+                "limited"
+            )
+        return self
+
 
 class Boundary(Section):
     """States in which a design begins and ends."""

@@ -155,6 +155,11 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
         ],
         [],
     ),
+    "ignored pairs without a clearance": (
+        '[limits]\nignored = [["cart", "bob"]]',
+        ["limits: ignored can only be given together with clearance"],
+        [],
+    ),
     "a body and itself": (
         '[limits]\nclearance = 0.01\nignored = [["bob", "bob"]]',
         ["limits.ignored: ['bob'] is no pair of bodies"],
