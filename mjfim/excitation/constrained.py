@@ -59,6 +59,8 @@ class ConstrainedSearch:
         variant: Plant on which the search runs; the result is evaluated on the stated plant later.
         threads: Threads for simulations; None for one per core.
         tightening: Share of half of each range that is held back, by kind of constraint.
+        inside_first: Steer the control inside all limits before the cost is minimised, however
+            little it violates them.
     """
 
     experiment: Experiment
@@ -72,6 +74,7 @@ class ConstrainedSearch:
     variant: ModelVariant = RELAXED
     threads: int | None = None
     tightening: Mapping[str, float] = field(default_factory=dict)
+    inside_first: bool = False
 
     def run(self, task: DesignTask | None = None) -> Generator[DesignEvent, None, RunResult]:
         """Run the search.
@@ -170,6 +173,8 @@ class _Search:
             basis=basis,
             regulator=replace(regulator_for(task), feedback_threshold=threshold),
             schedule=order.schedule,
+            other_centres=task.centres[1:],
+            inside_first=order.inside_first,
         )
         return cls(
             order=order,
@@ -186,6 +191,7 @@ class _Search:
         """Yield every iterate and return the best result."""
         result = RunResult(name=self.order.start.name)
         status: Status | None = None
+        best_of_stages: dict[float, Array] = {}
         control = self.task.averaged(self.order.start.control)
 
         # A simulation that diverges ends this search, not those of other initial controls.
@@ -197,6 +203,8 @@ class _Search:
 
                 # The next iterate may take longer than anybody waits for after Ctrl-C.
                 offer_result(replace(result, status=Status.INTERRUPTED))
+                if np.isfinite(result.cost) and result.control is not None:
+                    best_of_stages[iterate.mu] = result.control
                 if iterate.repaired:
                     continue
 
@@ -209,7 +217,8 @@ class _Search:
         except (SimulationDivergedError, np.linalg.LinAlgError):
             status = Status.STALLED
 
-        return replace(result, status=self._final_status(result, status))
+        earlier = tuple(best_of_stages.values())[:-1]
+        return replace(result, status=self._final_status(result, status), earlier=earlier)
 
     def _exact_point(self, iterate: BarrierIterate) -> DesignPoint | None:
         """Point of the iterate with the exact cost over all repetitions; None without a cost."""
@@ -240,7 +249,10 @@ class _Search:
         if not np.isfinite(result.cost):
             return Status.INFEASIBLE
 
-        # The last iterate has no status where the time was used up, or all stages were done.
+        # The last iterate has no status where the budget was used up, or where the last stages
+        # ended outside the limits.
+        if status is None and self.budget.exhausted is None:
+            return Status.BEST_SEEN
         return status or Status.MAX_ITERATIONS
 
     def _row(self, iterate: BarrierIterate, point: DesignPoint | None, steps: int) -> HistoryRow:

@@ -35,20 +35,32 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
     Raises:
         ExperimentError: No control holds the state.
     """
-    plant, space = system.plant, system.space
-    model = plant.model(system.theta)
+    control = least_drift_control(system, state, guess)
+
+    drift = _drift(system, state, control[None])[0]
+    _require_held(system, state, drift, key, place)
+    return control
+
+
+def least_drift_control(system: System, state: Array, guess: Array) -> Array:
+    """Find the control under which a state changes least over one sample.
+
+    It holds the state where any control does.
+
+    Args:
+        system: The system; the plant is taken at its theta.
+        state: (ns,) state.
+        guess: (nu,) control from which the search starts.
+
+    Returns:
+        (nu,) control, which may violate limits.
+    """
     control = np.array(guess)
     steps = RELATIVE_DIFFERENCE * np.maximum(np.abs(control), 1.0)
 
-    def drift(controls: Array) -> Array:
-        """(m, nx) change of the state over a sample under each of (m, nu) controls."""
-        states = np.broadcast_to(state, (len(controls), len(state)))
-        stepped = plant.simulator.step([model], states, controls)
-        return space.minus(stepped.states, state)
-
     for _ in range(NEWTON_STEPS):
         # The drift under the control, and under one control for each component that is moved.
-        rows = drift(np.vstack([control, control + np.diag(steps)]))
+        rows = _drift(system, state, np.vstack([control, control + np.diag(steps)]))
         B = (rows[1:] - rows[0]).T / steps
         if not np.isfinite(B).all():
             break
@@ -56,8 +68,15 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
         # The Gauss-Newton step makes the linearised drift as small as possible.
         control = control - np.linalg.lstsq(B, rows[0])[0]
 
-    _require_held(system, state, drift(control[None])[0], key, place)
     return control
+
+
+def _drift(system: System, state: Array, controls: Array) -> Array:
+    """(m, nx) change of a state over a sample under each of (m, nu) controls."""
+    plant = system.plant
+    states = np.broadcast_to(state, (len(controls), len(state)))
+    stepped = plant.simulator.step([plant.model(system.theta)], states, controls)
+    return np.asarray(system.space.minus(stepped.states, state))
 
 
 def _require_held(system: System, state: Array, drift: Array, key: str, place: str) -> None:

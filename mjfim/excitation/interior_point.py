@@ -7,6 +7,7 @@ tightens the limits of the next stage.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopReason
 from mjfim.excitation.constraints import ConstraintSet
-from mjfim.excitation.feasibility import shrink_until_feasible
+from mjfim.excitation.feasibility import shrink_about_each
 from mjfim.excitation.interior_problem import InteriorPoint, InteriorProblem, values_of
 from mjfim.excitation.objective import DesignProblem
 from mjfim.optimize.projection_operator import Armijo, Iterate, Regulator, optimize
@@ -43,8 +44,11 @@ RELEASE_GAIN = 0.5
 # A stage may take this many times its equal share of the time that is left.
 TIME_SHARE_FACTOR = 1.5
 
-# Largest number of repetitions of the last stage while its result violates a limit.
+# Largest number of repetitions of the last stage after results that violate a limit.
 MAX_REPEATED_STAGES = 3
+
+# Share of the budget after which a run without a feasible iterate continues from a shrunk control.
+PATIENCE_OUTSIDE = 0.5
 
 # Violation of a limit, relative to half of its range, up to which the relaxed barrier makes a
 # control feasible without steering.
@@ -158,12 +162,16 @@ class _StageResult:
     Attributes:
         iterate: Last iterate of the stage, numbered within the stage.
         is_feasible: True where all limits hold along it.
+        was_feasible: True where all limits hold along any iterate of the stage.
         converged: True where the run has converged at it, so that no stage may follow.
+        stalled: True where no step lowers the merit any more, so that no stage may follow.
     """
 
     iterate: Iterate[InteriorPoint]
     is_feasible: bool
+    was_feasible: bool
     converged: bool
+    stalled: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,11 +181,15 @@ class InteriorPointMethod:
     Attributes:
         base: The cost on the plant without clamps.
         constraints: The limits.
-        centre: (nu,) control about which an infeasible control is shrunk [u-unit].
+        centre: (nu,) control about which controls vary [u-unit].
+        other_centres: Further controls, (nu,) each, towards which an infeasible control is shrunk
+            where shrinking towards `centre` does not help [u-unit].
         basis: (N, M) curves whose sums are the allowed deviations of the control from its centre;
             None where the control is free.
         regulator: Gain of the projection operator.
         schedule: Weights of the barrier, and when a stage ends.
+        inside_first: Steer the control inside all limits before the cost is minimised, however
+            little it violates them.
     """
 
     base: DesignProblem
@@ -186,6 +198,8 @@ class InteriorPointMethod:
     basis: Array | None
     regulator: Regulator
     schedule: BarrierSchedule = BarrierSchedule()
+    other_centres: tuple[Array, ...] = ()
+    inside_first: bool = False
 
     def run(self, control: Array, budget: Budget) -> Iterator[BarrierIterate]:
         """Run the method from a control.
@@ -200,17 +214,23 @@ class InteriorPointMethod:
         """
         first = yield from self._find_first_control(control, budget)
 
+        # A run that has to begin inside ends where no control inside was found.
+        is_inside = first.control is not None and self._is_near_feasible(first.control, 0.0)
+        if self.inside_first and not is_inside:
+            return
+
         if first.control is not None and not budget.stop.requested:
             yield from self._minimize(first.control, budget, first.iterations)
 
     def shrink_inside(self, control: Array) -> Array | None:
-        """Shrink a control about the centre until all limits hold strictly.
+        """Shrink a control about one of the centres until all limits hold strictly.
 
         Args:
             control: (N, nu) control [u-unit].
 
         Returns:
-            (N, nu) the shrunk control; None where no factor makes it feasible.
+            (N, nu) the control, shrunk about the first centre for which a factor makes it feasible;
+            None where there is none.
         """
         problem = self._problem_without_cost
 
@@ -221,7 +241,8 @@ class InteriorPointMethod:
                 return None
             return np.asarray(candidate)
 
-        return shrink_until_feasible(control, self.centre, keep_feasible)
+        centres = (self.centre, *map(self._fit_to_basis, self.other_centres))
+        return next(shrink_about_each(control, centres, keep_feasible), None)
 
     # ---- the first control
 
@@ -236,15 +257,17 @@ class InteriorPointMethod:
         fitted = self._fit_to_basis(control)
 
         # A small violation is removed by the relaxed barrier.
-        if self._is_near_feasible(fitted):
+        if self._is_near_feasible(fitted, 0.0 if self.inside_first else MAX_START_VIOLATION):
             return _FirstControl(control=fitted, iterations=0)
 
         shrunk = self.shrink_inside(fitted)
 
         # Steer the control inside; only a few iterations where the shrunk control is feasible.
         longest = MAX_STEERING_ITERATIONS if shrunk is None else MAX_STEERING_TRIAL
+        if not self.inside_first:
+            longest = int(min(budget.max_iterations, longest))
         steered: BarrierIterate | None = None
-        for steered in self._steer_inside(fitted, int(min(budget.max_iterations, longest)), budget):
+        for steered in self._steer_inside(fitted, longest, budget):
             yield steered
 
         if steered is None:
@@ -268,18 +291,23 @@ class InteriorPointMethod:
         return _FirstControl(control=best, iterations=iterations)
 
     def _fit_to_basis(self, control: Array) -> Array:
-        """The nearest control, (N, nu), that the basis can represent."""
+        """The nearest control, (N, nu) or (nu,), that the basis can represent."""
         if self.basis is None:
             return control
 
+        control = np.broadcast_to(control, (len(self.basis), len(self.centre)))
         coefficients = np.linalg.lstsq(self.basis, control - self.centre)[0]
         return np.asarray(self.centre + self.basis @ coefficients)
 
-    def _is_near_feasible(self, control: Array) -> bool:
+    def _is_near_feasible(self, control: Array, violation: float) -> bool:
         """Check whether the relaxed barrier can make a control feasible.
 
-        Constraints on the final state are ignored: their tolerances are narrow, so that even a
-        usable control misses them by many times the tolerance.
+        Constraints on the final state are ignored where a violation is accepted: their tolerances
+        are narrow, so that even a usable control misses them by many times the tolerance.
+
+        Args:
+            control: (N, nu) control [u-unit].
+            violation: Largest violation that is accepted, relative to half of the range.
         """
         values = self._problem_without_cost.point(control).values
         if values is None:
@@ -287,9 +315,9 @@ class InteriorPointMethod:
 
         margins = self.constraints.relative_margins(values)
         return all(
-            margin > -MAX_START_VIOLATION
+            margin > -violation
             for kind, margin in margins.items()
-            if not kind.startswith("end_")
+            if violation == 0.0 or not kind.startswith("end_")
         )
 
     def _steer_inside(
@@ -324,20 +352,26 @@ class InteriorPointMethod:
     def _minimize(
         self, control: Array, budget: Budget, first_index: int
     ) -> Iterator[BarrierIterate]:
-        """Run the stages with falling mu; repeat the last one while its result is infeasible."""
+        """Run the stages with falling mu.
+
+        The last one is repeated until it has converged or the budget is used up, but only a few
+        times while its result is infeasible.
+        """
         weights = self.schedule.barrier_weights()
-        stages = [*weights, *weights[-1:] * MAX_REPEATED_STAGES]
+        infeasible_repeats = 0
 
         # All stages share one direction, because its curvature pairs do not depend on mu.
         direction = self._direction()
         tightening = dict[str, float]()
+        was_feasible = False
 
         point = self._problem(weights[0], self.constraints).point(control)
         if point.values is None:
             # The simulation diverges when the parameters change slightly.
             return
 
-        for number, mu in enumerate(stages):
+        for number in itertools.count():
+            mu = weights[min(number, len(weights) - 1)]
             problem = self._problem(mu, self.constraints.tightened(tightening))
             stage = self._stage(problem, len(weights) - number, budget, first_index)
             ended = yield from self._run_stage(stage, problem.reevaluate(point), direction)
@@ -345,17 +379,26 @@ class InteriorPointMethod:
                 return
 
             point = ended.iterate.point
+            was_feasible = was_feasible or ended.was_feasible
             first_index += ended.iterate.index
             budget.spend(iterations=ended.iterate.index)
             reason = budget.exhausted
 
             # Repair an infeasible result, since no better one may follow. After Ctrl-C this would
             # take too long.
+            repaired = None
             if not ended.is_feasible and reason is not StopReason.REQUESTED:
-                yield from self._repair(problem, ended.iterate, first_index)
+                repaired = yield from self._repair(problem, ended.iterate, first_index)
 
-            if reason is not None or (stage.is_last and ended.is_feasible):
+            infeasible_repeats += stage.is_last and not ended.is_feasible
+            if reason is not None or ended.stalled or infeasible_repeats > MAX_REPEATED_STAGES:
                 return
+
+            # Use the rest of the budget inside the limits where no iterate has been there.
+            is_late = budget.used >= PATIENCE_OUTSIDE
+            if repaired is not None and is_late and not was_feasible:
+                point = repaired
+                direction = self._direction()
 
             # Tighten violated limits, so that the result of the next stage keeps them.
             if mu <= TIGHTENING_MU:
@@ -390,6 +433,7 @@ class InteriorPointMethod:
         schedule = self.schedule
         problem = stage.problem
         values: list[float] = []
+        was_feasible = False
 
         # Continue below a coarser stated tolerance: a smaller slope also means a smaller violation.
         tolerance = min(schedule.tolerance, BarrierSchedule.tolerance)
@@ -406,6 +450,7 @@ class InteriorPointMethod:
         for iterate in iterates:
             margins = self.constraints.margins(values_of(iterate.point))
             is_feasible = self.constraints.is_feasible(values_of(iterate.point))
+            was_feasible = was_feasible or is_feasible
 
             # A status ends the run only in the last stage, and only where the stated limits hold.
             status = Status.CONVERGED if iterate.slope <= schedule.tolerance else iterate.status
@@ -430,27 +475,30 @@ class InteriorPointMethod:
         return _StageResult(
             iterate=iterate,
             is_feasible=is_feasible,
+            was_feasible=was_feasible,
             converged=status is Status.CONVERGED,
+            stalled=status is Status.STALLED,
         )
 
     def _repair(
         self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], index: int
-    ) -> Iterator[BarrierIterate]:
-        """Shrink an infeasible iterate until all limits hold, and yield it where that succeeds."""
+    ) -> Generator[BarrierIterate, None, InteriorPoint | None]:
+        """Shrink an infeasible iterate until all limits hold; yield and return it if possible."""
         control = self.shrink_inside(iterate.point.ctrl)
         if control is None:
-            return
+            return None
 
         stated = replace(problem, constraints=self.constraints)
         point = stated.point(control)
         if point.values is None:
-            return
+            return None
 
         repaired = replace(
             iterate, index=index, point=point, value=stated.value(point), gamma=0.0, status=None
         )
         margins = self.constraints.margins(point.values)
         yield BarrierIterate(iterate=repaired, mu=problem.mu, margins=margins, repaired=True)
+        return point
 
     # ---- problems and direction of the stages
 

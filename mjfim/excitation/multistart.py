@@ -8,10 +8,11 @@ is evaluated; then it is optimised again within tighter limits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.excitation.constrained import ConstrainedSearch, run_in_worker
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.feasibility import shrink_until_feasible
+from mjfim.excitation.feasibility import shrink_about_each
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
 from mjfim.excitation.levels import DescentLevel
@@ -56,6 +57,22 @@ TIGHTENED_RUN_MU = 1e-3
 
 # Largest number of iterations of a run within tighter limits.
 TIGHTENED_RUN_ITERATIONS = 60
+
+# Least number of iterations of the run that follows where no start found a feasible motion; it is
+# never larger than that of the experiment.
+RESCUE_ITERATIONS = 60
+
+
+class _Feasible(NamedTuple):
+    """A control with its cost on the unmodified model.
+
+    Attributes:
+        cost: J; infinite where the control violates a limit.
+        control: (N, nu) control [u-unit].
+    """
+
+    cost: float
+    control: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,23 +165,115 @@ class Multistart:
                 if np.isfinite(result.cost):
                     results[winner] = _append_run(results[winner], result)
 
-        return self._repaired(results)
-
-    def _repaired(self, results: Sequence[RunResult]) -> list[RunResult]:
-        """Shrink controls that violate a limit where that gives a feasible result."""
-        results = list(results)
-
-        # Shrink the control where tighter limits did not help.
-        violated = self._violated_by_winner(results)
-        if violated is not None:
-            winner, _ = violated
-            results[winner] = self._shrink(results[winner])
-
-        if any(np.isfinite(result.cost) for result in results):
+        results = self._repaired(results)
+        if any(np.isfinite(result.cost) for result in results) or self.budget.stop.requested:
             return results
 
-        # No start found anything feasible: a smaller motion about the holding control may be.
-        return [self._rescued(result) for result in results]
+        # No start found anything feasible.
+        return (yield from self._rescued(results))
+
+    def _repaired(self, results: Sequence[RunResult]) -> list[RunResult]:
+        """Make sure that the best result keeps all limits of the unmodified model.
+
+        A winner that violates a limit is replaced by the best feasible control that its start has
+        seen, or counts as infeasible; then the next best result has to be feasible.
+        """
+        results = list(results)
+        while True:
+            violated = self._violated_by_winner(results)
+            if violated is None:
+                return results
+
+            winner, _ = violated
+            results[winner] = self._best_feasible(results[winner])
+
+    def _best_feasible(self, result: RunResult) -> RunResult:
+        """A result with its best feasible control: a shrunk one, or that of an earlier stage."""
+        found = [self._shrink(np.asarray(result.control))]
+        found += [_Feasible(self._cost_on_stated_plant(c), c) for c in result.earlier]
+
+        best = min(found, key=lambda feasible: feasible.cost)
+        if not np.isfinite(best.cost):
+            return replace(result, cost=np.inf, status=Status.INFEASIBLE)
+        return replace(result, control=best.control, cost=best.cost, status=Status.BEST_SEEN)
+
+    # ---- the search for a feasible motion
+
+    def _rescued(self, results: Sequence[RunResult]) -> Runs:
+        """Search for a feasible motion where no start found one, and optimise from there.
+
+        Each control is shrunk about the controls that hold the start, even when the time is used
+        up. Where that does not help, these are steered inside the limits.
+        """
+        results = [self._rescued_by_shrinking(result) for result in results]
+        best = min(range(len(results)), key=lambda i: results[i].cost, default=None)
+        if best is None:
+            return results
+
+        begins = self._steered_begins(results)
+        if np.isfinite(results[best].cost):
+            begins = [np.asarray(results[best].control)]
+        for control in begins:
+            if self.budget.exhausted is not None:
+                break
+
+            found = yield from self._continue_inside(results[best], control)
+            if found.cost < results[best].cost:
+                results[best] = found
+            if np.isfinite(results[best].cost):
+                break
+
+        return results
+
+    def _rescued_by_shrinking(self, result: RunResult) -> RunResult:
+        """A result with the feasible control to which its own one can be shrunk, if there is one.
+
+        The initial control is shrunk as well, since its motion may be inside where that of the
+        result is not.
+        """
+        if result.control is None:
+            return result
+
+        found = [self._shrink(control) for control in (result.control, self.fine.task.control)]
+        best = min(found, key=lambda feasible: feasible.cost)
+        if not np.isfinite(best.cost):
+            return result
+        begun = replace(result, control=best.control, cost=best.cost)
+        return replace(begun, status=Status.MAX_ITERATIONS)
+
+    def _steered_begins(self, results: Sequence[RunResult]) -> list[Array]:
+        """Controls, (N, nu) each, from which the limits may be reached without the cost."""
+        task = self.fine.task
+        held = [np.broadcast_to(centre, task.control.shape) for centre in reversed(task.centres)]
+        found = [result.control for result in results if result.control is not None]
+        return [np.array(control) for control in (*held, *found)]
+
+    def _continue_inside(
+        self, result: RunResult, control: Array
+    ) -> Generator[DesignEvent, None, RunResult]:
+        """Optimise from a control, which is first steered inside the limits.
+
+        Args:
+            result: Result that is continued.
+            control: (N, nu) control with which to begin [u-unit].
+
+        Returns:
+            The result with the history and the engine steps of both. It is feasible on the
+            unmodified model where its cost is finite.
+        """
+        done = result.history[-1].iteration if result.history else 0
+        iterations = max(self._max_iterations - done, RESCUE_ITERATIONS)
+        runs = yield from self._round(
+            self.fine,
+            [InitialControl(name=result.name, control=control)],
+            BarrierSchedule(),
+            min(iterations, self._max_iterations),
+            self.budget.seconds_left,
+            inside_first=True,
+        )
+        for run in self._repaired(runs):
+            return _append_run(result, run)
+        return result
 
     # ---- properties of the task
 
@@ -292,26 +401,17 @@ class Multistart:
 
         return winner, found.relative_margins
 
-    def _rescued(self, result: RunResult) -> RunResult:
-        """Shrink the control of an infeasible result, even when the time is used up."""
-        if result.control is None or self.budget.stop.requested:
-            return result
+    def _shrink(self, control: Array) -> _Feasible:
+        """Shrink a control about each centre until no limit is violated; the best one counts."""
 
-        shrunk = self._shrink(result)
-        if not np.isfinite(shrunk.cost):
-            return result
-        return replace(shrunk, status=Status.MAX_ITERATIONS)
+        def feasible(candidate: Array) -> _Feasible | None:
+            """The control with its cost; None where it violates a limit."""
+            cost = self._cost_on_stated_plant(candidate)
+            return _Feasible(cost, candidate) if np.isfinite(cost) else None
 
-    def _shrink(self, result: RunResult) -> RunResult:
-        """Shrink the control of a result until no limit is violated, if that is possible."""
-
-        def repair(control: Array) -> RunResult | None:
-            """The result with this control, where it is feasible."""
-            cost = self._cost_on_stated_plant(control)
-            return replace(result, control=control, cost=cost) if np.isfinite(cost) else None
-
-        control = np.asarray(result.control)
-        return shrink_until_feasible(control, self.fine.task.centre, repair) or result
+        found = shrink_about_each(control, self.fine.task.centres, feasible)
+        outside = _Feasible(np.inf, control)
+        return min(found, key=lambda candidate: candidate.cost, default=outside)
 
     # ---- the rounds
 
@@ -367,6 +467,8 @@ class Multistart:
         max_iterations: int,
         seconds: float,
         tightening: Mapping[str, float] | None = None,
+        *,
+        inside_first: bool = False,
     ) -> Runs:
         """Run one search per start, each with the given iterations and seconds."""
         task = stage.task
@@ -390,6 +492,7 @@ class Multistart:
                 variant=task.system.variant,
                 threads=threads,
                 tightening=tightening or {},
+                inside_first=inside_first,
             )
             for start in starts
         ]
@@ -485,8 +588,11 @@ def _merge(first: RunResult, second: RunResult) -> RunResult:
         status=second.status,
         slope=second.slope,
     )
+    merged = replace(merged, earlier=(*first.earlier, *second.earlier))
     if second.control is not None and second.cost <= first.cost:
         merged = replace(merged, control=second.control, cost=second.cost)
+    elif second.status.success:
+        merged = replace(merged, status=Status.BEST_SEEN)
 
     # The control of the first round still counts where the second one found nothing feasible.
     if np.isfinite(merged.cost) and second.status is Status.INFEASIBLE:

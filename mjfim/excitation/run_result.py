@@ -31,6 +31,9 @@ class RunResult:
         steps: Engine steps taken on other plants than the stated one.
         point: The control evaluated on the stated plant; None where that was not done.
         is_feasible: False where the control is known to violate a limit on the stated plant.
+        earlier: (N, nu) controls each, the best feasible ones of earlier barrier stages. They keep
+            larger distances from the limits, and replace the control where that violates a limit
+            of the unmodified model.
         left_limits: True where a run without a barrier ended because it left the limits.
     """
 
@@ -43,6 +46,7 @@ class RunResult:
     steps: int = 0
     point: DesignPoint | None = None
     is_feasible: bool = True
+    earlier: tuple[Array, ...] = ()
     left_limits: bool = False
 
     @property

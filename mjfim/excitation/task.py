@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.holding_control import holding_control
+from mjfim.excitation.holding_control import holding_control, least_drift_control
 from mjfim.excitation.limits import Limit, limits_of
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.prior_information import information_of
@@ -46,6 +46,9 @@ MOST_PROBE_AMPLITUDE = 2.0
 
 # Share of the horizon over which a random control fades in from rest, and over which it fades out.
 FADE_SHARE = 0.1
+
+# Distance from the bounds of a control at which a centre lies at least, over half of its range.
+RANGE_MARGIN = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -366,6 +369,36 @@ class DesignTask:
         if self.experiment.boundary.start == "rest":
             return self.initial_hold
         return np.asarray(self.control.mean(axis=0))
+
+    @cached_property
+    def centres(self) -> tuple[Array, ...]:
+        """Controls, (nu,) each, towards which an infeasible control may be shrunk [u-unit].
+
+        They are `centre`, the control under which the initial state changes least, and the control
+        at rest; the latter two are moved inside the ranges of the controls.
+        """
+        start = self.plant.initial_state(self.theta)
+        rest = self.system.rest
+        found = [self.centre]
+
+        for control in (least_drift_control(self.system, start, rest), rest):
+            inside = self._inside_ranges(control)
+            is_new = not any(np.array_equal(inside, other) for other in found)
+            if is_new and np.isfinite(inside).all():
+                found.append(inside)
+
+        return tuple(found)
+
+    def _inside_ranges(self, control: Array) -> Array:
+        """A control, (nu,), moved inside the ranges of the controls [u-unit]."""
+        inside = np.array(control)
+        for limit in self.limits:
+            if limit.kind == "control":
+                gap = RANGE_MARGIN * limit.scale
+                inside[limit.index] = np.clip(
+                    inside[limit.index], limit.lower + gap, limit.upper - gap
+                )
+        return inside
 
     @cached_property
     def initial_hold(self) -> Array:

@@ -88,6 +88,10 @@ class Status(Enum):
         "stopped at its budget (max_iterations or seconds) before convergence; for a better "
         "result, raise it or start from this one"
     )
+    BEST_SEEN = (
+        "ended without convergence: this is the best trajectory that was found, later ones cost "
+        "more or left the limits"
+    )
     INFEASIBLE = (
         "found no trajectory that keeps all limits; the margins show which limit is violated: "
         "widen it, or begin with an initial control of smaller amplitude"
@@ -102,8 +106,8 @@ class Status(Enum):
 
     @property
     def ended_as_planned(self) -> bool:
-        """True if the optimisation converged, or used up the budget that the user gave it."""
-        return self.success or self is Status.MAX_ITERATIONS
+        """True if the optimisation converged, found no better one, or used up its budget."""
+        return self.success or self in (Status.MAX_ITERATIONS, Status.BEST_SEEN)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ from mjfim.excitation.feasibility import SHRINK_FACTORS
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.interior_point import BarrierSchedule, InteriorPointMethod, updated_tightening
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.multistart import Multistart
+from mjfim.excitation.multistart import Multistart, _Feasible
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
@@ -207,6 +207,77 @@ def test_an_infeasible_result_with_a_feasible_motion_inside_is_shrunk(tmp_path: 
     assert found.status is Status.MAX_ITERATIONS
     assert np.abs(found.control).max() > 0.0
     assert_inside(task, found.control)
+
+
+class Rigid(Multistart):
+    """Several starts whose controls cannot be shrunk inside the limits."""
+
+    def _shrink(self, control: Array) -> _Feasible:
+        return _Feasible(np.inf, control)
+
+
+def test_a_winner_that_cannot_be_shrunk_does_not_hide_a_feasible_start(tmp_path: Path) -> None:
+    task = cart_inside(tmp_path)
+    free = task.relaxed()
+    rigid = Rigid(fine=DescentLevel(free, None), coarse=None, budget=Budget())
+    inside = 0.2 * task.control
+    cost = rigid._cost_on_stated_plant(inside)
+    assert np.isfinite(cost)
+    wild = RunResult(name="wild", control=30.0 * task.control, cost=0.1 * cost)
+    calm = RunResult(name="calm", control=inside, cost=cost)
+
+    first, second = consume(replace(rigid, budget=over()).tighten_winner([wild, calm]), None)
+    assert not np.isfinite(first.cost)
+    assert first.status is Status.INFEASIBLE
+    assert second is calm
+
+    # The best feasible control of an earlier stage of the same start counts as well.
+    wild = replace(wild, earlier=(0.1 * task.control, inside, 20.0 * task.control))
+    (found,) = consume(replace(rigid, budget=over()).tighten_winner([wild]), None)
+    assert found.status is Status.BEST_SEEN
+    assert found.cost == min(cost, rigid._cost_on_stated_plant(0.1 * task.control))
+    assert_inside(task, found.control)
+
+
+def over() -> Budget:
+    """A budget whose time is used up."""
+    return Budget(seconds=0.0)
+
+
+@pytest.mark.parametrize("robust", [False, True], ids=["one model", "variants"])
+def test_a_motion_about_the_holding_control_is_found_and_improved(
+    robust: bool, tmp_path: Path
+) -> None:
+    """The mean of the initial control lets the arm fall out of narrow limits; its hold does not."""
+    narrow = {"position": {"shoulder": (-0.01, 0.01), "elbow": (-0.01, 0.01)}}
+    more: dict[str, Any] = {}
+    if robust:
+        mass = {"target": "body/fore:mass", "prior": 0.05}
+        more = {"robust": {"samples": 3}, "parameters": {"m": mass}}
+    task = arm_task(
+        tmp_path,
+        limits=narrow,
+        control={"kind": "sine", "amplitude": 0.3, "frequency": 2.0},
+        descent={"max_iterations": 4, "coarse": 1},
+        **more,
+    )
+    design = design_task(task)
+    assert design.status is not Status.INFEASIBLE
+    assert design.sound
+    rows = played(
+        task.system.model,
+        (np.zeros(2), np.zeros(2)),
+        design.trajectory.ctrl,
+        task.system.grid.substeps,
+    )
+    assert np.abs(rows["q"]).max() <= 0.01
+    assert np.abs(design.trajectory.ctrl).max() <= 1.0
+
+    # The search continued from the shrunk motion, so that the design tells more than that.
+    multistart = multistart_of(task.relaxed())
+    shrunk = multistart._shrink(task.control)
+    assert np.isfinite(shrunk.cost)
+    assert design.final.cost < 0.99 * shrunk.cost
 
 
 SWINGING = CART_PENDULUM.format(integrator="RK4").replace(

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from tests.fuzz import bad_inputs, inputs
+from tests.fuzz import bad_inputs, inputs, problems
 from tests.fuzz.inputs import Ending
 from tests.fuzz.outcome import Case, KnownFailure, Outcome
 from tests.fuzz.plants import random_plant
@@ -41,6 +41,19 @@ def test_random_cases(kind: str) -> None:
     replay = [f"python -m tests.fuzz --only {o.case}: {o.complaint}" for o in failed]
     assert len(outcomes) > 0
     assert replay == []
+
+
+# Random problems with a feasible motion that is hard to find: about the holding control, with a
+# small share of the initial control, and by steering.
+HIDDEN = (2, 19, 62, 113, 472)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", HIDDEN)
+def test_a_hidden_feasible_motion_is_found(seed: int, tmp_path: Path) -> None:
+    outcome = problems.run(Case(kind="problem", seed=seed), tmp_path)
+    assert outcome.group == "claimed"
+    assert outcome.complaint == ""
 
 
 def test_a_case_is_read_as_it_is_printed() -> None:
