@@ -35,8 +35,8 @@ class ConstraintValues:
         distances: (N, m) distances at the samples 1 ... N [m], or None without a clearance.
         distance_slopes: (N, m, nv) derivatives of the distances by the position [m / q-unit], or
             None where they were not requested.
-        observation_jacobian: (N, S, w, nx+nu) derivatives of the quantities at S engine steps of
-            each sample by the state and the control at the beginning of the sample, or None where
+        observation_jacobian: (N, S, w, nx+nu) derivatives of the quantities at S rows of each
+            sample by the state and the control at the beginning of the sample, or None where
             they were not requested.
     """
 
@@ -151,7 +151,7 @@ class SubstepConstraint:
             yield KindMargins(kind, margins[..., i], float(self.bounds.scale[i]))
 
     def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """Mean over the engine steps with derivatives. See `Constraint.barrier`."""
+        """Mean over the rows with derivatives. See `Constraint.barrier`."""
         observed, weight = self._observed_with_weight(values)
         return self.bounds.barrier(observed, delta, weight).value
 
@@ -179,10 +179,9 @@ class SubstepConstraint:
         sums.weights.R[:] += hessian[:, nx:, nx:]
 
     def _observed_with_weight(self, values: ConstraintValues) -> tuple[Array, float]:
-        """Quantities at the S engine steps with derivatives, (N, S, w), and the weight of each."""
-        steps = np.array(self.observations.derivative_substeps) - 1
-        observed = values.observed[:, steps]
-        return observed, values.weight / len(steps)
+        """Quantities at the S rows with derivatives, (N, S, w), and the weight of each."""
+        rows = np.array(self.observations.derivative_rows)
+        return values.observed[:, rows], values.weight / len(rows)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -97,7 +97,7 @@ class SubstepObservations:
         actuator_forces: Addresses in actuator_force.
         joint_forces: Addresses in qfrc_actuator.
         derivative_substeps: Engine steps of a sample, counted from 1, at which derivatives are
-            taken.
+            taken; the last one ends the sample.
         timestep: Engine timestep [s].
         force_rows: Engine step of a sample, counted from 0, to which each further row of a
             rollout belongs; the last one is the end of the sample. Empty where forces are constant
@@ -112,6 +112,21 @@ class SubstepObservations:
     derivative_substeps: tuple[int, ...]
     timestep: float
     force_rows: tuple[int, ...] = ()
+
+    @property
+    def has_stages(self) -> bool:
+        """Whether the forces at the beginning of the engine steps are further rows, as for RK4."""
+        return len(self.force_rows) > 1
+
+    @property
+    def derivative_rows(self) -> tuple[int, ...]:
+        """Rows of a rollout for which derivatives are taken.
+
+        Of the further rows it is the first one: with RK4 the beginning of the sample, where the
+        control has changed, and otherwise its end.
+        """
+        steps = tuple(step - 1 for step in self.derivative_substeps)
+        return (*steps, self.derivative_substeps[-1]) if self.force_rows else steps
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -187,8 +202,8 @@ class SampleSteps:
         states: (n, ns) states after the sample, NaN where a simulation diverged.
         sensors: (n, nsensordata) sensor data that belong to the states before the sample, or None
             if not requested.
-        observed: (n, derivative substeps, w) observations within the sample, or None if not
-            requested.
+        observed: (n, S, w) observations at the S rows of `SubstepObservations.derivative_rows`, or
+            None if not requested.
     """
 
     states: Array
@@ -467,7 +482,7 @@ class BatchSimulator:
 
         Returns:
             (count, nsensordata) sensor data or None, and a list of (count, w) observations, one
-            for each derivative substep.
+            for each derivative row.
         """
         substeps = () if observations is None else observations.derivative_substeps
         accelerations = observations is not None and len(observations.accelerations) > 0
@@ -478,6 +493,10 @@ class BatchSimulator:
         stops = {*substeps, self.substeps}
         if self.sensors:
             stops.add(1)
+
+        begun = None
+        if observations is not None and observations.has_stages:
+            begun = self._current_forces(batch, ids, count, observations)
 
         done = 0
         for stop in sorted(stops):
@@ -498,7 +517,30 @@ class BatchSimulator:
                 observed.append(
                     observations.values(qpos, qvel, before, lambda name: batch.bind(name)[:count])
                 )
+
+        # The further row belongs to the first engine step with RK4, and otherwise to the last one.
+        if observations is not None and observations.force_rows:
+            further = observed[0 if observations.has_stages else -1].copy()
+            if begun is None:
+                begun = self._current_forces(batch, ids, count, observations)
+            further[:, -begun.shape[1] :] = begun
+            observed.append(further)
         return sensors, observed
+
+    def _current_forces(
+        self,
+        batch: Batch,
+        ids: np.ndarray | None,
+        count: int,
+        observations: SubstepObservations,
+    ) -> Array:
+        """(count, f) observed forces by `mj_forward` at the states of a batch, which it keeps."""
+        with silence_mujoco_log():
+            batch.forward(ids)
+
+        # mj_forward leaves its accelerations for the solver of the next step.
+        batch.bind("qacc_warmstart")[:count] = 0.0
+        return observations.forces(lambda name: batch.bind(name)[:count])
 
     def _observed(
         self,
@@ -570,9 +612,7 @@ class BatchSimulator:
         for name in observations.fields:
             batch.bind(name)
 
-        with silence_mujoco_log():
-            batch.forward(ids)
-        return observations.forces(lambda name: batch.bind(name)[:count])
+        return self._current_forces(batch, ids, count, observations)
 
     def _sensor_data(self, data: Array) -> Array:
         """A copy of sensor data: (..., nsensordata) whose clocks count from zero."""

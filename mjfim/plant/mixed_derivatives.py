@@ -70,7 +70,7 @@ class Bilinear:
             zero.
         output_delay: Time delay of the outputs, or None.
         delay_derivative: (p,) derivative of the delay by theta [s / theta-unit].
-        observation_jacobian: (N, derivative substeps, w, nx+nu) derivative of the observations by
+        observation_jacobian: (N, S, w, nx+nu) derivative of the observations by
             (x, u), or None if nothing was observed.
     """
 
@@ -94,7 +94,7 @@ class _PairDerivatives:
         mixed: (c, n, nx) mixed differences of F.
         sensor_first: (c, n, nsensordata) first differences of the sensors, or None without sensors.
         sensor_mixed: (c, n, nsensordata) mixed differences of the sensors, or None without sensors.
-        observation_jacobian: (N, derivative substeps, w, c) first differences of the observations,
+        observation_jacobian: (N, S, w, c) first differences of the observations,
             or None.
     """
 
@@ -352,7 +352,7 @@ class MixedDerivatives(StepDerivatives):
                 without sensors.
             sensor_mixed: r mixed differences of the sensors, each (nx+nu, N+1, nsensordata); empty
                 without sensors.
-            observation_jacobian: (N, derivative substeps, w, nx+nu) derivative of the observations,
+            observation_jacobian: (N, S, w, nx+nu) derivative of the observations,
                 or None.
         """
         plant, nx = self.plant, self.plant.space.nx

@@ -60,11 +60,11 @@ class MovedSamples:
         """Derivative of observations by (x, u).
 
         Args:
-            change: (c, n, derivative substeps, w) differences of the observations between the
+            change: (c, n, S, w) differences of the observations at S rows between the
                 forward moves and the backward or zero ones.
 
         Returns:
-            (n, derivative substeps, w, c) derivative.
+            (n, S, w, c) derivative.
         """
         quotient = change / self.widths[..., None]
         return np.moveaxis(quotient, 0, 3)
@@ -144,7 +144,7 @@ class StepDerivatives(DifferenceSteps):
             step: Difference step relative to `difference_sizes`.
 
         Returns:
-            A: (N, nx, nx), B: (N, nx, nu), and (N, derivative substeps, w, nx+nu) derivative of the
+            A: (N, nx, nx), B: (N, nx, nu), and (N, S, w, nx+nu) derivative of the
             observations.
 
         Raises:

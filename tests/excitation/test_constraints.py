@@ -154,7 +154,7 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     _, _, rise = task.plant.derivatives.observation_jacobians(
         task.theta, values.trajectory, constraints.observations
     )
-    looked, ctrl = np.array(constraints.observations.derivative_substeps) - 1, task.control
+    looked, ctrl = list(constraints.observations.derivative_rows), task.control
     assert values.distances is not None
     assert values.distance_slopes is not None
     assert clearance is not None
@@ -227,7 +227,7 @@ def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Pa
         zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
         up, down = (values_of(problem.point(task.control + s * way)).observed for s in (1.0, -1.0))
         moved = (0.5 * np.abs(up - down) / constraints.substeps.bounds.scale)[
-            :, np.array(constraints.observations.derivative_substeps) - 1
+            :, list(constraints.observations.derivative_rows)
         ].max()
         wanted = max(moved, np.abs(way / constraints.control.bounds.scale).max())
         assert expansion.barrier.largest_relative_move(zeta) == pytest.approx(wanted, rel=1e-3)

@@ -143,7 +143,7 @@ def test_single_samples_and_the_whole_curve_give_equal_observations(tmp_path: Pa
         )
         np.testing.assert_allclose(
             stepped.observed,
-            observed[order][:, np.array(observations.derivative_substeps) - 1],
+            observed[order][:, list(observations.derivative_rows)],
             rtol=0,
             atol=1e-9,
         )
@@ -174,35 +174,46 @@ def test_observations_cost_no_further_steps(tmp_path: Path) -> None:
     assert counts == [35, 35]
 
 
-def differences(
-    task: DesignTask, sample: int, substeps: tuple[int, ...], step: float = 1e-6
+def rows_of_sample(
+    model: Any, state: Array, ctrl: Array, observations: SubstepObservations, substeps: int
 ) -> Array:
-    """(derivative substeps, 9, nx+nu) central differences of plain loops over one sample of the
-    lifted plant.
+    """(S, 9) values of one sample at the rows with derivatives; the last row has the forces at the
+    beginning of the sample with RK4, and otherwise those at its end.
     """
+    values, forces = played_with_forces(model, state, ctrl[None], substeps)
+    chosen = values[0, np.array(observations.derivative_substeps) - 1]
+    edge = 0 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else -1
+    return np.concatenate([chosen, np.append(chosen[edge, :5], forces[0, edge])[None]])
+
+
+def differences(
+    task: DesignTask, sample: int, observations: SubstepObservations, step: float = 1e-6
+) -> Array:
+    """(S, 9, nx+nu) central differences of plain loops over one sample of the lifted plant."""
     plant, u = task.plant, task.control[sample]
     model, x = plant.model(task.theta), task.initial.state[sample]
     loop, nx, columns = Loop(model, task.system.grid.substeps), task.space.nx, []
     for e in step * np.eye(nx + len(u)):
         up, down = (
-            played(
+            rows_of_sample(
                 model,
                 loop.plus(x, sign * e[:nx]),
-                (u + sign * e[nx:])[None],
+                u + sign * e[nx:],
+                observations,
                 task.system.grid.substeps,
-            )[0]
+            )
             for sign in (1.0, -1.0)
         )
-        columns.append((up - down)[np.array(substeps) - 1] / (2 * step))
+        columns.append((up - down) / (2 * step))
     return np.stack(columns, axis=-1)
 
 
 def assert_slopes(
     found: Array, task: DesignTask, observations: SubstepObservations, tolerance: float
 ) -> None:
-    """Derivatives (N, derivative substeps, 9, nx+nu) of every kind at some samples."""
+    """Derivatives (N, S, 9, nx+nu) of every kind at some samples."""
     for sample in (0, 11, 29):
-        wanted = differences(task, sample, observations.derivative_substeps)
+        wanted = differences(task, sample, observations)
         for i, shown in enumerate(SHOWN):
             assert relative_error(found[sample, :, i], wanted[:, i]) < tolerance, (sample, shown)
 
@@ -216,7 +227,7 @@ def test_derivatives_of_observations_are_differences_of_independent_simulations(
     A, B, slopes = task.plant.derivatives.observation_jacobians(
         task.theta, task.initial, observations
     )
-    assert slopes.shape == (30, len(observations.derivative_substeps), len(SHOWN), 20)
+    assert slopes.shape == (30, len(observations.derivative_substeps) + 1, len(SHOWN), 20)
     assert_slopes(slopes, task, observations, 1e-3)
     exact = task.plant.derivatives.jacobians(task.theta, task.initial)
     assert relative_error(A, exact[0]) < 1e-5
