@@ -536,3 +536,60 @@ def test_units_of_quotients_and_variances() -> None:
 def test_value_is_rounded_to_its_uncertainty() -> None:
     assert format_with_uncertainty(0.99412, 0.0121) == "0.994 ± 0.012"
     assert format_with_uncertainty(1.0, np.inf) == "1.000 ± ∞"
+
+
+# ---- settings of the user
+
+
+# Settings that a `matplotlibrc` may hold and that would be seen in every figure.
+OTHER_SETTINGS = {
+    "font.size": 20.0,
+    "font.family": "monospace",
+    "axes.facecolor": "black",
+    "lines.linewidth": 8.0,
+    "savefig.facecolor": "red",
+    "axes.unicode_minus": False,
+    "savefig.bbox": "tight",
+}
+
+
+def test_settings_of_the_user_change_no_figure_and_stay(tmp_path: Path) -> None:
+    """A `matplotlibrc` in the current folder sets them where Python imports matplotlib."""
+    design = make_design()
+    plots.save(plots.std_bars(design, make_labels(2, 3)), tmp_path / "plain.png")
+
+    with matplotlib.rc_context(OTHER_SETTINGS):
+        plots.save(plots.std_bars(design, make_labels(2, 3)), tmp_path / "other.png")
+        assert {key: matplotlib.rcParams[key] for key in ("font.size", "axes.facecolor")} == {
+            "font.size": 20.0,
+            "axes.facecolor": "black",
+        }
+
+    assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "other.png").read_bytes()
+
+
+@pytest.mark.parametrize("name", plots.__all__)
+def test_every_plotting_function_draws_in_its_own_style(name: str) -> None:
+    assert "own_style" in getattr(plots, name).__code__.co_qualname
+
+
+@pytest.mark.slow
+def test_a_matplotlibrc_of_the_current_folder_changes_no_figure(tmp_path: Path) -> None:
+    """In Python, without the command line, matplotlib reads this file when it is imported."""
+    settings = "font.size: 20\naxes.facecolor: black\nsavefig.facecolor: red\n"
+    script = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from mjfim.output import plots\n"
+        "from tests.output.test_plots import make_design\n"
+        "plots.save(plots.convergence(make_design()), 'figure.png')\n"
+    )
+
+    pictures = []
+    for name, text in (("plain", ""), ("other", settings)):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "matplotlibrc").write_text(text, encoding="utf-8")
+        subprocess.run([sys.executable, "-c", script, str(ROOT)], cwd=folder, check=True)
+        pictures.append((folder / "figure.png").read_bytes())
+
+    assert pictures[0] == pictures[1]

@@ -22,6 +22,7 @@ PARAMETER_NAME_WIDTH = 18
 TICK_DIGITS = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8))
 
 
+@style.own_style
 def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: bool) -> Figure:
     """Draw standard deviation and estimate of each parameter over the rounds.
 

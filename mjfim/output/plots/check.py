@@ -22,6 +22,7 @@ from mjfim.output.plots.style import (
     format_axes,
     format_percent,
     new_figure,
+    own_style,
     shorten,
     write_message,
 )
@@ -47,6 +48,7 @@ MAX_LEVEL_CHARACTERS = 24
 DARK_CELL = 0.6
 
 
+@own_style
 def check_figure(check: Check) -> Figure:
     """Draw predicted and wanted relative standard deviations, and the correlation matrix.
 

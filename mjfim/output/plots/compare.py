@@ -25,6 +25,7 @@ from mjfim.output.plots.style import (
     format_number,
     format_percent,
     new_figure,
+    own_style,
     shorten,
     write_message,
 )
@@ -57,6 +58,7 @@ DARK_CELL = 0.6
 COLOUR_BAR_RATIOS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 
 
+@own_style
 def compare_figure(comparison: Comparison) -> Figure:
     """Draw standard deviations relative to the design's (cells), and the worst combination (bars).
 

@@ -27,6 +27,7 @@ from mjfim.output.plots.style import (
     format_axes,
     format_number,
     new_figure,
+    own_style,
     quotient_unit,
     shorten,
     trajectory_handles,
@@ -75,6 +76,7 @@ class _Panel:
     label: str
 
 
+@own_style
 def trajectories(design: Design, labels: Labels) -> Figure:
     """Draw states, controls and the information gathered up to each time (the paper's figure 2).
 
@@ -191,6 +193,7 @@ def _draw_information(axes: Axes, design: Design) -> None:
 # ---- sensitivities
 
 
+@own_style
 def sensitivity_phase(design: Design, labels: Labels) -> Figure:
     """Draw phase plots of the sensitivities psi (the paper's figure 3).
 
@@ -349,6 +352,7 @@ def _label_phase_axes(axes: Axes, labels: Labels, dof: int, j: int) -> None:
 # ---- convergence
 
 
+@own_style
 def convergence(design: Design) -> Figure:
     """Draw cost, slope and smallest eigenvalue over the iterations, logarithmically.
 

@@ -16,6 +16,7 @@ from mjfim.output.plots.style import (
     format_axes,
     format_number,
     new_figure,
+    own_style,
     shorten,
 )
 from mjfim.records.design import Design, LimitUsage
@@ -40,6 +41,7 @@ NAMED_COLOURS = (OPTIMIZED_COLOUR, "#ee7733", "#aa3377")
 CURVE_NAME_WIDTH = 24
 
 
+@own_style
 def limits(design: Design) -> Figure:
     """Draw a panel per kind of limit; the curves that come closest to a bound are named.
 

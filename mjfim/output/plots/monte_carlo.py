@@ -22,6 +22,7 @@ from mjfim.output.plots.style import (
     format_axes,
     format_number,
     new_figure,
+    own_style,
     quotient_unit,
     squared_unit,
     trajectory_style,
@@ -50,6 +51,7 @@ CURVE_POINTS = 400
 MIN_BINS, MAX_BINS = 8, 60
 
 
+@own_style
 def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Figure:
     """Draw the estimates of one parameter along each trajectory (the paper's figures 4 to 6).
 

@@ -25,6 +25,7 @@ from mjfim.output.plots.style import (
     format_percent,
     format_with_uncertainty,
     new_figure,
+    own_style,
     shorten,
     shorten_label,
 )
@@ -66,6 +67,7 @@ class _Accuracies:
     std_final: Array
 
 
+@own_style
 def std_bars(design: Design, labels: Labels) -> Figure:
     """Draw the predicted standard deviations along both trajectories.
 
@@ -254,6 +256,7 @@ class _RelativeEstimate:
     interval: Array
 
 
+@own_style
 def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     """Draw estimates with 95 % intervals relative to the guess; an estimate at its bound is marked.
 

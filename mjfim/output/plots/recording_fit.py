@@ -26,6 +26,7 @@ from mjfim.output.plots.style import (
     break_before_unit,
     format_axes,
     new_figure,
+    own_style,
     write_message,
 )
 from mjfim.records.estimate import Estimate
@@ -38,6 +39,7 @@ MAX_OUTPUTS = 12
 MAX_SAMPLES = 6000
 
 
+@own_style
 def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] | Array) -> Figure:
     """Draw measured and predicted outputs of one recording, with their residuals.
 

@@ -28,6 +28,7 @@ from mjfim.output.plots.style import (
     format_axes,
     format_number,
     new_figure,
+    own_style,
     shorten,
     write_message,
 )
@@ -53,6 +54,7 @@ SMALLEST_WRITTEN_P = 1e-6
 # ---- residual spectra
 
 
+@own_style
 def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
     """Draw the spectrum of the residuals of every output, relative to white noise of sigma.
 
@@ -175,6 +177,7 @@ def _draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) ->
 # ---- predictions
 
 
+@own_style
 def predictions(estimate: Estimate, labels: Labels) -> Figure:
     """Draw prediction errors of the identified and of the nominal model.
 

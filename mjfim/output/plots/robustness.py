@@ -29,6 +29,7 @@ LIMIT_NAME_WIDTH, PARAMETER_NAME_WIDTH = 26, 24
 MAX_LEVEL_CHARACTERS = 60
 
 
+@style.own_style
 def robustness_figure(result: Robustness) -> Figure:
     """Draw the margins of every limit, the errors, the coverage, and the errors of the guess.
 

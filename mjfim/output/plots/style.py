@@ -1,16 +1,20 @@
 """Style of the figures: colours, fonts, number formats, labels, blank figures, atomic saving.
 
-Only Figure and Agg objects are used: pyplot and its global state stay untouched, so several threads
-may draw at once.
+Only Figure and Agg objects are used: pyplot and its global state stay untouched. Settings of the
+user, from a `matplotlibrc` or in Python, change no figure.
 """
 
 from __future__ import annotations
 
 import os
 import textwrap
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
+import matplotlib.style
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -22,6 +26,13 @@ from matplotlib.lines import Line2D
 from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
 from mjfim.model.coordinates import split_unit
+
+# Arguments and result of a function that draws.
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+# The settings of matplotlib belong to the whole process, so one thread draws at a time.
+STYLE_LOCK = threading.RLock()
 
 # Colour of the initial trajectory, of guesses and of nominal models.
 INITIAL_COLOUR = "#0077bb"
@@ -62,6 +73,27 @@ TRAJECTORY_STYLES: dict[str, tuple[str, str]] = {
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+# ---- settings of matplotlib
+
+
+def own_style(draw: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Let a function draw with the defaults of matplotlib; the user's settings return after it.
+
+    Args:
+        draw: The function.
+
+    Returns:
+        The function that draws always in the same style.
+    """
+
+    @wraps(draw)
+    def with_own_style(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
+        with STYLE_LOCK, matplotlib.style.context("default"):
+            return draw(*arguments, **options)
+
+    return with_own_style
 
 
 # ---- units
@@ -319,6 +351,7 @@ def trajectory_handles() -> list[Line2D]:
     ]
 
 
+@own_style
 def save(figure: Figure, path: str | os.PathLike[str], dpi: float = 200.0) -> Path:
     """Write a figure as PNG in one step: readers find the old file or the complete new one.
 

@@ -18,6 +18,7 @@ from mjfim.output.plots.style import (
     TEXT_COLOUR,
     format_number,
     new_figure,
+    own_style,
     shorten,
     shorten_label,
     trajectory_style,
@@ -46,6 +47,7 @@ NOTE_HEIGHT = 0.17
 HEADING_WIDTH = 16
 
 
+@own_style
 def design_table(design: Design, labels: Labels) -> Figure:
     """Draw eigenvalues and cost (the paper's table I), and predicted standard deviations.
 
@@ -64,6 +66,7 @@ def design_table(design: Design, labels: Labels) -> Figure:
     return draw_tables(summary.title, tables, notes)
 
 
+@own_style
 def study_table(study: MonteCarloStudy, labels: Labels) -> Figure:
     """Draw covariances, information, bounds and efficiency (the paper's tables II and III).
 
