@@ -37,7 +37,7 @@ CHECK = ("check", "study.toml", "--threads", "1")
 SIMULATE = ("simulate", "study.toml", "design.npz", "-o", "new.csv")
 
 # Size of the array inside of a packed design that is far too large [bytes].
-BOMB_SIZE = 1 << 30
+BOMB_SIZE = 1 << 28
 
 # Names of files and folders that are odd, but allowed.
 ODD_NAMES = (
@@ -173,7 +173,7 @@ def boolean_measurement(rng: Rng, folder: Path) -> Call:
 
 @functools.cache
 def _bomb() -> Path:
-    """A design.npz of a megabyte that unpacks to a gigabyte, made once in each process."""
+    """A design.npz that unpacks to a thousand times its size, made once in each process."""
     path = Path(tempfile.mkdtemp(dir=Path.cwd())) / "bomb.npz"
     header = np.lib.format
     with (

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
 from tests.fuzz import bad_inputs, inputs, problems
+from tests.fuzz.faults import FAULTS, packed_bomb
 from tests.fuzz.inputs import Ending
+from tests.fuzz.mechanism_problems import omissions
+from tests.fuzz.mechanisms import random_mechanism
 from tests.fuzz.outcome import Case, KnownFailure, Outcome
 from tests.fuzz.plants import random_plant
 from tests.fuzz.player import (
@@ -26,9 +32,10 @@ from tests.fuzz.player import (
 from tests.fuzz.problems import random_tables
 from tests.fuzz.result_files import PIXEL, faults_of, is_temporary
 from tests.fuzz.workers import run_cases
+from tests.support.cli import write_experiment
 
 # Time of each kind in these tests [s]; no case begins later.
-SECONDS = {"problem": 15.0, "input": 20.0, "kill": 30.0, "mechanism": 15.0}
+SECONDS = {"problem": 15.0, "input": 15.0, "kill": 30.0, "mechanism": 15.0, "fault": 15.0}
 
 
 @pytest.mark.slow
@@ -82,6 +89,51 @@ def test_random_plants_compile_with_their_ranges(seed: int) -> None:
             assert tuple(model.joint(name).range) == bounds
         if kind == "control":
             assert tuple(model.actuator(name).ctrlrange) == bounds
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_mechanisms_compile_with_their_ranges(seed: int) -> None:
+    mechanism = random_mechanism(np.random.default_rng(seed))
+    model = mujoco.MjModel.from_xml_string(mechanism.xml)
+    assert (model.njnt, model.nu) == (len(mechanism.links), len(mechanism.actuators))
+    for (kind, name), bounds in mechanism.ranges.items():
+        if kind == "position":
+            assert tuple(model.joint(name).range) == bounds
+        if kind == "force":
+            assert tuple(model.actuator(name).forcerange) == bounds
+
+
+def test_ranges_that_a_design_does_not_mention_are_noticed() -> None:
+    rng = np.random.default_rng(18)
+    mechanism = random_mechanism(rng)
+    while not mechanism.unheld or all(link.is_scalar for link in mechanism.links):
+        mechanism = random_mechanism(rng)
+    tables = {"limits": {"velocity": 1.0}}
+
+    silent: Any = SimpleNamespace(warnings=())
+    names = {*mechanism.unheld, *(k.name for k in mechanism.links if not k.is_scalar)}
+    found = "; ".join(omissions(mechanism, tables, silent))
+    assert [name for name in names if name not in found] == []
+    told: Any = SimpleNamespace(warnings=(f"limits.velocity does not apply to {' '.join(names)}",))
+    assert omissions(mechanism, tables, told) == []
+
+
+@pytest.mark.parametrize("make", [make for make, _ in FAULTS if make is not packed_bomb])
+def test_every_fault_can_be_made(
+    make: Callable[[Any, Path], bad_inputs.Call], tmp_path: Path
+) -> None:
+    """Nothing but the generator is called; it has to cope with every choice that it makes."""
+    names = ("t", "ctrl:force", "qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge")
+    for seed in range(3):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        write_experiment(folder)
+        rows = [",".join(names), *(",".join([f"{0.01 * i}"] * 6) for i in range(4))]
+        (folder / "run.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        np.savez(folder / "design.npz", t=np.arange(3), qpos=np.ones((3, 2)), ctrl=np.ones((2, 1)))
+        call = make(np.random.default_rng(seed), folder)
+        assert len(call.words) > 1
+        assert call.spoiled
 
 
 # A mass of 1 kg on a slide, driven by a motor.
