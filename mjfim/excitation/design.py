@@ -26,6 +26,7 @@ from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import Verification, require_feasible_start, verify
+from mjfim.excitation.violations import violations_of
 from mjfim.experiment.schema import Experiment
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.information.marginal import shared
@@ -408,6 +409,7 @@ class _Report:
             seconds=seconds,
             limits=found.margins,
             usage=found.usage,
+            initial_violations=violations_of(task, verify(task, initial.trajectory)),
             warnings=warnings,
             found_by=best.name,
             starts=tuple(result.start_result for result in results),

@@ -37,6 +37,9 @@ from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
 # Largest number of parameters or outputs that have a column each.
 MAX_COLUMNS = 7
 
+# Largest number of limits that the initial control violates and that a summary lists.
+MAX_VIOLATIONS = 4
+
 # Largest number of eigenvalues that a table shows one by one; of more, the largest three and the
 # smallest two are shown.
 MAX_EIGENVALUES = 6
@@ -240,6 +243,18 @@ def _limit_parts(design: Design) -> list[Part]:
         return []
 
     parts: list[Part] = []
+    broken = [str(violation) for violation in design.initial_violations]
+    if broken:
+        shown = "; ".join(broken[:MAX_VIOLATIONS])
+        others = len(broken) - MAX_VIOLATIONS
+        more = f"; and {others} more, see limits.initial in design.json" if others > 0 else ""
+        parts.append(
+            Paragraph(
+                text=f"The initial control violates limits: {shown}{more}. Its standard deviations "
+                "are those of a motion outside the limits."
+            )
+        )
+
     violated = [kind for kind, margin in design.limits.items() if margin < 0.0]
     if violated:
         parts.append(

@@ -211,6 +211,51 @@ class LimitUsage:
         freeze(self, "t", "share")
 
 
+@dataclass(frozen=True, kw_only=True)
+class LimitViolation:
+    """A limit that a trajectory violates.
+
+    Attributes:
+        kind: Kind of the limit: "position", "velocity", "control", "end_position", ...
+        name: Name of the joint, the actuator or the nearest pair of geoms; "final state" for the
+            tolerances of the boundary.
+        since: Time at which it is violated first [s].
+        t: Time at which the violation is largest [s].
+        value: The limited quantity at this time [unit of the kind]; for the final state, the
+            largest deviation.
+        lower: Lower bound, or None [unit of the kind].
+        upper: Upper bound, or None [unit of the kind].
+    """
+
+    kind: str
+    name: str
+    since: float
+    t: float
+    value: float
+    lower: float | None
+    upper: float | None
+
+    def __str__(self) -> str:
+        low = "-inf" if self.lower is None else f"{self.lower:.4g}"
+        high = "inf" if self.upper is None else f"{self.upper:.4g}"
+        return (
+            f"{self.kind} of {self.name} is {self.value:.4g} at {self.t:.4g} s, outside "
+            f"[{low}, {high}] (first at {self.since:.4g} s)"
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one entry of `limits.initial` in design.json."""
+        return {
+            "kind": self.kind,
+            "name": self.name,
+            "since": self.since,
+            "t": self.t,
+            "value": self.value,
+            "lower": self.lower,
+            "upper": self.upper,
+        }
+
+
 def _npz_names() -> dict[str, str]:
     """Return the short names of arrays in design.npz, by path in the record."""
     names = {}
@@ -242,6 +287,7 @@ class Design(SavedRecord):
         seconds: Wall time [s].
         limits: Worst margin per kind of limit, positive inside [unit of the limit].
         usage: Position between the bounds of every limit, at every engine step.
+        initial_violations: Limits that the initial trajectory violates.
         warnings: Sentences for the user.
         found_by: Name of the initial control that led to the design.
         starts: Results of all initial controls.
@@ -265,6 +311,7 @@ class Design(SavedRecord):
     seconds: float
     limits: dict[str, float] = field(default_factory=dict)
     usage: tuple[LimitUsage, ...] = ()
+    initial_violations: tuple[LimitViolation, ...] = ()
     warnings: tuple[str, ...] = ()
     found_by: str = "initial control"
     starts: tuple[StartResult, ...] = ()
@@ -330,7 +377,11 @@ class Design(SavedRecord):
             "theta": self.theta,
             "initial": self.initial.summary(),
             "final": self.final.summary(),
-            "limits": {"margins": self.limits, "satisfied": self.within_limits},
+            "limits": {
+                "margins": self.limits,
+                "satisfied": self.within_limits,
+                "initial": [violation.summary() for violation in self.initial_violations],
+            },
             "found_by": self.found_by,
             "starts": [start.summary() for start in self.starts],
             "warnings": list(self.warnings),

@@ -28,6 +28,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import verify
 from mjfim.experiment.schema import Experiment
+from mjfim.output.summaries import describe_design
+from mjfim.output.summary_parts import Paragraph
 from mjfim.records.design import Design, HistoryRow, Status
 from mjfim.records.events import DesignEvent
 from mjfim.signals import spline_basis
@@ -207,6 +209,39 @@ def test_an_infeasible_result_with_a_feasible_motion_inside_is_shrunk(tmp_path: 
     assert found.status is Status.MAX_ITERATIONS
     assert np.abs(found.control).max() > 0.0
     assert_inside(task, found.control)
+
+
+def test_a_design_says_what_the_initial_control_violates_and_when(tmp_path: Path) -> None:
+    wild = {"kind": "sine", "amplitude": 8.0, "frequency": 1.0}
+    task = cart_inside(tmp_path, control=wild, descent={"max_iterations": 1, "coarse": 1})
+    design = design_task(task)
+    start = task.space.split(task.plant.nominal_initial_state)[:2]
+    substeps = task.system.grid.substeps
+    rows = played(task.system.model, start, task.control, substeps)
+    step = task.dt / substeps
+
+    found = {(v.kind, v.name): v for v in design.initial_violations}
+    control = found["control", "force"]
+    assert control.value == pytest.approx(np.abs(task.control).max() * np.sign(control.value))
+    assert (control.lower, control.upper) == (-5.0, 5.0)
+    outside = np.flatnonzero(np.abs(task.control[:, 0]) > 5.0)
+    assert control.since == pytest.approx(outside[0] * task.dt)
+
+    slide = found["position", "slide"]
+    beyond = np.maximum(rows["q"][:, 0] - 0.5, -0.3 - rows["q"][:, 0])
+    worst = int(np.argmax(beyond))
+    assert slide.value == pytest.approx(rows["q"][worst, 0], abs=1e-6)
+    assert slide.t == pytest.approx((worst + 1) * step)
+    assert slide.since == pytest.approx((np.flatnonzero(beyond > 0.0)[0] + 1) * step)
+
+    # The summary and the JSON name joint, value and time.
+    parts = describe_design(design, task.system.units).parts
+    text = " ".join(part.text for part in parts if isinstance(part, Paragraph))
+    assert f"position of slide is {slide.value:.4g} at {slide.t:.4g} s" in text
+    kinds = [entry["kind"] for entry in design.summary()["limits"]["initial"]]
+    assert set(kinds) == {kind for kind, _ in found}
+    design.save(tmp_path)
+    assert Design.load(tmp_path).initial_violations == design.initial_violations
 
 
 class Rigid(Multistart):
