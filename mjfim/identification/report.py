@@ -15,6 +15,7 @@ from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
 from mjfim.identification.fit_quality import FitQuality, fit_quality
 from mjfim.identification.missing_terms import find_missing_terms
+from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
 from mjfim.identification.residuals import FitProblem
 from mjfim.identification.task import FitTask
@@ -78,6 +79,7 @@ class _Findings:
         at_bound: Names of the parameters at a bound or beyond it.
         outside: True where a parameter is beyond a bound.
         interrupted: True after a request to stop.
+        unpredictable: A motion that is too unstable for the segments of a poor fit, or None.
     """
 
     result: FitResult
@@ -88,6 +90,7 @@ class _Findings:
     at_bound: tuple[str, ...]
     outside: bool
     interrupted: bool
+    unpredictable: UnpredictableMotion | None
 
 
 def estimate_from(result: FitResult, budget: Budget) -> Estimate:
@@ -133,8 +136,22 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
         at_bound=at_bound,
         outside=outside,
         interrupted=budget.stop.requested,
+        unpredictable=_unpredictable(result, bool(reasons or quality.unexplained)),
     )
     return _estimate(findings, predictions)
+
+
+def _unpredictable(result: FitResult, is_poor: bool) -> UnpredictableMotion | None:
+    """A motion that is too unstable for the segments; None for a good fit, which needs no advice.
+
+    Args:
+        result: The fit.
+        is_poor: True where the fit does not explain the data, although it may have converged.
+    """
+    solution = result.solution
+    if solution.interrupted or not (is_poor or not solution.success):
+        return None
+    return unpredictable_motion(result.problem, solution.unknowns)
 
 
 def _missing_terms(
@@ -298,6 +315,9 @@ def _warnings_of_search(findings: _Findings) -> Iterator[str]:
     """Warnings about an interrupted search, a poor minimum and undetermined parameters."""
     quality = findings.quality
     accuracy = findings.accuracy
+    if findings.unpredictable is not None:
+        yield str(findings.unpredictable)
+
     if findings.interrupted and not findings.result.solution.interrupted:
         yield "interrupted after the search: there are no predictions of data that were not fitted"
 

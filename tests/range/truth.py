@@ -151,6 +151,8 @@ def relative_change(one: Array, two: Array) -> float:
     if not (np.isfinite(one).all() and np.isfinite(two).all()):
         return float("inf")
     scale = np.sqrt(np.diag(two))
+    if not one.any() and not two.any():
+        return 0.0
     if not (scale > 0.0).all():
         return float("inf")
     return float(np.abs((one - two) / np.outer(scale, scale)).max())
