@@ -11,7 +11,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Nuisance, ParameterSpec
-from mjfim.model.coordinates import ModelCoordinates, unknown_coordinate
+from mjfim.model.coordinates import unknown_coordinate
 from mjfim.model.elements import identifier, names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource
@@ -64,7 +64,7 @@ def resolve_parameters(
     Raises:
         ExperimentError: A parameter cannot be resolved; the message names its key.
     """
-    nuisance = list(_nuisance_parameters(experiment.nuisance, source.coordinates, outputs))
+    nuisance = list(_nuisance_parameters(experiment.nuisance, source, outputs))
 
     resolved: list[Parameter] = []
     for name, spec in experiment.parameters.items():
@@ -230,12 +230,13 @@ def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[in
 
 
 def _nuisance_parameters(
-    stated: Nuisance, coordinates: ModelCoordinates, outputs: Sequence[str]
+    stated: Nuisance, source: ModelSource, outputs: Sequence[str]
 ) -> Iterator[Parameter]:
     """Parameters of the table `nuisance`.
 
     They are deviations of the initial state, biases of outputs, and the delay of all outputs.
     """
+    coordinates = source.coordinates
     deviations = {
         component.name: component for component in coordinates.deviations if component.path
     }
@@ -247,9 +248,13 @@ def _nuisance_parameters(
         )
     for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(deviations)):
         deviation = deviations[name]
-        target = Target(path=deviation.path, field=InitialStateField(deviation.address))
+        start = InitialStateField(deviation.address)
         yield _nuisance_parameter(
-            f"{INITIAL_STATE_PREFIX}{name}", target, prior, unit=deviation.unit
+            f"{INITIAL_STATE_PREFIX}{name}",
+            Target(path=deviation.path, field=start),
+            prior,
+            unit=deviation.unit,
+            magnitude=start.magnitude(source.model),
         )
 
     for name, prior in _priors_by_name("nuisance.bias", stated.bias, outputs):

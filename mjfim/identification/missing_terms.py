@@ -20,6 +20,7 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.identification.residuals import FitProblem
 from mjfim.model.coordinates import scalar_joints
+from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.units import JOINT_FIELD_UNITS
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -32,7 +33,8 @@ SIGNIFICANCE = 1e-3
 # Smallest share of the sum of squared residuals that a reported term explains.
 MIN_EXPLAINED_SHARE = 2e-3
 
-# Size at which the sensitivity of a term is taken where it is zero in the model [unit of the term].
+# Size at which the sensitivity of a term is taken where it is zero in the model, relative to the
+# inertia of its joint and the natural time of the motion.
 LINEARISATION_SIZE = 1e-4
 
 # Largest number of candidates.
@@ -72,6 +74,7 @@ class Candidate:
         positive: True where only positive values make sense.
         value: Value in the model [unit].
         linearised_at: Value at which its sensitivity is taken [unit].
+        size: Small size of the term, larger than 0 [unit].
     """
 
     description: str
@@ -80,6 +83,7 @@ class Candidate:
     positive: bool
     value: float
     linearised_at: float
+    size: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -179,7 +183,7 @@ def _extended_system(
         tables[name] = {
             "target": candidate.path,
             "guess": candidate.linearised_at,
-            "scale": LINEARISATION_SIZE,
+            "scale": candidate.size,
         }
 
     try:
@@ -285,12 +289,23 @@ def _candidates(system: System, free_starts: bool) -> Iterator[Candidate]:
             positive=True,
             value=0.0,
             linearised_at=0.0,
+            size=LINEARISATION_SIZE * system.plant.dt,
         )
 
 
 def _joint_terms(system: System) -> Iterator[Candidate]:
     """Friction, damping, rotor inertia and stiffness of every joint with one degree of freedom."""
     model: Any = system.model
+    time = system.plant.dt / LEAST_MOVE_PER_SAMPLE
+    force = LINEARISATION_SIZE * force_sizes(model, time)
+    stiffness = force / position_sizes(model)
+    sizes = {
+        "frictionloss": force,
+        "damping": stiffness * time,
+        "armature": stiffness * time**2,
+        "stiffness": stiffness,
+    }
+
     for joint in scalar_joints(model):
         for field, words in JOINT_TERMS.items():
             # MuJoCo stores stiffness by joint, the other fields by degree of freedom.
@@ -299,13 +314,15 @@ def _joint_terms(system: System) -> Iterator[Candidate]:
             else:
                 value = float(getattr(model, f"dof_{field}")[joint.v])
 
+            size = float(sizes[field][joint.v])
             yield Candidate(
                 description=f"{words} of {joint.name}",
                 path=f"joint/{joint.name}:{field}",
                 unit=JOINT_FIELD_UNITS[field][joint.unit],
                 positive=True,
                 value=value,
-                linearised_at=value or LINEARISATION_SIZE,
+                linearised_at=value or size,
+                size=size,
             )
 
 
@@ -319,4 +336,5 @@ def _output_biases(system: System) -> Iterator[Candidate]:
             positive=False,
             value=0.0,
             linearised_at=0.0,
+            size=1.0,
         )

@@ -37,8 +37,8 @@ MIN_BLOCK_ROWS = 8
 # Approximate largest number of blocks into which all rows are divided.
 MAX_BLOCKS = 1024
 
-# Standard deviation of the prior on a free initial state [m, rad, m/s, ...]. This weak prior keeps
-# components finite that no output determines.
+# Standard deviation of the prior on a free initial state, relative to the natural sizes of the
+# state. This weak prior keeps components finite that no output determines.
 FREE_START_SIGMA = 1e3
 
 # Largest increase of a delay during the search, in prior standard deviations of its parameters, or
@@ -660,8 +660,9 @@ class FitProblem:
         # A weak prior on a free initial state, for components that no output determines.
         if self.layout.free_starts:
             rows = np.zeros((count, n, m))
-            rows[:, diagonal, diagonal] = 1.0 / FREE_START_SIGMA
-            rows[:, :, -1] = at.private / FREE_START_SIGMA
+            sigma = FREE_START_SIGMA * self.system.plant.sizes.state
+            rows[:, diagonal, diagonal] = 1.0 / sigma
+            rows[:, :, -1] = at.private / sigma
             return rows
         if not n:
             return np.zeros((count, 0, m))

@@ -107,7 +107,8 @@ def force_sizes(model: Any, time: float) -> Array:
     Returns:
         (nv,) forces [N or N m].
     """
-    inertia = 1.0 / np.maximum(model.dof_invweight0, mujoco.mjMINVAL)
+    weight = np.asarray(model.dof_invweight0)
+    inertia = 1.0 / np.where(weight > 0.0, weight, 1.0)
     return np.asarray(inertia * position_sizes(model) / time**2)
 
 
@@ -130,7 +131,7 @@ def _control_size(model: Any, actuator: int, control: int, time: float) -> float
     output = int(model.actuator_outadr[actuator])
     force = float(np.abs(model.actuator_forcerange[output]).max())
     if not force > 0.0:
-        force = length / time**2 / max(float(model.actuator_acc0[output]), mujoco.mjMINVAL)
+        force = length / time**2 / (float(model.actuator_acc0[output]) or 1.0)
     return force / gain
 
 

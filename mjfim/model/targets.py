@@ -24,6 +24,7 @@ import numpy as np
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
+from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, position_sizes
 
 # Array of MjModel -> array that says whether the frame of the element coincides with that of its
 # body. MuJoCo skips the position of such elements, so the flag is cleared when the position is
@@ -226,6 +227,16 @@ class InitialStateField(DeviationField):
     """
 
     tangent: int
+
+    def magnitude(self, model: Any) -> float:
+        """Natural size of the component: 1 rad, the length of the model, or such a size per time.
+
+        The time is that of many engine steps. Activations have the magnitude 1.
+        """
+        sizes = position_sizes(model)
+        speeds = LEAST_MOVE_PER_SAMPLE * sizes / float(model.opt.timestep)
+        both = np.concatenate([sizes, speeds])
+        return float(both[self.tangent]) if self.tangent < len(both) else 1.0
 
 
 @dataclass(frozen=True)

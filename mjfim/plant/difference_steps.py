@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE
 from mjfim.records.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -51,6 +50,4 @@ class DifferenceSteps:
         Returns:
             (nx+nu,) magnitudes [x-unit, u-unit].
         """
-        sizes = self.plant.sizes
-        least_speed = LEAST_MOVE_PER_SAMPLE * sizes.position / self.plant.dt
-        return sizes.along(trajectory, least_speed)
+        return self.plant.sizes.along(trajectory)

@@ -329,13 +329,15 @@ class RolloutDerivatives(DifferenceSteps):
 
         # A parameter that is a deviation of the initial state moves theta and the initial state.
         state_moves = theta_moves @ plant.initial_state_derivative.T
-        state_moves[len(moving) :] = step * start_directions.T
+        reach = (np.abs(start_directions) / plant.sizes.state[:, None]).max(axis=0, initial=0.0)
+        start_steps = step / np.maximum(reach, TINY)
+        state_moves[len(moving) :] = start_steps[:, None] * start_directions.T
 
         return _ResponseMoves(
             theta=_with_origin(theta_moves, central),
             initial_state=_with_origin(state_moves, central),
             moving=moving,
-            widths=np.concatenate([h, np.full(k, step)]) * (2.0 if central else 1.0),
+            widths=np.concatenate([h, start_steps]) * (2.0 if central else 1.0),
             central=central,
         )
 

@@ -24,6 +24,7 @@ class StateSizes:
         space: Layout of the state.
         position: (nv,) sizes of positions, 1 for rotations [m or rad].
         translates: (nv,) True for translations.
+        velocity: (nv,) speeds below which a motion counts as slow [m/s or rad/s].
         activation: (na,) sizes of activations [unit of the actuator].
         control: (nu,) sizes of controls [u-unit].
     """
@@ -31,6 +32,7 @@ class StateSizes:
     space: StateSpace
     position: Array
     translates: np.ndarray
+    velocity: Array
     activation: Array
     control: Array
 
@@ -55,25 +57,35 @@ class StateSizes:
             if first >= 0 and int(model.actuator_ctrlnum[actuator]):
                 activation[first : first + count] = control[int(model.actuator_ctrladr[actuator])]
 
+        position = position_sizes(model)
         return StateSizes(
             space=space,
-            position=position_sizes(model),
+            position=position,
+            velocity=LEAST_MOVE_PER_SAMPLE * position / dt,
             translates=translations(model),
             activation=activation,
             control=control,
         )
 
-    def along(self, trajectory: Trajectory, least_speed: Array) -> Array:
+    @property
+    def state(self) -> Array:
+        """(nx,) natural sizes of the state [x-unit]."""
+        return np.concatenate([self.position, self.velocity, self.activation])
+
+    def along(self, trajectory: Trajectory, least_speed: Array | None = None) -> Array:
         """Sizes along a trajectory.
 
         Args:
             trajectory: The trajectory.
-            least_speed: (nv,) speeds below which a coordinate counts as slow [m/s or rad/s].
+            least_speed: (nv,) speeds below which a coordinate counts as slow [m/s or rad/s];
+                default: `velocity`.
 
         Returns:
             (nx+nu,) largest values along the trajectory; natural sizes where they are larger, and
             for rotations [x-unit, u-unit].
         """
+        if least_speed is None:
+            least_speed = self.velocity
         velocity = np.maximum(least_speed, np.abs(trajectory.qvel).max(axis=0, initial=0.0))
         return np.concatenate(
             [

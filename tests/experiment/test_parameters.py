@@ -230,13 +230,18 @@ def test_messages_about_wrong_parameters(name: str, tmp_path: Path) -> None:
         body_task(tmp_path, parameters=table)
 
 
+# Distance from the hull to the arm, to its centre of mass, and its largest radius of gyration [m].
+BODY_LENGTH = 0.15 + np.hypot(0.05, 0.25) + np.sqrt(0.012 / 0.4)
+
+
 @pytest.mark.parametrize(
     ("path", "guess", "unit", "scale"),
     [
         ("joint/ball:damping", 0.05, "N m s/rad", 0.05),
         ("body/arm:mass", 0.4, "kg", 0.4),
         ("body/arm:rot[1]", 0.0, "rad", 1.0),
-        ("initial/float:qpos.y", 0.0, "m", 1.0),
+        ("initial/float:qpos.y", 0.0, "m", BODY_LENGTH),
+        ("initial/float:qvel.y", 0.0, "m/s", BODY_LENGTH),
         ("initial/float:qpos.ry", 0.0, "rad", 1.0),
         ("initial/float:qvel.ry", 0.0, "rad/s", 1.0),
         ("initial/ball:qvel.rx", 0.0, "rad/s", 1.0),
