@@ -22,7 +22,7 @@ from mjfim.excitation.feasibility import SHRINK_FACTORS
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.interior_point import BarrierSchedule, InteriorPointMethod, updated_tightening
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.multistart import Multistart, _Feasible
+from mjfim.excitation.multistart import Multistart, _Feasible, _merge_rounds
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
@@ -507,6 +507,47 @@ def test_limits_are_tightened_where_violated_and_released_where_well_kept() -> N
     )
     assert held == pytest.approx({"position": 0.16, "control": 0.07, "force": 0.0})
     assert updated_tightening({}, {"velocity": -0.1}) == pytest.approx({"velocity": 0.12})
+
+
+# ---- more iterations
+
+
+def test_the_last_stage_uses_all_iterations_that_are_left(tmp_path: Path) -> None:
+    """Before, it ended after twice its patience and said that the budget was used up."""
+    free = cart_inside(tmp_path, horizon=0.4).relaxed()
+    schedule = BarrierSchedule(first=0.1, last=0.05, patience=2)
+    method = replace(method_of(free), schedule=schedule)
+    begin = 0.2 * free.control
+    iterates = list(method.run(begin, Budget(iterations=12)))
+    assert iterates[-1].iterate.index == 12
+    assert {iterate.mu for iterate in iterates} == {0.1, 0.05}
+
+
+@pytest.mark.slow
+def test_more_iterations_never_give_less(tmp_path: Path) -> None:
+    """The result is the best feasible iterate of the run, and a larger budget improves on it."""
+    costs = {}
+    for iterations in (8, 200, 800):
+        rows: list[HistoryRow] = []
+        descent = {"max_iterations": iterations, "coarse": 1}
+        task = cart_inside(tmp_path, horizon=0.4, descent=descent)
+        design = design_task(task, callback=lambda event, rows=rows: rows.append(event.row))
+        seen = min(row.cost for row in rows if row.margin >= 0.0)
+        assert design.final.cost <= seen * (1 + 1e-4)
+        costs[iterations] = design.final.cost
+        reached = Status.MAX_ITERATIONS if iterations == 8 else Status.CONVERGED
+        assert design.status is reached
+    assert costs[800] <= costs[200] * (1 + 1e-9)
+    assert costs[200] < costs[8]
+
+
+def test_a_second_round_that_converges_at_a_higher_cost_is_not_reported() -> None:
+    control = np.zeros((3, 1))
+    first = RunResult(name="x", control=control, cost=1.0, status=Status.MAX_ITERATIONS)
+    second = RunResult(name="x", control=control + 1.0, cost=2.0, status=Status.CONVERGED)
+    (merged,) = _merge_rounds([first], [second])
+    assert merged.control is control
+    assert merged.status is Status.BEST_SEEN
 
 
 # ---- several starts
