@@ -205,7 +205,13 @@ class Multistart:
         Each control is shrunk about the controls that hold the start, even when the time is used
         up. Where that does not help, these are steered inside the limits.
         """
-        results = [self._rescued_by_shrinking(result) for result in results]
+        results = list(results)
+        for i, result in enumerate(results):
+            # With several starts this may take long.
+            if i and self.budget.exhausted is not None:
+                break
+            results[i] = self._rescued_by_shrinking(result)
+
         best = min(range(len(results)), key=lambda i: results[i].cost, default=None)
         if best is None:
             return results
@@ -234,19 +240,24 @@ class Multistart:
         if result.control is None:
             return result
 
-        found = [self._shrink(control) for control in (result.control, self.fine.task.control)]
+        found = (self._shrink(result.control), self._shrunk_initial)
         best = min(found, key=lambda feasible: feasible.cost)
         if not np.isfinite(best.cost):
             return result
         begun = replace(result, control=best.control, cost=best.cost)
         return replace(begun, status=Status.MAX_ITERATIONS)
 
+    @cached_property
+    def _shrunk_initial(self) -> _Feasible:
+        """The initial control, shrunk inside the limits."""
+        return self._shrink(self.fine.task.control)
+
     def _steered_begins(self, results: Sequence[RunResult]) -> list[Array]:
         """Controls, (N, nu) each, from which the limits may be reached without the cost."""
         task = self.fine.task
         held = [np.broadcast_to(centre, task.control.shape) for centre in reversed(task.centres)]
         found = [result.control for result in results if result.control is not None]
-        return [np.array(control) for control in (*held, *found)]
+        return [np.array(control) for control in (*held, *found[:1])]
 
     def _continue_inside(
         self, result: RunResult, control: Array
