@@ -69,10 +69,10 @@ CALLS = {
         )
     ),
     "robustness": Call(
-        words=("robustness", "study.toml", "made", *FOLDER, "--runs", "4"), has_workers=True
+        words=("robustness", "study.toml", "made", *FOLDER, "--runs", "3"), has_workers=True
     ),
     "robustness of a new design": Call(
-        words=("robustness", "limited.toml", *FOLDER, "--runs", "3", "--jobs", "1"),
+        words=("robustness", "limited.toml", *FOLDER, "--runs", "2", "--jobs", "1"),
         has_workers=True,
     ),
     "campaign": Call(
@@ -164,7 +164,7 @@ def valid_study() -> Path:
 
 def _write_limited(folder: Path) -> None:
     """A study under hard limits; its initial controls run in worker processes."""
-    study = write_experiment(folder, tolerance="1e-12", max_iterations="12\nstarts = 4")
+    study = write_experiment(folder, tolerance="1e-12", max_iterations="8\nstarts = 3")
     limits = "\n[limits]\nposition = { slide = [-1.0, 1.0] }\ncontrol = { force = [-5.0, 5.0] }\n"
     text = study.read_text(encoding="utf-8") + limits
     (folder / "limited.toml").write_text(text, encoding="utf-8")

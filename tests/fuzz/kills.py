@@ -62,7 +62,6 @@ KILLS = (
     ("SIGTERM", "SIGINT"),
     ("SIGINT", "SIGKILL"),
     (WORKER,),
-    (WORKER,),
 )
 
 
