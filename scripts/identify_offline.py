@@ -18,10 +18,11 @@ import sys
 from pathlib import Path
 
 import mjfim
-from mjfim.errors import MjfimError
+from mjfim.errors import MjfimError, NoResultError
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
+from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, Interruption
 from mjfim.output.manifest import OutputGuard, claimed
 from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings.read import read_recording
@@ -37,8 +38,18 @@ def main() -> int:
     parser.add_argument("--force", action="store_true", help="replace your own identified.xml")
     args = parser.parse_args()
 
+    def announce(sentence: str) -> None:
+        """Show what Ctrl-C does."""
+        print(f"{parser.prog}: {sentence}", file=sys.stderr)
+
+    # Ctrl-C ends the fit with its best result so far, which is written.
     try:
-        return identify(args.experiment, args.recordings, force=args.force)
+        with Interruption(announce) as interruption:
+            code = identify(args.experiment, args.recordings, force=args.force)
+        return INTERRUPTED_CODE if interruption.presses else code
+    except NoResultError:
+        announce(NOTHING_SENTENCE)
+        return INTERRUPTED_CODE
     except MjfimError as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 2

@@ -16,6 +16,7 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 import mjfim
+from mjfim.atomic_io import remove_temporary_files
 from mjfim.errors import MjfimError, NoResultError, RecordingError, UnfinishedError
 from mjfim.interruption import (
     INTERRUPTED_CODE,
@@ -260,6 +261,9 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
             if interruption.presses and not end.exit_code:
                 raise typer.Exit(INTERRUPTED_CODE) from None
             raise
+        finally:
+            # A press may have come between the creation of a temporary file and its removal.
+            remove_temporary_files()
 
         if interruption.presses:
             raise typer.Exit(INTERRUPTED_CODE)

@@ -13,7 +13,7 @@ KINDS = ("problem", "input", "kill", "mechanism", "fault")
 TIME_LIMITS = {
     "problem": 180.0,
     "input": 60.0,
-    "kill": 180.0,
+    "kill": 300.0,
     "mechanism": 180.0,
     "fault": 60.0,
 }
