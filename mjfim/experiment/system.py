@@ -189,6 +189,27 @@ class System:
             return replace(self, variant=variant, plant=plant(speeds, None))
         return replace(self, variant=variant, plant=plant((), plant(speeds, None)))
 
+    def with_substeps(self, substeps: int) -> System:
+        """This system, as the experiment states it, with samples of another length.
+
+        Recordings whose rows lie between the samples are simulated on this shorter grid.
+
+        Args:
+            substeps: Engine steps of a sample, at most those that the experiment states.
+
+        Returns:
+            The system; plant models and counted engine steps are shared.
+        """
+        grid = replace(
+            self.stated_grid,
+            dt=substeps * float(self.model.opt.timestep),
+            substeps=substeps,
+            stride=max(self.stated_grid.stride * self.stated_grid.substeps // substeps, 1),
+            playback_steps=substeps,
+        )
+        plant = self.plant.with_substeps(substeps)
+        return replace(self, variant=STATED, stated_grid=grid, plant=plant)
+
     def calibrated(self, theta: Array, ctrl: Array) -> System:
         """This system with difference steps that suit the trajectory of a control.
 

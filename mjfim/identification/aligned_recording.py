@@ -6,6 +6,7 @@ because that would colour their noise. Predictions are interpolated instead.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +16,7 @@ import numpy as np
 from mjfim.arrays import Array, freeze
 from mjfim.errors import RecordingError, listed, unknown
 from mjfim.experiment.system import System
+from mjfim.model.variants import STATED
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
@@ -71,6 +73,48 @@ class AlignedRecording:
         return tuple(np.flatnonzero(column) for column in self.measured.T)
 
 
+def on_grid_of(system: System, recordings: Sequence[Recording]) -> System:
+    """A system whose samples are so short that rows of recordings lie on their edges.
+
+    A control that changes inside a sample acts on the robot when it changes, not as a mean over
+    the sample. So samples are shortened down to single engine steps, which cannot be divided.
+
+    Args:
+        system: System as the experiment states it.
+        recordings: Recordings in SI units.
+
+    Returns:
+        The system with the longest such samples, at most those that the experiment states; with
+        samples of one engine step where rows lie inside engine steps.
+    """
+    stated = system.grid.substeps
+    timestep = system.dt / stated
+    times = [recording.t - recording.t[0] for recording in recordings if len(recording.t)]
+    if system.variant != STATED or all(_lie_on_grid(t, system.dt) for t in times):
+        return system
+
+    # Engine steps after which there are rows; their common divisors are possible samples.
+    if all(_lie_on_grid(t, timestep) for t in times):
+        steps = np.concatenate([np.rint(t / timestep).astype(np.int64) for t in times])
+        common = int(np.gcd.reduce(steps))
+        return system.with_substeps(_largest_divisor(common, stated))
+    return system.with_substeps(1)
+
+
+def _lie_on_grid(t: Array, dt: float) -> bool:
+    """Whether all times t: (M,) [s] are multiples of the period dt [s].
+
+    False for times that are missing, which `align` refuses.
+    """
+    return bool(np.abs(t - np.rint(t / dt) * dt).max() <= GRID_TOLERANCE * dt)
+
+
+def _largest_divisor(number: int, limit: int) -> int:
+    """Largest divisor of a number that does not exceed a limit; 1 for the number 0."""
+    divisors = (k for k in range(min(number, limit), 0, -1) if number % k == 0)
+    return next(divisors, 1)
+
+
 def align(system: System, recording: Recording) -> AlignedRecording:
     """Align a recording with the sample grid of a system.
 
@@ -91,7 +135,7 @@ def align(system: System, recording: Recording) -> AlignedRecording:
 
     # Time stamps that nearly lie on the grid are moved onto it.
     sample = np.rint(t / dt)
-    on_grid = bool(np.abs(t - sample * dt).max() <= GRID_TOLERANCE * dt)
+    on_grid = _lie_on_grid(t, dt)
     if on_grid:
         t = sample * dt
 

@@ -35,8 +35,11 @@ BOUND_TOLERANCE = 1e-6
 
 
 # A recording is remarked on if at least this share of the changes of its control lies inside
-# samples of the experiment.
+# engine steps of the model.
 MIN_SHARE_WITHIN_SAMPLES = 0.05
+
+# Relative rounding of the ratio of two periods.
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -279,7 +282,7 @@ def _warnings(findings: _Findings) -> Iterator[str]:
     if findings.reasons and findings.quality.worst_residual is not None:
         yield str(findings.quality.worst_residual)
     if findings.reasons:
-        yield from _warnings_of_rate(result.task)
+        yield from _warnings_of_rate(result)
     for term in findings.missing:
         yield f"the model may lack {term}"
 
@@ -293,22 +296,28 @@ def _warnings(findings: _Findings) -> Iterator[str]:
             yield f"poor data in {Path(recording.name).name}: {remark}"
 
 
-def _warnings_of_rate(task: FitTask) -> Iterator[str]:
-    """Warnings about recordings whose control changes inside the samples of the experiment."""
-    dt = task.system.dt
-    for recording in task.recordings:
+def _warnings_of_rate(result: FitResult) -> Iterator[str]:
+    """Warnings about recordings whose control changes inside the engine steps of the model."""
+    dt = result.problem.system.dt
+    for recording in result.task.recordings:
         count = len(recording.t) - 1
         share = changes_within_samples(recording.t, recording.ctrl[:count], dt)
         if share < MIN_SHARE_WITHIN_SAMPLES:
             continue
 
-        rate = 1.0 / float(np.median(np.diff(recording.t)))
+        period = float(np.median(np.diff(recording.t)))
         yield (
             f"{100 * share:.0f} % of the changes of the control in {Path(recording.name).name} lie "
-            f"inside the samples of the experiment ({1.0 / dt:g} Hz), which hold its mean: this "
-            f"alone can cause a misfit. State the rate of the log, rate = {rate:.4g}, in the "
-            "experiment file (each sample is a whole number of timesteps of the model)"
+            f"inside the engine steps of the model ({dt:g} s), which hold its mean: this alone can "
+            f"cause a misfit. State a timestep in the MJCF that divides the period of the log, for "
+            f'example timestep="{_dividing_timestep(period, dt):.4g}", and rate = '
+            f"{1.0 / period:.4g} in the experiment file"
         )
+
+
+def _dividing_timestep(period: float, timestep: float) -> float:
+    """Longest timestep [s] of at most `timestep` [s] of which a period [s] is a whole number."""
+    return period / np.ceil(period / timestep * (1.0 - ROUNDING))
 
 
 def _warnings_of_search(findings: _Findings) -> Iterator[str]:

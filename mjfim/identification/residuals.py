@@ -17,7 +17,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import AlignedRecording, align
+from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.segment_simulation import SegmentRows, SegmentSimulation
 from mjfim.identification.segments import Segment, cut_into_segments, whole_recordings
 from mjfim.identification.unknowns import UnknownLayout
@@ -45,7 +45,7 @@ FREE_START_SIGMA = 1e3
 # in their scales where there is no prior.
 MAX_DELAY_GROWTH = 5.0
 
-# Number of samples of the longest recording along which difference steps are calibrated.
+# Number of stated samples of the longest recording along which difference steps are calibrated.
 CALIBRATION_SAMPLES = 1000
 
 
@@ -136,11 +136,14 @@ class FitProblem:
 
         settings = system.experiment.fit
         parameters = system.parameters
+        stated_substeps = system.grid.substeps
+        system = on_grid_of(system, recordings)
         aligned = tuple(align(system, recording) for recording in recordings)
 
         # Difference steps depend on how strongly each parameter changes the recorded motion.
         longest = max(aligned, key=lambda recording: len(recording.ctrl))
-        system = system.calibrated(parameters.guess, longest.ctrl[:CALIBRATION_SAMPLES])
+        samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
+        system = system.calibrated(parameters.guess, longest.ctrl[:samples])
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = settings.start == "measured" or settings.segments is not None

@@ -5,6 +5,7 @@ Every engine step is counted.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -211,6 +212,17 @@ class SampleSteps:
     observed: Array | None
 
 
+class StepCount:
+    """Number of engine steps, shared by simulators of one model.
+
+    Attributes:
+        steps: `mj_step` calls so far.
+    """
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+
 class BatchSimulator:
     """Steps many simulations of models that share one memory layout.
 
@@ -220,7 +232,6 @@ class BatchSimulator:
         substeps: `mj_step` calls per sample.
         sensors: True if sensor data are requested.
         threads: Number of threads.
-        steps: `mj_step` calls so far.
     """
 
     def __init__(
@@ -244,13 +255,31 @@ class BatchSimulator:
         self.substeps = substeps
         self.sensors = sensors
         self.threads = threads or cores()
-        self.steps = 0
+        self._count = StepCount()
         self._batches: dict[str, Batch] = {}
         self._data = mujoco.MjData(model)
         self._clocks = model.sensor_adr[model.sensor_type == CLOCK_SENSOR]
 
         mocap_bodies = np.flatnonzero(model.body_mocapid >= 0)
         self._mocap_bodies = mocap_bodies[np.argsort(model.body_mocapid[mocap_bodies])]
+
+    @property
+    def steps(self) -> int:
+        """`mj_step` calls so far, those of `with_substeps` included."""
+        return self._count.steps
+
+    def with_substeps(self, substeps: int) -> BatchSimulator:
+        """A simulator with samples of another length; memory and counted steps are shared.
+
+        Args:
+            substeps: `mj_step` calls per sample.
+
+        Returns:
+            The simulator.
+        """
+        other = copy.copy(self)
+        other.substeps = substeps
+        return other
 
     def step(
         self,
@@ -312,7 +341,7 @@ class BatchSimulator:
         record = self._recorded_fields(observations)
         with silence_mujoco_log():
             out = batch.rollout(held.shape[1], held, record=record, ids=ids)
-        self.steps += count * held.shape[1]
+        self._count.steps += count * held.shape[1]
 
         # Engine step i is recorded after the step: sample k ends with step k * substeps.
         engine_steps = ctrl.shape[1] * self.substeps
@@ -389,7 +418,7 @@ class BatchSimulator:
                 ctrl[:] = u
                 mujoco.mj_step(model, data, substeps)
                 q[:], v[:], a[:] = qpos, qvel, act
-        self.steps += N * substeps
+        self._count.steps += N * substeps
 
         finite = (
             np.isfinite(states).all()
@@ -461,7 +490,7 @@ class BatchSimulator:
 
         with silence_mujoco_log():
             sensors, observed = self._advance(batch, ids, count, observations)
-        self.steps += self.substeps * count
+        self._count.steps += self.substeps * count
 
         names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
         after = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)

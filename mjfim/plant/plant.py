@@ -135,6 +135,22 @@ class Plant:
         other._step_factors = factors
         return other
 
+    def with_substeps(self, substeps: int) -> Plant:
+        """A plant with samples of another length; models and counted engine steps are shared.
+
+        Args:
+            substeps: `mj_step` calls per sample.
+
+        Returns:
+            The plant, whose difference steps are those of this one.
+        """
+        other = copy.copy(self)
+        other.simulator = self.simulator.with_substeps(substeps)
+        other.dt = substeps * float(self.source.model.opt.timestep)
+        if self._smooth is not None:
+            other._smooth = self._smooth.with_substeps(substeps)
+        return other
+
     def with_initial_state(self, state: Array) -> Plant:
         """A plant with another nominal initial state; simulator and models are shared.
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
 import mjfim
+from mjfim.arrays import Array
 from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
@@ -162,32 +164,76 @@ def test_one_extreme_value_is_named_where_the_simulation_diverges(
         mjfim.identify(experiment, [faulty], threads=1)
 
 
-def test_a_log_at_a_higher_rate_is_fitted_at_its_own_rate(tmp_path: Path) -> None:
-    """At half the rate of the log every other change of the control acts too early or too late.
+# Further rates of logs [Hz].
+OTHER_RATES = (50, 80, 100, 200, 250, 1000, "irregular")
 
-    The warning names the cause, and the rate of the log mends it.
+
+def log_of_another_rate(
+    folder: Path, timestep: float, t: Array
+) -> tuple[mjfim.Experiment, Recording]:
+    """A cart-pendulum at 100 Hz and a log of it, whose control jumps at the times t: (M,) [s].
+
+    The log is a simulation in plain MuJoCo, whose steps end at the rows of the log.
     """
     model = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
-    model = model.replace('timestep="0.01"', 'timestep="0.005"')
-    (tmp_path / "fine.xml").write_text(model, encoding="utf-8")
-    text = MINIMAL.replace((MODELS / "cart_pendulum.xml").as_posix(), "fine.xml")
+    model = model.replace('timestep="0.01"', f'timestep="{timestep}"')
+    (folder / "other.xml").write_text(model, encoding="utf-8")
+    text = MINIMAL.replace((MODELS / "cart_pendulum.xml").as_posix(), "other.xml")
     text = text.replace("state = 0.05", "state = 0.001")
-    for rate in (100, 200):
-        stated = text.replace("rate = 100.0", f"rate = {rate}.0")
-        (tmp_path / f"{rate}.toml").write_text(stated, encoding="utf-8")
-    slow, fast = (mjfim.Experiment.from_file(tmp_path / f"{rate}.toml") for rate in (100, 200))
+    (folder / "other.toml").write_text(text, encoding="utf-8")
+    experiment = mjfim.Experiment.from_file(folder / "other.toml")
+    system, rng = System.resolve(experiment, threads=1), np.random.default_rng(1)
 
-    system, rng = System.resolve(fast), np.random.default_rng(1)
-    t, ctrl = np.arange(201) * system.dt, 10.0 * rng.standard_normal((200, 1))
-    y, _ = system.plant.measure(system.parameters.true[None], ctrl)
-    y = y[0] + 0.001 * rng.standard_normal(y[0].shape)
-    log = Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log")
+    truth = system.model_at(system.parameters.true)
+    data = mujoco.MjData(truth)
+    data.qpos[:] = system.space.split(system.nominal_initial_state)[0]
+    ctrl = 10.0 * rng.standard_normal((len(t) - 1, 1))
+    y = [np.concatenate([data.qpos, data.qvel])]
+    for u, period in zip(ctrl, np.diff(t), strict=True):
+        steps = int(np.ceil(period / timestep - 1e-6))
+        truth.opt.timestep = period / steps
+        data.ctrl[:] = u
+        mujoco.mj_step(truth, data, steps)
+        y.append(np.concatenate([data.qpos, data.qvel]))
 
-    at_half_rate = mjfim.identify(slow, [log], threads=1)
-    assert at_half_rate.misfit
-    cause = [warning for warning in at_half_rate.warnings if "rate = 200" in warning]
-    assert cause and cause[0].startswith("50 % of the changes of the control in log lie inside")
+    noisy = np.array(y) + 0.001 * rng.standard_normal((len(t), 4))
+    names = ("qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge")
+    return experiment, Recording(t=t, ctrl=ctrl, y=noisy, outputs=names, name="log")
 
-    at_its_rate = mjfim.identify(fast, [log], threads=1)
-    assert not at_its_rate.misfit
-    assert not any("inside the samples" in warning for warning in at_its_rate.warnings)
+
+@pytest.mark.parametrize(
+    "rate",
+    [125, *(pytest.param(rate, marks=pytest.mark.slow) for rate in OTHER_RATES)],
+)
+def test_a_log_of_any_rate_is_fitted_where_engine_steps_end_at_its_rows(
+    rate: int | str, tmp_path: Path
+) -> None:
+    """Controls jump between the samples at 100 Hz, and act there.
+
+    Held as a mean over each sample they gave a misfit, with the warning to state the rate.
+    """
+    count = 200 if rate == "irregular" else int(rate)
+    t = np.arange(count + 1) / count
+    if rate == "irregular":
+        t[1:-1] += np.random.default_rng(2).choice([-0.0015, 0.0, 0.0005], count - 1)
+
+    experiment, log = log_of_another_rate(tmp_path, 0.0005, t)
+    estimate = mjfim.identify(experiment, [log], threads=1)
+    assert not estimate.misfit
+    assert abs(estimate.chi2 / estimate.dof - 1.0) < 5.0 * np.sqrt(2.0 / estimate.dof)
+    system = System.resolve(experiment, threads=1)
+    assert np.abs((estimate.theta - system.parameters.true) / estimate.std).max() < 4.0
+
+
+@pytest.mark.parametrize(
+    ("rate", "remedy"),
+    [(125, 'timestep="0.008", and rate = 125'), (1000, 'timestep="0.001", and rate = 1000')],
+)
+def test_a_log_with_jumps_inside_engine_steps_is_a_misfit_with_its_remedy(
+    rate: int, remedy: str, tmp_path: Path
+) -> None:
+    experiment, log = log_of_another_rate(tmp_path, 0.01, np.arange(rate + 1) / rate)
+    estimate = mjfim.identify(experiment, [log], threads=1)
+    assert estimate.misfit
+    cause = [warning for warning in estimate.warnings if remedy in warning]
+    assert cause and "lie inside the engine steps of the model (0.01 s)" in cause[0]
