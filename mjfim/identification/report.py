@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -317,7 +318,7 @@ def _warnings_of_rate(result: FitResult) -> Iterator[str]:
 
 def _dividing_timestep(period: float, timestep: float) -> float:
     """Longest timestep [s] of at most `timestep` [s] of which a period [s] is a whole number."""
-    return period / np.ceil(period / timestep * (1.0 - ROUNDING))
+    return period / math.ceil(period / timestep * (1.0 - ROUNDING))
 
 
 def _warnings_of_search(findings: _Findings) -> Iterator[str]:
