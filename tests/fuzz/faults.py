@@ -248,6 +248,7 @@ def odd_numbers(rng: Rng, folder: Path) -> Call:
     share = float(rng.choice([0.01, 0.3, 1.0]))
     for name in names:
         columns[name] = [value if rng.random() < share else v for v in columns[name]]
+        columns[name][int(rng.integers(len(columns[name]) - 1))] = value
     kind, words = _write_log(rng, folder, columns)
     refused = any(np.isinf(columns[name]).any() for name in ("t", "ctrl:force"))
     what = "all columns" if len(names) > 1 else names[0]
