@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.cli.announcements import announce_check, announce_recordings
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -20,6 +21,7 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
+from mjfim.excitation.task_parts import require_design_keys, stated_control
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.output import archive
@@ -55,7 +57,8 @@ def check(
     """Say which parameters can be identified, how accurately, and which only in combination."""
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(stated, threads=threads)
-    loaded = [read_recording(path, system.channels) for path in recordings or []]
+    with progress("reading"):
+        loaded = [read_recording(path, system.channels) for path in recordings or []]
     trajectory = None
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]
@@ -64,6 +67,13 @@ def check(
         inputs = input_files(stated, [*(recordings or []), design_file])
         claim_folder(output, CHECK_FILES, inputs, force=force)
 
+    if loaded:
+        announce_recordings(system, loaded, fit=False)
+    elif trajectory is not None:
+        announce_check(system, trajectory.ctrl)
+    else:
+        require_design_keys(stated, "check without recordings")
+        announce_check(system, stated_control(system))
     with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import functools
 import io
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -54,6 +57,9 @@ out = Console(
 # if stderr is not a terminal.
 DESIGN_LINES = 10
 FIT_LINES = 5
+
+# Time after which a line of progress is due, if stderr is not a terminal [s].
+LINE_SECONDS = 10.0
 
 # Arguments and options that several verbs share.
 ExperimentFile = Annotated[
@@ -302,6 +308,24 @@ class ProgressDisplay:
         self._bar = bar
         self._task = bar.add_task(description, total=None)
         self._announced_part = ""
+        self._latest = description
+        self._begun = self._told = time.monotonic()
+
+    def describe(self, description: str) -> None:
+        """Show what is done until the next event."""
+        self._latest = description
+        self._bar.update(self._task, description=description)
+
+    def tell_if_silent(self, seconds: float) -> None:
+        """Without a terminal, print what is done if nothing was printed for some seconds."""
+        now = time.monotonic()
+        if not errors.is_terminal and now - self._told >= seconds:
+            self._print(f"{self._latest} ({now - self._begun:.0f} s)")
+
+    def _print(self, text: str) -> None:
+        """Print a line of progress."""
+        self._told = time.monotonic()
+        errors.print(text, markup=False)
 
     def __call__(self, event: Event) -> None:
         """Show an event.
@@ -335,20 +359,21 @@ class ProgressDisplay:
 
     def _show_iterate(self, text: str, iteration: int, period: int) -> None:
         """Show an iterate on the bar; without a terminal, print every `period`-th iterate."""
-        self._bar.update(self._task, description=text)
+        self.describe(text)
 
         is_due = iteration % period == 0
         if is_due and not errors.is_terminal:
-            errors.print(text, markup=False)
+            self._print(text)
 
     def _show_study(self, event: StudyEvent) -> None:
         """Show the progress of a study."""
         # Without a known number of parts there is no bar, and each part is a line.
         if event.count is None:
-            errors.print(event.message, markup=False)
+            self._print(event.message)
             return
 
         part = f"{event.index + 1}/{event.count} {event.part}"
+        self._latest = part
         self._bar.update(
             self._task,
             description=f"{part}  {event.message}",
@@ -360,18 +385,19 @@ class ProgressDisplay:
 
         # Without a terminal, each part is a line. A study without messages reports its percentage.
         if not event.message:
-            errors.print(f"{event.part}: {100 * event.share:.0f} %", markup=False)
+            self._print(f"{event.part}: {100 * event.share:.0f} %")
         elif part != self._announced_part:
-            errors.print(part, markup=False)
+            self._print(part)
         self._announced_part = part
 
 
 @contextmanager
-def progress(description: str) -> Iterator[ProgressDisplay]:
+def progress(description: str, line_seconds: float = LINE_SECONDS) -> Iterator[ProgressDisplay]:
     """Show the progress of a long computation on stderr.
 
     Args:
         description: Text until the first event.
+        line_seconds: Silent time after which a line is printed, if stderr is not a terminal [s].
 
     Yields:
         The display, which is called with every event.
@@ -379,7 +405,33 @@ def progress(description: str) -> Iterator[ProgressDisplay]:
     description_column = TextColumn("{task.description}", markup=False)
     columns = (SpinnerColumn(), description_column, BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-        yield ProgressDisplay(bar, description)
+        display = ProgressDisplay(bar, description)
+        with _repeatedly(partial(display.tell_if_silent, line_seconds), 0.1 * line_seconds):
+            yield display
+
+
+@contextmanager
+def _repeatedly(call: Callable[[], None], period: float) -> Iterator[None]:
+    """Call a function from time to time, from another thread, until the context ends.
+
+    Args:
+        call: The function.
+        period: Time between two calls [s].
+    """
+    ended = threading.Event()
+
+    def run() -> None:
+        """Call the function until the context has ended."""
+        while not ended.wait(period):
+            call()
+
+    thread = threading.Thread(target=run, name="mjfim-progress", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def print_result(as_json: bool, summary: dict[str, Any], text: RenderableType) -> None:

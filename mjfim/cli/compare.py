@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.cli.announcements import announce_comparison
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -58,8 +59,10 @@ def compare(
     chosen = (
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
     )
-    names = comparison_files(chosen_methods(task, chosen))
+    baselines = chosen_methods(task, chosen)
+    names = comparison_files(baselines)
     claim_folder(output, names, input_files(task.experiment), force=force)
+    announce_comparison(len(baselines) + 1, seconds)
     with progress("comparing") as show:
         result = compare_task(
             task, seconds=seconds, steps=steps, seed=seed, methods=chosen, callback=show

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Annotated
 
 import typer
 
 import mjfim
 from mjfim.budget import StopToken, stop_on_interrupt
+from mjfim.cli.announcements import announce_design, number_of_starts
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -28,12 +30,17 @@ from mjfim.cli.common import (
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, ShortestExperiment
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.input_files import input_files
+from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import MAX_STARTS
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.summaries import describe_design
 from mjfim.output.text import render
 from mjfim.records.events import Callback
+
+# Time after which a design ends that states none [s].
+DEFAULT_SECONDS = 120.0
 
 
 @contextmanager
@@ -43,10 +50,7 @@ def several(task: DesignTask) -> Iterator[Executor | None]:
     Yields:
         A pool; None without hard limits, and for a single initial control, which uses all threads.
     """
-    descent = task.experiment.descent
-    further = len(descent.previous) + len(descent.fourier) + len(descent.repeats)
-    count = descent.starts + further
-
+    count = number_of_starts(task.system)
     if count == 1 or not task.is_limited:
         yield None
         return
@@ -79,7 +83,16 @@ def design(
     stated = mjfim.Experiment.from_file(experiment)
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
-    task = DesignTask.resolve(stated, threads=threads)
+    require_design_keys(stated)
+    system = System.resolve(stated, threads=threads)
+
+    # A design that states no time ends all the same. The shortest horizon takes many designs.
+    has_default = stated.descent.seconds is None and not shortest
+    if has_default:
+        stated = stated.replace(descent={"seconds": DEFAULT_SECONDS})
+        system = replace(system, experiment=stated)
+    announce_design(system, is_default=has_default)
+    task = DesignTask.of(system)
     names = (*DESIGN_FILES, *(SHORTEST_FILES if shortest else ()))
     claim_folder(output, names, input_files(stated), force=force)
 
@@ -121,6 +134,12 @@ def design(
     errors.print(f"wrote {output}/ (to see the motion: mjfim replay {output})", markup=False)
     if not result.success:
         errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
+    if has_default and result.seconds >= DEFAULT_SECONDS:
+        errors.print(
+            f"mjfim: {DEFAULT_SECONDS:g} s are used up, the default; `seconds` in the table "
+            f"[descent] of {experiment} states another time",
+            markup=False,
+        )
     raise typer.Exit(0 if result.sound and (found is None or found.closed) else 1)
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.cli.announcements import announce_recordings
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -70,6 +71,8 @@ def identify(
             summaries = [log.summary for log in (*fitted, *predicted)]
             out.print(render(describe_logs(summaries)))
 
+        announce_recordings(system, [log.recording for log in fitted], fit=True)
+        show.describe("fitting")
         result = identify_system(
             system,
             [log.recording for log in fitted],

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.cli.announcements import announce_trials
 from mjfim.cli.common import (
     AsJson,
     DesignFile,
@@ -31,7 +32,7 @@ from mjfim.output import archive
 from mjfim.output.folders import study_files
 from mjfim.output.summaries import describe_study
 from mjfim.output.text import render
-from mjfim.studies.monte_carlo import monte_carlo_system
+from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
 
 
 @verb
@@ -80,6 +81,8 @@ def montecarlo(
     inputs = input_files(system.experiment, [design_file])
     claim_folder(output, study_files(system.parameters.names), inputs, force=force)
 
+    require_memory_for_trials(system, named, trials)
+    announce_trials(system, named, trials)
     with progress(f"{trials} trials") as show:
         study = monte_carlo_system(system, named, trials=trials, seed=seed, callback=show)
 

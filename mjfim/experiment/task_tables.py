@@ -153,7 +153,10 @@ class Descent(Section):
     )
     seconds: Positive | None = Field(
         default=None,
-        description="Time after which the best design found is returned [s]. Default: no limit.",
+        description=(
+            "Time after which the best design found is returned [s]. Default: 120 s for the "
+            "command `mjfim design`; no limit in Python and for the other verbs."
+        ),
     )
     psi_weight: NonNegative = Field(
         default=0.0,

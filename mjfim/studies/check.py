@@ -168,6 +168,19 @@ def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, Desig
     return problem, problem.point(curve, CENTRAL_DIFFERENCES)
 
 
+def evaluate_and_test(task: DesignTask) -> None:
+    """Do the main work of a check along the initial control of a task, to measure its duration.
+
+    Args:
+        task: The task.
+
+    Raises:
+        SimulationDivergedError: The simulation diverges.
+    """
+    problem, point = _evaluate(task, task.initial)
+    self_test(task, problem, point)
+
+
 class _Stages:
     """Stages of a check that are left out after a request to stop.
 

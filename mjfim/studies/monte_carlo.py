@@ -119,8 +119,8 @@ def monte_carlo_system(
     """Study the estimator on a resolved system. See `monte_carlo`."""
     if trials < 2:
         raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
-    _require_memory_for(trials, len(system.parameters.names))
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
+    require_memory_for_trials(system, named, trials)
 
     # Fail before the first trial where a trajectory cannot be simulated.
     for curve in named.values():
@@ -153,9 +153,21 @@ def monte_carlo_system(
     )
 
 
-def _require_memory_for(trials: int, count: int) -> None:
-    """Raise ExperimentError if the estimates of `count` parameters of all trials do not fit."""
-    require_memory(ESTIMATE_COPIES * float(trials) * count, f"trials: {trials}")
+def require_memory_for_trials(
+    system: System, trajectories: Mapping[str, Trajectory], trials: int
+) -> None:
+    """Refuse trials that do not fit into memory.
+
+    Args:
+        system: The system whose parameters are estimated.
+        trajectories: Trajectories by name.
+        trials: Number of repetitions of each.
+
+    Raises:
+        ExperimentError: The estimates, or the trials that are stepped together, do not fit.
+    """
+    estimates = ESTIMATE_COPIES * float(trials) * len(system.parameters)
+    require_memory(estimates, f"trials: {trials}")
 
 
 @dataclass(frozen=True, kw_only=True)

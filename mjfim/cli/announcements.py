@@ -1,0 +1,151 @@
+"""Sentences about the duration of long work, which verbs print before they begin it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from mjfim.arrays import Array
+from mjfim.cli.common import errors
+from mjfim.duration import in_words
+from mjfim.errors import ExperimentError
+from mjfim.excitation.duration import iteration_seconds
+from mjfim.experiment.system import System
+from mjfim.identification.duration import pass_seconds
+from mjfim.parallel import cores
+from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
+from mjfim.studies.duration import check_seconds, trials_seconds
+
+# Duration from which work is announced [s].
+ANNOUNCED_SECONDS = 20.0
+
+# Duration of one iteration from which a design is refused, unless it states as much time [s].
+LONGEST_ITERATION = 3600.0
+
+# Passes over the data that a fit usually needs, with its intervals and predictions.
+USUAL_PASSES = 10
+
+# Ends of sentences about work that Ctrl-C ends.
+BEST_IS_KEPT = "Ctrl-C ends it at any time with the best result so far"
+DONE_IS_KEPT = "Ctrl-C ends it at any time; what is finished is kept"
+QUICKER = "a shorter horizon, a lower rate or a longer timestep makes it quicker"
+
+
+def announce_design(
+    system: System, *, is_default: bool, longest_iteration: float = LONGEST_ITERATION
+) -> None:
+    """Say how long a design takes, if it is long.
+
+    Args:
+        system: The system, whose experiment states the design.
+        is_default: True if the time of the design is the default, not what the user stated.
+        longest_iteration: Time of one iteration from which the design is refused [s].
+
+    Raises:
+        ExperimentError: A single iteration would take hours, and no such time is stated.
+    """
+    experiment, descent = system.experiment, system.experiment.descent
+    most = max(descent.max_iterations, 1)
+    iteration = iteration_seconds(system, negligible=ANNOUNCED_SECONDS / most)
+    if iteration is None:
+        return
+
+    # A single iteration that takes hours is a mistyped horizon or rate, as a rule.
+    stated = 0.0 if is_default else (descent.seconds or 0.0)
+    if iteration > max(longest_iteration, stated):
+        raise ExperimentError(
+            f"{experiment.source}: horizon: {experiment.horizon:g} s at {experiment.rate:g} Hz: "
+            f"one iteration would take about {in_words(iteration)}; {QUICKER} (descent.seconds = "
+            f"{2.0 * iteration:.1g} permits it)"
+        )
+
+    starts = number_of_starts(system)
+    longest = most * -(-starts // min(cores(), starts)) * iteration
+    if longest < ANNOUNCED_SECONDS:
+        return
+
+    # The time of the design ends it, but not before the first iteration.
+    duration = f"at most about {in_words(longest)}"
+    if descent.seconds is not None and descent.seconds < longest:
+        end = max(descent.seconds, iteration)
+        key = "default of descent.seconds" if is_default else "descent.seconds"
+        duration = f"at most about {in_words(end)} ({key}: {descent.seconds:g} s)"
+    _say(
+        f"one iteration takes about {in_words(iteration)}, and the design {duration}; "
+        f"{BEST_IS_KEPT}"
+    )
+
+
+def number_of_starts(system: System) -> int:
+    """Number of initial controls of a design."""
+    descent = system.experiment.descent
+    further = len(descent.previous) + len(descent.fourier) + len(descent.repeats)
+    return descent.starts + further
+
+
+def announce_check(system: System, control: Array) -> None:
+    """Say how long a check of a control takes, if it is long.
+
+    Args:
+        system: The system.
+        control: (N, nu) control [unit of the actuator].
+    """
+    seconds = check_seconds(system, control, negligible=ANNOUNCED_SECONDS)
+    if seconds is not None and seconds >= ANNOUNCED_SECONDS:
+        _say(f"the check takes about {in_words(seconds)}; {QUICKER}")
+
+
+def announce_recordings(system: System, recordings: Sequence[Recording], *, fit: bool) -> None:
+    """Say how long the work on recordings takes, if it is long.
+
+    Args:
+        system: The system.
+        recordings: The recordings.
+        fit: True for a fit, False for a check.
+    """
+    each = pass_seconds(system, recordings)
+    if each is None:
+        return
+
+    total = (USUAL_PASSES if fit else 2) * each
+    if total < ANNOUNCED_SECONDS:
+        return
+    rows = sum(len(recording.t) for recording in recordings)
+    begin = f"{rows:,} rows: one pass over the data takes about {in_words(each)}"
+    if fit:
+        _say(f"{begin}, and the fit usually about {in_words(total)}; {BEST_IS_KEPT}")
+    else:
+        _say(f"{begin}, and the check about {in_words(total)}")
+
+
+def announce_trials(system: System, trajectories: Mapping[str, Trajectory], trials: int) -> None:
+    """Say how long a Monte-Carlo study takes, if it is long.
+
+    Args:
+        system: The system.
+        trajectories: Trajectories by name.
+        trials: Number of repetitions of each.
+    """
+    seconds = trials_seconds(system, trajectories, trials)
+    if seconds >= ANNOUNCED_SECONDS:
+        _say(f"{trials:,} trials take about {in_words(seconds)}; {DONE_IS_KEPT}")
+
+
+def announce_comparison(methods: int, seconds: float) -> None:
+    """Say how long a comparison takes, if it is long.
+
+    Args:
+        methods: Number of compared methods.
+        seconds: Time of each [s].
+    """
+    total = methods * seconds
+    if total >= ANNOUNCED_SECONDS:
+        _say(
+            f"{methods} methods of at most {in_words(seconds)} each take at most about "
+            f"{in_words(total)}; {DONE_IS_KEPT}"
+        )
+
+
+def _say(sentence: str) -> None:
+    """Print a sentence on stderr."""
+    errors.print(f"mjfim: {sentence}", markup=False)

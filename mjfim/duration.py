@@ -1,0 +1,60 @@
+"""Duration of work, estimated from a small part of it on this machine, before the work begins."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+# Time that a part has to take, so that its duration can be measured [s].
+LEAST_SECONDS = 0.2
+
+# Items of the first part, and the factor from one part to the next.
+FIRST_ITEMS = 16
+GROWTH = 4
+
+# Units of time in words, from the longest [s]. A duration of two units or more is stated in it.
+UNITS = {"days": 86400.0, "hours": 3600.0, "minutes": 60.0}
+
+
+def estimated_seconds(
+    work: Callable[[int], object],
+    count: int,
+    *,
+    first: int = FIRST_ITEMS,
+    negligible: float = 0.0,
+    clock: Callable[[], float] = time.perf_counter,
+) -> float:
+    """Estimate how long work takes whose duration is proportional to the number of its items.
+
+    The number of items grows from part to part, until a part takes long enough to be measured.
+
+    Args:
+        work: Does the work on the first n items.
+        count: Number of all items.
+        first: Items of the first part.
+        negligible: Duration of all items that need not be known accurately [s].
+        clock: Returns the present time [s].
+
+    Returns:
+        The duration of the work on all items [s].
+    """
+    items = min(first, count)
+
+    # What is allocated at the first call takes no time later.
+    work(items)
+    while True:
+        begun = clock()
+        work(items)
+        seconds = clock() - begun
+        total = seconds * count / items
+        if seconds >= LEAST_SECONDS or items >= count or total < negligible:
+            return total
+        items = min(GROWTH * items, count)
+
+
+def in_words(seconds: float) -> str:
+    """Return a duration as a rounded number with its unit."""
+    for unit, length in UNITS.items():
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:.2g} {unit}" if seconds < 1e3 * length else f"> 999 {unit}"
+    return f"{seconds:.2g} s" if seconds < 99.5 else f"{seconds:.0f} s"
