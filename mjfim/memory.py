@@ -18,22 +18,24 @@ def available_memory() -> float:
     return float(psutil.virtual_memory().available)
 
 
-def require_memory(numbers: float, cause: str) -> None:
+def require_memory(numbers: float, cause: str, *, available: float | None = None) -> None:
     """Refuse work whose arrays do not fit into the available memory.
 
     Args:
-        numbers: Numbers of double precision that the work holds at the same time, at least.
+        numbers: Numbers of double precision that the work holds at the same time.
         cause: Key or option with its value, for the message.
+        available: Memory that is there [bytes]; None for that of this machine.
 
     Raises:
         ExperimentError: The memory is too small.
     """
-    needed, usable = NUMBER_BYTES * numbers, USABLE_FRACTION * available_memory()
+    free = available_memory() if available is None else available
+    needed, usable = NUMBER_BYTES * numbers, USABLE_FRACTION * free
     if needed <= usable:
         return
 
     raise ExperimentError(
-        f"{cause}: this needs at least {needed / 2**30:.3g} GiB of memory, and "
+        f"{cause}: this needs about {needed / 2**30:.3g} GiB of memory, and "
         f"{usable / 2**30:.3g} GiB are available; at most {usable / needed:.2g} times this size is "
         "possible"
     )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -9,9 +12,17 @@ import pytest
 import mjfim
 from mjfim import memory
 from mjfim.errors import ExperimentError
+from mjfim.excitation.design_memory import design_bytes, require_memory_for_design
 from mjfim.excitation.task import DesignTask
-from mjfim.studies.monte_carlo import monte_carlo_system
+from mjfim.experiment.system import System
+from mjfim.identification.fit_memory import recordings_bytes, require_memory_for_recordings
+from mjfim.studies.monte_carlo import (
+    chunk_size,
+    monte_carlo_system,
+    require_memory_for_trials,
+)
 from tests.support.cli import write_experiment
+from tests.support.paths import ROOT
 
 GIBIBYTE = 2.0**30
 
@@ -38,7 +49,7 @@ def test_too_many_trials(tmp_path: Path) -> None:
     """The number of trials is refused before the first simulation."""
     experiment = mjfim.Experiment.from_file(write_experiment(tmp_path))
     task = DesignTask.resolve(experiment)
-    with pytest.raises(ExperimentError, match=r"trials: 1000000000: this needs at least"):
+    with pytest.raises(ExperimentError, match=r"trials: 1000000000: this needs about"):
         monte_carlo_system(task.system, task.initial, trials=1_000_000_000)
 
 
@@ -47,3 +58,88 @@ def test_too_long_horizon(tmp_path: Path) -> None:
     path = write_experiment(tmp_path, horizon="90000.0", start='{ kind = "sine" }')
     with pytest.raises(ExperimentError, match=r"study\.toml: horizon: 90000 s at 100 Hz: "):
         DesignTask.resolve(mjfim.Experiment.from_file(path))
+
+
+# ---- with a stated memory
+
+
+@pytest.mark.parametrize(("available", "fits"), [(1e5, False), (1e8, True)])
+def test_a_horizon_is_compared_with_the_memory_that_is_there(
+    available: float, fits: bool, tmp_path: Path
+) -> None:
+    """1000 samples of the cart-pendulum need about 10 MB."""
+    system = System.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
+    refused = pytest.raises(ExperimentError, match=r"horizon: 1 s at 100 Hz: this needs about")
+    with nullcontext() if fits else refused:
+        require_memory_for_design(system, 1000, available)
+
+
+def test_the_jacobians_of_all_trials_count(tmp_path: Path) -> None:
+    """64 long trials that are stepped together fill the memory, though their estimates are few."""
+    task = DesignTask.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
+    curve = {"final": task.initial}
+    require_memory_for_trials(task.system, curve, 64, available=1e9)
+    with pytest.raises(ExperimentError, match=r"trials: 64: this needs about"):
+        require_memory_for_trials(task.system, curve, 64, available=1e6)
+
+
+def test_long_trials_are_stepped_in_smaller_blocks(tmp_path: Path) -> None:
+    """However long the trajectory is, a block of trials needs at most 1 GB."""
+    system = System.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
+    assert chunk_size(system, 200, 1500) == 150
+    assert chunk_size(system, 200, 10) == 10
+    assert 1 < chunk_size(system, 100_000, 1500) < 64
+    assert chunk_size(system, 10_000_000, 1500) == 1
+
+
+def test_recordings_are_compared_with_the_memory_that_is_there(tmp_path: Path) -> None:
+    """The blocks of simulations are bounded, the recorded numbers are not."""
+    task = DesignTask.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
+    recording = mjfim.simulate(task.experiment, task.initial, seed=0)
+    require_memory_for_recordings(task.system, [recording], fit=True, available=1e8)
+    with pytest.raises(ExperimentError, match=r"recordings of \d+ rows in all: this needs about"):
+        require_memory_for_recordings(task.system, [recording], fit=True, available=1e4)
+
+    hour, day = (recordings_bytes(task.system, rows, fit=True) for rows in (3_600_000, 86_400_000))
+    assert 10.0 < day / hour < 24.0
+
+
+MEASURED = """
+import sys
+import threading
+
+import psutil
+
+import mjfim
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
+
+task = DesignTask.resolve(mjfim.Experiment.from_file(sys.argv[1]))
+memory = psutil.Process().memory_info
+before, seen, ended = memory().rss, [], threading.Event()
+
+def watch():
+    while not ended.wait(0.002):
+        seen.append(memory().rss)
+
+thread = threading.Thread(target=watch)
+thread.start()
+design_task(task)
+ended.set()
+thread.join()
+print(max(seen) - before)
+"""
+
+
+@pytest.mark.slow
+def test_the_estimate_is_above_the_measured_peak(tmp_path: Path) -> None:
+    """The peak of a design of 100 s at 100 Hz is between half of the estimate and the estimate."""
+    path = write_experiment(
+        tmp_path, horizon="100.0", start='{ kind = "sine" }', max_iterations="2"
+    )
+    words = [sys.executable, "-c", MEASURED, str(path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT)
+
+    system = System.resolve(mjfim.Experiment.from_file(path))
+    estimate = design_bytes(system, 10_000)
+    assert 0.5 * estimate < float(done.stdout) < estimate

@@ -20,16 +20,13 @@ from mjfim.excitation.constraint_kinds import (
     ExpansionSums,
     SubstepConstraint,
 )
-from mjfim.excitation.limits import Limit, has_constant_forces
+from mjfim.excitation.limits import Limit, derivative_substeps_of, has_constant_forces
 from mjfim.excitation.task import DesignTask
 from mjfim.model.geom_distance import GeomDistances
 from mjfim.model.geom_pairs import find_geom_pairs
 from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.plant.batch import SubstepObservations
 from mjfim.records.trajectory import Trajectory
-
-# Largest number of engine steps of a sample at which the barrier is evaluated with derivatives.
-MAX_DERIVATIVE_SUBSTEPS = 5
 
 # Distance beyond the stated clearance up to which distances are measured [m].
 CLEARANCE_REACH = 0.1
@@ -184,15 +181,6 @@ class ConstraintSet:
             control_scale=self.control.bounds.scale,
             control_step_scale=step_scale,
         )
-
-
-def derivative_substeps_of(substeps: int) -> tuple[int, ...]:
-    """Engine steps of a sample, counted from 1, at which the barrier takes derivatives.
-
-    They are closer together at the beginning of the sample, where the control jumps.
-    """
-    spaced = np.geomspace(1, substeps, min(MAX_DERIVATIVE_SUBSTEPS, substeps))
-    return tuple(sorted({round(step) for step in spaced.tolist()}))
 
 
 def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:

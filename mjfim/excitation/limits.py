@@ -18,6 +18,9 @@ Range = tuple[float, float]
 # Kinds of limits that are stated by joint; the others are stated by actuator.
 JOINT_KINDS = ("position", "velocity", "acceleration", "joint_force")
 
+# Largest number of engine steps of a sample at which the barrier is evaluated with derivatives.
+MAX_DERIVATIVE_SUBSTEPS = 5
+
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
@@ -363,3 +366,12 @@ def _names(model: Any, kind: Any, chosen: Any) -> list[str]:
     """Names of chosen elements of a kind, or their numbers; chosen: (n,) truth values."""
     indices = np.flatnonzero(chosen).tolist()
     return [mujoco.mj_id2name(model, kind, i) or f"number {i}" for i in indices]
+
+
+def derivative_substeps_of(substeps: int) -> tuple[int, ...]:
+    """Engine steps of a sample, counted from 1, at which the barrier takes derivatives.
+
+    They are closer together at the beginning of the sample, where the control jumps.
+    """
+    spaced = np.geomspace(1, substeps, min(MAX_DERIVATIVE_SUBSTEPS, substeps))
+    return tuple(sorted({round(step) for step in spaced.tolist()}))

@@ -6,13 +6,13 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
+from mjfim.excitation.design_memory import require_memory_for_design
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.robust import ParameterSamples
 from mjfim.experiment.control_signal import generate
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import Signal
-from mjfim.memory import require_memory
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.recordings.control_table import read_control
@@ -92,29 +92,12 @@ def stated_control(system: System) -> Array:
     experiment, grid = system.experiment, system.stated_grid
     source = experiment.initial.control
     count = sample_count(experiment, grid.stride)
-    _require_memory_for(system, count)
+    require_memory_for_design(system, count)
     t = np.arange(count, dtype=np.float64) * grid.dt
 
     if isinstance(source, Signal):
         return generate(source, t, system.controls, system.rest)
     return read_control(experiment.directory / str(source), t, grid.dt, system.controls)
-
-
-def _require_memory_for(system: System, count: int) -> None:
-    """Raise ExperimentError if the arrays of a design with `count` samples do not fit into memory.
-
-    The estimate is a lower bound: the linearisation of every sample, and the states and controls
-    of every engine step of one simulation.
-    """
-    nx, nu = system.space.nx, len(system.controls)
-    columns = nx + nu + len(system.parameters.names)
-    per_sample = (nx + len(system.outputs.names)) * columns
-    per_sample += (nx + nu) * system.grid.substeps
-
-    experiment = system.experiment
-    require_memory(
-        float(count) * per_sample, f"horizon: {experiment.horizon:g} s at {experiment.rate:g} Hz"
-    )
 
 
 def require_bounded_controls(system: System, limits: tuple[Limit, ...], weight: Array) -> None:

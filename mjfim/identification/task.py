@@ -13,6 +13,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
+from mjfim.identification.fit_memory import require_memory_for_recordings
 from mjfim.identification.residuals import FitProblem
 from mjfim.identification.same_data import refuse_same_data
 from mjfim.records.recording import Recording
@@ -115,6 +116,7 @@ class FitTask:
             )
 
         refuse_same_data(recordings, held_out)
+        require_memory_for_recordings(system, [*recordings, *held_out], fit=True)
         return cls(
             system=system,
             recordings=tuple(recordings),

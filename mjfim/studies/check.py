@@ -18,6 +18,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.fit_memory import require_memory_for_recordings
 from mjfim.identification.residuals import FitProblem
 from mjfim.identification.same_data import refuse_same_data
 from mjfim.information.fisher import FisherInformation
@@ -128,6 +129,7 @@ def check_recordings(
     See `check`.
     """
     refuse_same_data(recordings, ())
+    require_memory_for_recordings(system, recordings, fit=False)
     fit = FitProblem.of(system, recordings, data_only=True)
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     task = DesignTask.along(system, longest.ctrl[:MAX_TESTED_SAMPLES])

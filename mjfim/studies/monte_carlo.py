@@ -28,7 +28,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.identify import least_squares, newton_raphson
 from mjfim.identification.residuals import FitProblem
 from mjfim.information.identifiability import require_visible
-from mjfim.memory import require_memory
+from mjfim.memory import NUMBER_BYTES, require_memory
 from mjfim.parallel import one_blas_thread
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
@@ -52,8 +52,12 @@ CHUNK_BYTES = 1e8
 # and for the files.
 ESTIMATE_COPIES = 6
 
-# Smallest number of trials that are stepped together.
+# Smallest number of trials that are stepped together, where their memory permits it.
 MIN_CHUNK = 64
+
+# Largest memory of all trials that are stepped together [bytes], for long trajectories and for
+# models with large meshes, of which each trial has a copy.
+LARGEST_CHUNK_BYTES = 1e9
 
 # Number of chunks of many trials. A study that is stopped keeps the chunks that are finished.
 CHUNKS = 10
@@ -154,7 +158,10 @@ def monte_carlo_system(
 
 
 def require_memory_for_trials(
-    system: System, trajectories: Mapping[str, Trajectory], trials: int
+    system: System,
+    trajectories: Mapping[str, Trajectory],
+    trials: int,
+    available: float | None = None,
 ) -> None:
     """Refuse trials that do not fit into memory.
 
@@ -162,12 +169,59 @@ def require_memory_for_trials(
         system: The system whose parameters are estimated.
         trajectories: Trajectories by name.
         trials: Number of repetitions of each.
+        available: Memory that is there [bytes]; None for that of this machine.
 
     Raises:
         ExperimentError: The estimates, or the trials that are stepped together, do not fit.
     """
-    estimates = ESTIMATE_COPIES * float(trials) * len(system.parameters)
-    require_memory(estimates, f"trials: {trials}")
+    p = len(system.parameters)
+    needed = NUMBER_BYTES * ESTIMATE_COPIES * float(trials) * p
+    needed += max(
+        chunk_size(system, len(curve.ctrl), trials) * _trial_bytes(system, len(curve.ctrl))
+        for curve in trajectories.values()
+    )
+    require_memory(needed / NUMBER_BYTES, f"trials: {trials}", available=available)
+
+
+def chunk_size(system: System, samples: int, trials: int) -> int:
+    """Number of trials that are stepped together.
+
+    It depends on the study only, not on the machine, because the results depend on it.
+
+    Args:
+        system: The system.
+        samples: Number of samples of the trajectory.
+        trials: Number of all trials.
+
+    Returns:
+        The number, at least 1.
+    """
+    jacobian = NUMBER_BYTES * _measurements(system, samples) * len(system.parameters)
+    most = min(int(CHUNK_BYTES / jacobian), -(-trials // CHUNKS))
+    fitting = int(LARGEST_CHUNK_BYTES / _trial_bytes(system, samples))
+    return min(max(MIN_CHUNK, most), max(fitting, 1), trials)
+
+
+def _measurements(system: System, samples: int) -> int:
+    """Number of measured values of a trial."""
+    return int(np.sum(samples // np.asarray(system.noise.strides)))
+
+
+def _trial_bytes(system: System, samples: int) -> float:
+    """Estimate of the memory of one trial [bytes].
+
+    Counted are the Jacobian, the columns of which it is put together, the measurements and
+    predictions; the state and the control of every engine step of a simulation; and a copy of the
+    model.
+    """
+    state, nu = system.nominal_initial_state.size, len(system.controls)
+    sensors = int(system.model.nsensordata) if system.outputs.needs_sensors else 0
+    fitted = _measurements(system, samples) * (2 * len(system.parameters) + 5)
+
+    at_engine_steps = system.grid.substeps * (1 + state + nu + sensors)
+    at_samples = state + sensors + 2 * len(system.outputs)
+    numbers = fitted + samples * (at_engine_steps + at_samples)
+    return float(NUMBER_BYTES * numbers + system.plant.source.model.nbuffer)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -339,10 +393,8 @@ def _trial_set(
     information = np.asarray(J.T @ J)
     require_visible(system.parameters, system.parameters.prior_information, J)
 
-    # Step as many trials at once as the memory allows. Those of a finished chunk are kept after a
-    # request to stop.
-    most = min(int(CHUNK_BYTES / (8 * J.size)), -(-count // CHUNKS))
-    chunk = max(MIN_CHUNK, most)
+    # Those of a finished chunk are kept after a request to stop.
+    chunk = chunk_size(system, len(curve.ctrl), count)
     firsts = range(0, count, chunk)
     estimates = []
     for number, first in enumerate(firsts):
