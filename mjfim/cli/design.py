@@ -37,6 +37,7 @@ from mjfim.experiment.task_tables import MAX_STARTS
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.summaries import describe_design
 from mjfim.output.text import render
+from mjfim.records.design import Design
 from mjfim.records.events import Callback
 
 # Time after which a design ends that states none [s].
@@ -88,11 +89,7 @@ def design(
 
     # A design that states no time ends all the same. The shortest horizon takes many designs.
     has_default = stated.descent.seconds is None and not shortest
-    if has_default:
-        stated = stated.replace(descent={"seconds": DEFAULT_SECONDS})
-        system = replace(system, experiment=stated)
-    announce_design(system, is_default=has_default)
-    task = DesignTask.of(system)
+    task = DesignTask.of(_announced(system, has_default))
     names = (*DESIGN_FILES, *(SHORTEST_FILES if shortest else ()))
     claim_folder(output, names, input_files(stated), force=force)
 
@@ -134,13 +131,32 @@ def design(
     errors.print(f"wrote {output}/ (to see the motion: mjfim replay {output})", markup=False)
     if not result.success:
         errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
+    _say_if_default_ended(result, has_default)
+    raise typer.Exit(0 if result.sound and (found is None or found.closed) else 1)
+
+
+def _announced(system: System, has_default: bool) -> System:
+    """The system with the default time where none is stated, after a sentence about its duration.
+
+    Args:
+        system: The system, whose experiment states the design.
+        has_default: True if the default time ends the design.
+    """
+    if has_default:
+        limited = system.experiment.replace(descent={"seconds": DEFAULT_SECONDS})
+        system = replace(system, experiment=limited)
+    announce_design(system, is_default=has_default)
+    return system
+
+
+def _say_if_default_ended(result: Design, has_default: bool) -> None:
+    """Say that the default time has ended a design, and how to state another one."""
     if has_default and result.seconds >= DEFAULT_SECONDS:
         errors.print(
             f"mjfim: {DEFAULT_SECONDS:g} s are used up, the default; `seconds` in the table "
-            f"[descent] of {experiment} states another time",
+            "[descent] states another time",
             markup=False,
         )
-    raise typer.Exit(0 if result.sound and (found is None or found.closed) else 1)
 
 
 def _shortest(
