@@ -8,6 +8,9 @@ from collections.abc import Callable
 # Time that a part has to take, so that its duration can be measured [s].
 LEAST_SECONDS = 0.2
 
+# Number of times that a part is done. The quickest counts, because other processes disturb some.
+REPEATS = 2
+
 # Items of the first part, and the factor from one part to the next.
 FIRST_ITEMS = 16
 GROWTH = 4
@@ -43,13 +46,18 @@ def estimated_seconds(
     # What is allocated at the first call takes no time later.
     work(items)
     while True:
-        begun = clock()
-        work(items)
-        seconds = clock() - begun
+        seconds = min(_seconds_of(work, items, clock) for _ in range(REPEATS))
         total = seconds * count / items
         if seconds >= LEAST_SECONDS or items >= count or total < negligible:
             return total
         items = min(GROWTH * items, count)
+
+
+def _seconds_of(work: Callable[[int], object], items: int, clock: Callable[[], float]) -> float:
+    """Time of the work on some items [s]."""
+    begun = clock()
+    work(items)
+    return clock() - begun
 
 
 def in_words(seconds: float) -> str:

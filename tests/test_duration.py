@@ -29,7 +29,7 @@ def test_the_duration_is_proportional_to_the_items(per_item: float) -> None:
     found = estimated_seconds(clock.work, 10_000_000, clock=lambda: clock.now)
     assert found == pytest.approx(per_item * 1e7)
     assert clock.parts[0] == clock.parts[1]
-    assert clock.now <= max(2.0, 2 * 16 * per_item)
+    assert clock.now <= max(3.0, 3 * 16 * per_item)
 
 
 def test_overhead_counts_little() -> None:
@@ -37,6 +37,19 @@ def test_overhead_counts_little() -> None:
     clock = Clock(1e-4, overhead=0.02)
     found = estimated_seconds(clock.work, 100_000, clock=lambda: clock.now)
     assert 10.0 < found < 12.0
+
+
+def test_a_disturbance_does_not_count() -> None:
+    """Another process stops the first measured part for a second; the estimate remains."""
+    clock = Clock(1e-5)
+
+    def disturbed(count: int) -> None:
+        """Work, and be stopped once."""
+        clock.work(count)
+        clock.now += 1.0 if len(clock.parts) == 2 else 0.0
+
+    found = estimated_seconds(disturbed, 1_000_000, clock=lambda: clock.now)
+    assert found == pytest.approx(10.0)
 
 
 def test_the_part_is_never_larger_than_the_whole() -> None:
@@ -48,7 +61,7 @@ def test_the_part_is_never_larger_than_the_whole() -> None:
 def test_negligible_work_is_not_measured_further() -> None:
     clock = Clock(1e-6)
     estimated_seconds(clock.work, 100_000, negligible=1.0, clock=lambda: clock.now)
-    assert clock.parts == [16, 16]
+    assert clock.parts == [16, 16, 16]
 
 
 @pytest.mark.parametrize(
