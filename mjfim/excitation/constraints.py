@@ -205,7 +205,11 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
     control = _bounds_of_controls(limits, "control", nu)
     if control is None:
         free = np.full(nu, np.inf)
-        control = Bounds(lower=-free, upper=free, scale=_control_sizes(task))
+        control = Bounds.from_range(-free, free)
+
+    # Controls without a range have the scale of the initial control.
+    is_free = ~np.isfinite(control.lower) & ~np.isfinite(control.upper)
+    control = replace(control, scale=np.where(is_free, _control_sizes(task), control.scale))
 
     # The holding controls are computed even without limits on rates, because a boundary that cannot
     # be kept is an error.
@@ -306,10 +310,10 @@ def _control_sizes(task: DesignTask) -> Array:
     """Scales of controls without a range: their largest initial deviation from rest.
 
     Returns:
-        (nu,) scales [u-unit], 1 where the initial control rests.
+        (nu,) scales [u-unit], the natural sizes where the initial control rests.
     """
     size = np.abs(task.control - task.system.rest).max(axis=0)
-    return np.where(size > 0.0, size, 1.0)
+    return np.where(size > 0.0, size, task.plant.sizes.control)
 
 
 def _distances(task: DesignTask, reach: float) -> GeomDistances:

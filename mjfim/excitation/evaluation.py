@@ -180,8 +180,8 @@ def design_warnings(
     yield from open_boundary_warnings(task)
     if found.deviation > SAME_STATE_TOLERANCE:
         yield (
-            f"played on the unmodified model, the design deviates by up to {found.deviation:.2g}: "
-            "a clamp, stop or contact acts"
+            f"played on the unmodified model, the design deviates by up to {found.deviation:.2g} "
+            "of the size of its states: a clamp, stop or contact acts"
         )
 
 

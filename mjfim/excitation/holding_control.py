@@ -15,8 +15,8 @@ NEWTON_STEPS = 4
 # Difference step of the control, relative to its size.
 RELATIVE_DIFFERENCE = 1e-4
 
-# Time in which a held state may not reach the velocity that `[boundary]` tolerates [s].
-HOLDING_TIME = 0.1
+# Share of the horizon in which a held state may not reach the velocity that `[boundary]` tolerates.
+HOLDING_SHARE = 0.025
 
 
 def holding_control(system: System, state: Array, guess: Array, *, key: str, place: str) -> Array:
@@ -56,7 +56,7 @@ def least_drift_control(system: System, state: Array, guess: Array) -> Array:
         (nu,) control, which may violate limits.
     """
     control = np.array(guess)
-    steps = RELATIVE_DIFFERENCE * np.maximum(np.abs(control), 1.0)
+    steps = RELATIVE_DIFFERENCE * np.maximum(np.abs(control), system.plant.sizes.control)
 
     for _ in range(NEWTON_STEPS):
         # The drift under the control, and under one control for each component that is moved.
@@ -99,7 +99,8 @@ def _require_held(system: System, state: Array, drift: Array, key: str, place: s
     moves = bool(speed.any())
     worst = int(np.argmax(speed if moves else acceleration))
     tolerated = system.experiment.boundary.velocity
-    if acceleration[worst] * HOLDING_TIME <= tolerated and not moves:
+    holding_time = HOLDING_SHARE * float(system.experiment.horizon or 0.0)
+    if acceleration[worst] * holding_time <= tolerated and not moves:
         return
 
     model = system.model

@@ -448,7 +448,7 @@ class DesignTask:
         """
         mean = self.control.mean(axis=0)
         peak = np.abs(self.control - mean).max(axis=0)
-        peak = np.where(peak > 0.0, peak, 1.0)
+        peak = np.where(peak > 0.0, peak, self.plant.sizes.control)
 
         about = self.initial_hold if self.experiment.boundary.start == "rest" else mean
         window = self.fade(self.samples)

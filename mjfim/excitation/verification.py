@@ -27,11 +27,11 @@ from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage
 from mjfim.records.trajectory import Trajectory
 
-# Deviation of a state up to which two simulations agree [unit of the state].
+# Deviation of a state up to which two simulations agree, relative to the sizes of the state.
 SAME_STATE_TOLERANCE = 1e-6
 
-# Distance that stands for contact where a clearance is divided by the distance [m].
-CONTACT_DISTANCE = 1e-9
+# Share of the clearance that stands for contact where the clearance is divided by the distance.
+CONTACT_SHARE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,8 +42,9 @@ class Verification:
         margins: Smallest margin of each kind over all engine steps, negative outside [unit of the
             kind].
         relative_margins: These margins over half of each range, or over the clearance.
-        deviation: Largest difference of a state at the samples from the designed trajectory [unit
-            of the state], with the exact solver; infinite where either simulation diverges.
+        deviation: Largest difference of a state at the samples from the designed trajectory,
+            relative to the size of the state, with the exact solver; infinite where either
+            simulation diverges.
         unenforced: Kinds that are checked, but not enforced.
         usage: Position of every limited quantity in its range over time.
         by_stated_solver: Kinds that are violated only with the solver settings of the MJCF.
@@ -136,7 +137,8 @@ def _verify_on(
         margins["clearance"] = distance - clearance.least
         relative_margins["clearance"] = margins["clearance"] / clearance.least
 
-    deviation = float(np.abs(task.space.minus(played.state, trajectory.state)).max())
+    difference = task.space.minus(played.state, trajectory.state)
+    deviation = float(np.abs(difference / task.sizes[: task.space.nx]).max())
     return Verification(
         margins=margins,
         relative_margins=relative_margins,
@@ -236,7 +238,7 @@ def _clearance_usage(
     nearest = clearance.distances(positions, slopes=False).d.min(axis=1)
 
     t = _engine_times(task, len(positions))
-    share = clearance.least / np.maximum(nearest, CONTACT_DISTANCE)
+    share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)
     return distance, LimitUsage(kind="clearance", name=pair.name, t=t, share=share)
 
 
