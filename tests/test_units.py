@@ -216,3 +216,43 @@ def assert_same(
         else:
             rtol = 1e-3 if key in rough else 1e-9
             np.testing.assert_allclose(found[key], value, rtol=rtol, atol=1e-9, err_msg=key)
+
+
+DECIMAL = {
+    "long": Units(length=1e3),
+    "short": Units(length=1e-3),
+    "heavy": Units(mass=1e6),
+    "light": Units(mass=1e-6),
+    "slow": Units(time=1e3),
+    "quick": Units(time=1e-3),
+    "small, light, quick": Units(length=1e-3, mass=1e-6, time=1e-3),
+}
+
+
+@pytest.mark.slow
+def test_converged_designs_and_estimates_agree_in_decimal_units(
+    tmp_path, recording: Recording
+) -> None:
+    """Numbers are rounded differently there, so a descent takes other steps to one optimum."""
+    original = stated(tmp_path / "original", descent={"max_iterations": 60, "coarse": 1})
+    own = rescale(original, Units(), tmp_path / "own")
+    expected = in_units(own, design(original))
+    fitted = fit_in_units(own, identify(original, [recording]))
+
+    for name, units in DECIMAL.items():
+        rescaled = rescale(original, units, tmp_path / name)
+        found = in_units(rescaled, design(rescaled.experiment))
+        assert found["status"] == expected["status"]
+        assert found["cost"] == pytest.approx(expected["cost"], rel=1e-5)
+        largest = np.abs(expected["control"]).max()
+        np.testing.assert_allclose(found["control"], expected["control"], atol=0.01 * largest)
+
+        estimate = identify(rescaled.experiment, [rescaled.recording(recording)])
+        again = fit_in_units(rescaled, estimate)
+        np.testing.assert_allclose(again["theta"], fitted["theta"], rtol=1e-6)
+        np.testing.assert_allclose(again["std"], fitted["std"], rtol=1e-6)
+        assert again["misfit"] == fitted["misfit"]
+
+        # Terms of nearly equal significance may change places.
+        assert sorted(again["terms"]) == sorted(fitted["terms"])
+        np.testing.assert_allclose(again["sigmas"], fitted["sigmas"], rtol=1e-3)
