@@ -12,6 +12,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Protocol
 
+import psutil
+
 # Permissions of a new file, from which the umask of the process removes some.
 DEFAULT_PERMISSIONS = 0o666
 
@@ -142,17 +144,11 @@ def _remove_left_over_files(folder: Path) -> None:
 
 def _is_running(process: int) -> bool:
     """Check whether a process exists, by its number."""
-    # On Windows this call would end the process, so files remain there.
-    if os.name == "nt":
-        return True
-
+    # `os.kill(process, 0)` would end the process on Windows.
     try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
+        return bool(psutil.pid_exists(process))
+    except OverflowError:
         return False
-    except OSError:
-        return True
-    return True
 
 
 def _umask() -> int:

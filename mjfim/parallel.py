@@ -13,6 +13,7 @@ import os
 import pickle
 import shutil
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -54,6 +55,9 @@ LOST_SENTENCE = (
 # Largest number of threads that can be asked for; more would only use memory.
 MAX_THREADS = 1024
 
+# Largest number of processes of a pool on Windows, beyond which Python refuses it.
+MAX_WINDOWS_PROCESSES = 61
+
 
 def cores() -> int:
     """Return the number of processors that this process may use."""
@@ -77,6 +81,19 @@ def require_threads(threads: int | None) -> None:
             f"threads: {threads} is not possible; it must be a whole number from 1 to "
             f"{MAX_THREADS}, or None for one thread per core"
         )
+
+
+def process_count(wanted: int | None) -> int:
+    """Return the number of worker processes of a pool.
+
+    Args:
+        wanted: Number that the user asks for; None for one per core.
+
+    Returns:
+        At most one per core, and on Windows at most the number that a pool can wait for.
+    """
+    largest = min(cores(), MAX_WINDOWS_PROCESSES) if sys.platform == "win32" else cores()
+    return min(wanted or largest, largest)
 
 
 @contextmanager
@@ -110,7 +127,7 @@ class Pool(ProcessPoolExecutor):
 
     def __init__(self, count: int | None = None) -> None:
         context = multiprocessing.get_context("spawn")
-        processes = min(count or cores(), cores())
+        processes = process_count(count)
 
         # The request to stop has no lock: a process that is killed while it holds a lock would
         # block all others.

@@ -1,0 +1,66 @@
+"""Branches for other operating systems, and processes that leave nothing open."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mjfim import atomic_io, parallel
+from tests.support.paths import ROOT
+
+
+def test_windows_waits_for_at_most_61_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python refuses pools of more processes there; other systems have no such bound."""
+    monkeypatch.setattr(parallel, "cores", lambda: 128)
+    assert parallel.process_count(None) == 128
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert parallel.process_count(None) == 61
+    assert parallel.process_count(100) == 61
+    assert parallel.process_count(3) == 3
+
+
+def test_left_over_files_are_removed_on_windows_without_a_signal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There, a signal with the number 0 would end the process that is asked for."""
+
+    def no_signal(process: int, number: int) -> None:
+        raise AssertionError(f"signal {number} to process {process}")
+
+    monkeypatch.setattr(os, "kill", no_signal)
+    monkeypatch.setattr(atomic_io.psutil, "pid_exists", lambda process: process == 17)
+    ended, running = (
+        tmp_path / f"{atomic_io.PREFIX}{process}-x.csv" for process in (4_000_000, 17)
+    )
+    ended.touch()
+    running.touch()
+
+    with atomic_io.replacing(tmp_path / "file.csv") as temporary:
+        temporary.write_text("t\n", encoding="utf-8")
+    assert not ended.exists()
+    assert running.exists()
+
+
+@pytest.mark.slow
+def test_designs_and_fits_leave_no_thread_and_warn_of_nothing() -> None:
+    """In Python's development mode files that are not closed are errors."""
+    script = (
+        "import threading, mjfim\n"
+        "e = mjfim.Experiment.from_file('models/cart_pendulum.toml')\n"
+        "d = e.descent.model_copy(update={'max_iterations': 1})\n"
+        "e = e.model_copy(update={'horizon': 0.3, 'descent': d})\n"
+        "design = mjfim.design(e)\n"
+        "log = mjfim.simulate(e, design.trajectory)\n"
+        "mjfim.identify(e, [log])\n"
+        "mjfim.check(e, [log])\n"
+        "print(threading.active_count())\n"
+    )
+    command = [sys.executable, "-X", "dev", "-W", "error", "-c", script]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1"]
+    assert not done.stderr
