@@ -10,6 +10,9 @@ from mjfim.optimize.directions import LBFGS
 # Factor from the counted numbers to the peak: short-lived copies, and what the allocator keeps.
 PEAK_FACTOR = 1.3
 
+# Memory that does not depend on the number of samples [bytes].
+FIXED_BYTES = 2**24
+
 # Moves of every coordinate of (x, u): forward and backward, at both sides of a direction.
 MOVES = 4
 
@@ -47,7 +50,7 @@ def design_bytes(system: System, samples: int) -> float:
         The memory [bytes].
     """
     numbers = max(_rollouts(system), _moved_samples(system)) + _held(system)
-    return PEAK_FACTOR * NUMBER_BYTES * numbers * samples
+    return FIXED_BYTES + PEAK_FACTOR * NUMBER_BYTES * numbers * samples
 
 
 def _rollouts(system: System) -> int:
@@ -65,7 +68,7 @@ def _moved_samples(system: System) -> int:
     """Numbers per sample of the steps from moved states and controls."""
     state, nu = system.nominal_initial_state.size, len(system.controls)
     batch = 2 * (1 + state + system.space.nv + nu)
-    each = 5 * state + 2 * nu + 2 * _sensors(system) + batch + 2 * _observed(system)
+    each = 5 * state + 2 * nu + 2 * _sensors(system) + batch + _observed(system)
     return MOVES * (system.space.nx + nu) * each
 
 
@@ -81,7 +84,7 @@ def _held(system: System) -> int:
     directions = p if is_smooth else 1
     mixed = directions * coordinates * 2 * (nx + _sensors(system))
 
-    barrier = 4 * coordinates * _observed(system) + (2 * coordinates**2 if is_smooth else 0)
+    barrier = 2 * coordinates * _observed(system) + (2 * coordinates**2 if is_smooth else 0)
     pairs = 2 * LBFGS.memory * nu
     points = HELD_POINTS * (sensitivity + 2 * system.nominal_initial_state.size + nu)
     return linearization + mixed + barrier + pairs + points
