@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError
+from mjfim.errors import SimulationDivergedError, listed
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.limits import unlimited_elements, unsupported_ranges
 from mjfim.excitation.objective import DesignPoint
@@ -166,7 +166,7 @@ def design_warnings(
         yield str(rough)
     if clamped:
         yield (
-            f"forcerange clamps {', '.join(clamped)} along the design: its derivatives do not hold "
+            f"forcerange clamps {listed(clamped)} along the design: its derivatives do not hold "
             "there, it may rest on spurious information caused by the saturation, and the descent "
             "may have stopped early; raise cost.control or begin with a smaller initial control"
         )
@@ -227,7 +227,7 @@ def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
         unsupported = unsupported_ranges(task.system.model)
         if unsupported:
             yield (
-                f"the MJCF's ranges of {', '.join(unsupported)} are not among the limits of the "
+                f"the MJCF's ranges of {listed(unsupported)} are not among the limits of the "
                 "design: it may run into them"
             )
     yield from unlimited_elements(task.system.model, experiment.limits)

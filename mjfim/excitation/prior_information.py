@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, RecordingError
+from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.information.marginal import marginal
 from mjfim.records.saved_information import SavedInformation
@@ -45,8 +45,8 @@ def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
         ]
         if not common:
             raise ExperimentError(
-                f"earlier: {path}: it has information about {', '.join(saved.parameters)}, but not "
-                f"about any of the parameters {', '.join(names)}"
+                f"earlier: {path}: it has information about {listed(saved.parameters)}, but not "
+                f"about any of the parameters {listed(names)}"
             )
 
         here = [list(names).index(name) for name in common]

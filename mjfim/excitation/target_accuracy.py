@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, UnidentifiableError
+from mjfim.errors import ExperimentError, UnidentifiableError, listed
 from mjfim.excitation.task import DesignTask
 from mjfim.records.design import Design
 
@@ -62,7 +62,7 @@ def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
     if not len(unreachable):
         return
 
-    names = ", ".join(task.parameters.names[j] for j in unreachable)
+    names = listed([task.parameters.names[j] for j in unreachable])
     known = f": {'; '.join(design.combinations)}" if design.combinations else ""
     raise UnidentifiableError(
         f"{task.experiment.source}: no standard deviation of {names} can be reached, because this "

@@ -11,6 +11,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget
+from mjfim.errors import listed
 from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
@@ -333,7 +334,7 @@ def _warnings_of_search(findings: _Findings) -> Iterator[str]:
 
     if quality.unexplained:
         yield (
-            f"the fit explains little of the motion of {', '.join(quality.unexplained)}: probably "
+            f"the fit explains little of the motion of {listed(quality.unexplained)}: probably "
             "a local minimum. Shorter segments (fit.segments), more starts (fit.starts) or a "
             "better guess may find a better one"
         )
@@ -371,16 +372,16 @@ def _warnings_of_recordings(findings: _Findings) -> Iterator[str]:
 
     names = findings.result.task.system.parameters.names
     index = findings.result.problem.layout.parameter_of_column
-    listed = ", ".join(names[index[column]] for column in robust.apart)
+    apart = [names[index[column]] for column in robust.apart]
     yield (
-        f"recordings disagree on {listed} by more than the scatter within each recording: "
+        f"recordings disagree on {listed(apart)} by more than the scatter within each recording: "
         "something differs between them that is not in the model; the intervals allow for it"
     )
 
 
 def _warnings_of_bounds(findings: _Findings) -> Iterator[str]:
     """Warnings about parameters at their bounds."""
-    names = ", ".join(findings.at_bound)
+    names = listed(findings.at_bound)
     if findings.outside:
         yield f"outside its bounds, which the method newton ignores: {names}; use least_squares"
     elif findings.at_bound:

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError, listed, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
@@ -154,7 +154,7 @@ def _start(system: System, method: Method, start: Array | None) -> Array:
     parameters = system.parameters
     theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
     if theta.shape != parameters.guess.shape:
-        names = ", ".join(parameters.names)
+        names = listed(parameters.names)
         raise ExperimentError(f"start: {theta.shape} numbers; expected one per parameter: {names}")
 
     if method == "least_squares":

@@ -14,7 +14,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
-from mjfim.errors import ModelError, RecordingError
+from mjfim.errors import ModelError, RecordingError, listed
 from mjfim.experiment.system import System
 from mjfim.interruption import run_optional
 from mjfim.output import plots
@@ -159,8 +159,8 @@ class CampaignFolder:
             design = Design.load(folder)
             if design.parameters != names:
                 raise RecordingError(
-                    f"{folder / 'design.json'}: designed for {', '.join(design.parameters)}; "
-                    f"the experiment has {', '.join(names)}"
+                    f"{folder / 'design.json'}: designed for {listed(design.parameters)}; "
+                    f"the experiment has {listed(names)}"
                 )
 
             trajectory = design.trajectory

@@ -19,6 +19,7 @@ from mjfim.errors import (
     MjfimError,
     SimulationDivergedError,
     explain_renamed_arguments,
+    listed,
 )
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.target_accuracy import (
@@ -413,6 +414,6 @@ def _doubts(estimate: Estimate, wanted: Array) -> Iterator[str]:
         if np.isfinite(target) and name in estimate.at_bound
     ]
     if at_bound:
-        yield f"has a target, but its estimate is at a bound: {', '.join(at_bound)}"
+        yield f"has a target, but its estimate is at a bound: {listed(at_bound)}"
     elif not estimate.success and not estimate.combinations:
         yield f"the fit did not succeed: {estimate.status}"

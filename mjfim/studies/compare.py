@@ -15,6 +15,7 @@ from mjfim.errors import (
     NoResultError,
     SimulationDivergedError,
     explain_renamed_arguments,
+    listed,
     unknown,
 )
 from mjfim.excitation.design import design_budget, design_task, designable
@@ -483,7 +484,7 @@ class MethodEvaluation:
 
         if outcome is MethodOutcome.INSIDE and saturated:
             outcome = MethodOutcome.CLAMPED
-            note = f"forcerange clamps {', '.join(saturated)}"
+            note = f"forcerange clamps {listed(saturated)}"
         elif verification.deviation > SAME_STATE_TOLERANCE:
             note = (
                 f"a clamp, stop or contact acts: the states deviate by {verification.deviation:.2g}"

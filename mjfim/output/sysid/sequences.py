@@ -12,7 +12,7 @@ import numpy as np
 from mujoco import sysid
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, MjfimError, ModelError
+from mjfim.errors import ExperimentError, MjfimError, ModelError, listed
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align
 from mjfim.model.mujoco_log import silence_mujoco_log
@@ -284,13 +284,13 @@ def _notes(system: System) -> tuple[str, ...]:
 
     with_prior = [parameter.name for parameter in p.parameters if parameter.prior is not None]
     if with_prior:
-        notes.append(f"the unweighted fit by sysid ignores the priors of {', '.join(with_prior)}")
+        notes.append(f"the unweighted fit by sysid ignores the priors of {listed(with_prior)}")
 
     is_bounded = np.isfinite(p.upper - p.lower)
     unbounded = [name for name, bounded in zip(p.names, is_bounded, strict=True) if not bounded]
     if unbounded:
         notes.append(
-            f"sysid needs finite bounds: {', '.join(unbounded)} may differ from the guess by "
+            f"sysid needs finite bounds: {listed(unbounded)} may differ from the guess by "
             f"{UNSTATED_BOUND:g} parameter sizes"
         )
 
