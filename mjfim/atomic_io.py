@@ -115,7 +115,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         # The error of a full disk names no file, other errors name the temporary one.
-        if error.filename in (None, name):
+        if error.errno is not None and error.filename in (None, name):
             error.filename = str(path)
         raise
     finally:
