@@ -10,8 +10,6 @@ import ctypes
 import itertools
 import multiprocessing
 import os
-import pickle
-import shutil
 import signal
 import sys
 import tempfile
@@ -133,9 +131,11 @@ class Pool(ProcessPoolExecutor):
         # block all others.
         self._stop = context.RawValue(ctypes.c_bool, False)
 
-        # Tasks that cannot end in time write their results so far into this folder, which exists
-        # after a request to stop only.
-        self._exchange = Path(tempfile.gettempdir()) / f"mjfim-{uuid.uuid4().hex}"
+        # Tasks that cannot end in time send their results so far to this address, at which somebody
+        # listens after a request to stop only.
+        self._address = _private_address()
+        self._listener: connection.Listener | None = None
+        self._offers: dict[int, Any] = {}
         self._next_number = itertools.count()
         self._numbers: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
 
@@ -143,7 +143,7 @@ class Pool(ProcessPoolExecutor):
         lifeline, self._hold = context.Pipe(duplex=False)
         self.is_abandoned = False
         self.has_lost_worker = False
-        arguments = (self._stop, lifeline, self._exchange)
+        arguments = (self._stop, lifeline, self._address)
         with _safe_path():
             super().__init__(processes, context, _initialize_worker, arguments)
 
@@ -160,15 +160,18 @@ class Pool(ProcessPoolExecutor):
 
     def stop(self) -> None:
         """Ask all running and later tasks to return their best result so far."""
-        # Nobody else may write what is read here.
-        with suppress(OSError):
-            self._exchange.mkdir(mode=0o700, exist_ok=True)
+        if self._listener is None:
+            # Only processes that have the key of this process are heard.
+            key = multiprocessing.current_process().authkey
+            with suppress(OSError):
+                self._listener = connection.Listener(self._address, authkey=key)
+                _run_in_background(self._listen, self._listener)
         self._stop.value = True
 
     def resume(self) -> None:
         """Withdraw the request to stop. No task may be running."""
         self._stop.value = False
-        shutil.rmtree(self._exchange, ignore_errors=True)
+        self._close_listener()
 
     def offered(self, future: Future[T]) -> list[T]:
         """Read what a running task has offered as its best result so far after `stop`.
@@ -179,11 +182,21 @@ class Pool(ProcessPoolExecutor):
         Returns:
             The result; empty where the task has none yet.
         """
-        try:
-            content = (self._exchange / f"{self._numbers[future]}.pickle").read_bytes()
-        except (OSError, KeyError):
-            return []
-        return [pickle.loads(content)]
+        number = self._numbers.get(future)
+        return [] if number not in self._offers else [self._offers[number]]
+
+    def _listen(self, listener: connection.Listener) -> None:
+        """Collect what workers offer, until the listener is closed."""
+        while self._listener is listener:
+            # A worker that is killed while it connects ends its own connection only.
+            with suppress(OSError, EOFError, multiprocessing.AuthenticationError):
+                _run_in_background(_receive, listener.accept(), self._offers)
+
+    def _close_listener(self) -> None:
+        """Hear no more offers."""
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            listener.close()
 
     def give_up(self) -> None:
         """End the workers after one of them was ended from outside."""
@@ -199,7 +212,7 @@ class Pool(ProcessPoolExecutor):
         if self.is_abandoned:
             self._hold.close()
         super().shutdown(wait, cancel_futures=cancel_futures)
-        shutil.rmtree(self._exchange, ignore_errors=True)
+        self._close_listener()
 
 
 # Stop token of the pool to which this process belongs. In a worker process, `_initialize_worker`
@@ -433,9 +446,7 @@ def _run_task(number: int, function: Callable[..., T], /, *args: Any, **kwargs: 
         _task = _offer = None
 
 
-def _initialize_worker(
-    stop: ctypes.c_bool, lifeline: connection.Connection, exchange: Path
-) -> None:
+def _initialize_worker(stop: ctypes.c_bool, lifeline: connection.Connection, address: str) -> None:
     """Prepare a new worker process.
 
     It ignores Ctrl-C, its token follows that of the pool, and it ends with its parent process.
@@ -443,33 +454,46 @@ def _initialize_worker(
     Args:
         stop: The request to stop, in memory that all processes of the pool share.
         lifeline: Connection that ends when the pool gives up its workers.
-        exchange: Folder for results so far.
+        address: Where results so far are heard.
     """
     global _pool_token
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _pool_token = StopToken(also=lambda: stop.value)
 
     _run_in_background(_end_with_parent, lifeline)
-    _run_in_background(_hand_over, stop, exchange)
+    _run_in_background(_hand_over, stop, address)
     _delay_termination()
 
 
-def _hand_over(stop: ctypes.c_bool, exchange: Path) -> None:
-    """Write what the running task has offered, whenever a stop is requested."""
-    written: tuple[int, object] | None = None
+def _private_address() -> str:
+    """Return an unused address for processes of this computer."""
+    name = f"mjfim-{uuid.uuid4().hex}"
+    return (
+        rf"\\.\pipe\{name}" if sys.platform == "win32" else str(Path(tempfile.gettempdir()) / name)
+    )
+
+
+def _receive(heard: connection.Connection, offers: dict[int, Any]) -> None:
+    """Receive one offer; a worker that is killed meanwhile offers nothing."""
+    with suppress(OSError, EOFError), heard:
+        number, result = heard.recv()
+        offers[number] = result
+
+
+def _hand_over(stop: ctypes.c_bool, address: str) -> None:
+    """Send what the running task has offered, whenever a stop is requested."""
+    sent: tuple[int, object] | None = None
+    key = multiprocessing.current_process().authkey
     while True:
         time.sleep(POLL_INTERVAL)
         offer = _offer
-        if not stop.value or offer is None or offer is written:
+        if not stop.value or offer is None or offer is sent:
             continue
 
-        # The folder is removed when nobody reads from it any more.
-        number, result = offer
-        with suppress(OSError):
-            temporary = exchange / f"{number}.part"
-            temporary.write_bytes(pickle.dumps(result))
-            temporary.replace(exchange / f"{number}.pickle")
-        written = offer
+        # Nobody listens any more where the parent process has what it needs.
+        with suppress(OSError, EOFError), connection.Client(address, authkey=key) as parent:
+            parent.send(offer)
+        sent = offer
 
 
 def _run_in_background(function: Callable[..., None], *arguments: object) -> None:

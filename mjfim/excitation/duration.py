@@ -24,22 +24,19 @@ def iteration_seconds(system: System, negligible: float = 0.0) -> float | None:
         negligible: Duration that need not be known accurately [s].
 
     Returns:
-        The time [s]; None where the first samples cannot be evaluated.
-
-    Raises:
-        ExperimentError: The horizon or the initial control cannot be used.
+        The time [s]; None where the first samples cannot be evaluated, or where the experiment is
+        wrong, which the design itself says.
     """
-    control = stated_control(system)
     robust = system.experiment.robust
     factor = 1 if robust is None else robust.samples
     try:
+        control = stated_control(system)
         return factor * estimated_seconds(
             lambda samples: _iterate(system, control[:samples]),
             len(control),
             negligible=negligible / factor,
         )
     except (MjfimError, ValueError):
-        # The design itself says what is wrong.
         return None
 
 
