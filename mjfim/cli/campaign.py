@@ -34,7 +34,7 @@ from mjfim.output.campaign_settings import (
     require_same_settings,
     write_settings,
 )
-from mjfim.output.summaries import describe_campaign
+from mjfim.output.summaries.campaign import describe_campaign
 from mjfim.output.text import render
 from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, CampaignStatus, Round

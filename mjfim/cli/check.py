@@ -26,7 +26,7 @@ from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import CHECK_FILES
-from mjfim.output.summaries import describe_check
+from mjfim.output.summaries.check import describe_check
 from mjfim.output.text import render
 from mjfim.recordings.read import read_recording
 

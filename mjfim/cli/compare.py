@@ -25,7 +25,7 @@ from mjfim.errors import NoResultError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.input_files import input_files
 from mjfim.output.folders import comparison_files
-from mjfim.output.summaries import describe_comparison
+from mjfim.output.summaries.comparison import describe_comparison
 from mjfim.output.text import render
 from mjfim.studies.baselines.methods import METHODS
 from mjfim.studies.compare import chosen_methods, compare_task

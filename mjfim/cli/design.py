@@ -35,7 +35,7 @@ from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import MAX_STARTS
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
-from mjfim.output.summaries import describe_design
+from mjfim.output.summaries.design import describe_design
 from mjfim.output.text import render
 from mjfim.records.design import Design
 from mjfim.records.events import Callback

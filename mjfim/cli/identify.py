@@ -28,7 +28,8 @@ from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.output.folders import estimate_files
-from mjfim.output.summaries import describe_estimate, describe_logs
+from mjfim.output.summaries.estimate import describe_estimate
+from mjfim.output.summaries.logs import describe_logs
 from mjfim.output.text import render
 from mjfim.recordings.read import read_log
 

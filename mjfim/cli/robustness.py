@@ -29,7 +29,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.input_files import input_files
 from mjfim.output.archive import write_design
 from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
-from mjfim.output.summaries import describe_robustness
+from mjfim.output.summaries.robustness import describe_robustness
 from mjfim.output.text import render
 from mjfim.parallel import cores
 from mjfim.records.robustness import RobotConditions, Robustness

@@ -30,7 +30,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import study_files
-from mjfim.output.summaries import describe_study
+from mjfim.output.summaries.monte_carlo import describe_study
 from mjfim.output.text import render
 from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
 

@@ -28,7 +28,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import verify
 from mjfim.experiment.schema import Experiment
-from mjfim.output.summaries import describe_design
+from mjfim.output.summaries.design import describe_design
 from mjfim.output.summary_parts import Paragraph
 from mjfim.records.design import Design, HistoryRow, Status
 from mjfim.records.events import DesignEvent

@@ -12,14 +12,12 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.output.rerun.text import design_text, estimate_text
 from mjfim.output.rerun.text import render as render_markdown
-from mjfim.output.summaries import (
-    describe_check,
-    describe_design,
-    describe_estimate,
-    describe_study,
-    improvement,
-    shortened,
-)
+from mjfim.output.summaries.accuracy import improvement
+from mjfim.output.summaries.check import describe_check
+from mjfim.output.summaries.design import describe_design
+from mjfim.output.summaries.estimate import describe_estimate
+from mjfim.output.summaries.monte_carlo import describe_study
+from mjfim.output.summaries.widths import shortened
 from mjfim.output.summary_parts import Name, Quantity, Summary
 from mjfim.output.text import render
 from mjfim.records.design import CombinationAccuracy, Design

@@ -21,7 +21,7 @@ from mjfim.model.coordinates import tangent_names
 from mjfim.optimize.lq import regulator
 from mjfim.output import archive
 from mjfim.output.playback import design_columns, reference_columns, simulate_playback
-from mjfim.output.summaries import robustness_sentences
+from mjfim.output.summaries.robustness import robustness_sentences
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
 from mjfim.records.robustness import RobotConditions, Robustness

@@ -26,7 +26,7 @@ from mjfim.output.plots.style import (
     shorten,
     write_message,
 )
-from mjfim.output.summaries import BEST_CASE
+from mjfim.output.summaries.accuracy import BEST_CASE
 from mjfim.records.check import CONFOUNDED_CORRELATION, Check, ParameterCheck
 
 # Largest number of parameters for which correlations are written into the cells.

@@ -29,7 +29,7 @@ from mjfim.output.plots.style import (
     shorten,
     write_message,
 )
-from mjfim.output.summaries import budget_in_words
+from mjfim.output.summaries.comparison import budget_in_words
 from mjfim.records.comparison import DESIGN, Comparison, MethodResult
 
 # Largest number of parameters for which ratios are written into the cells.

@@ -29,7 +29,7 @@ from mjfim.output.plots.style import (
     shorten,
     shorten_label,
 )
-from mjfim.output.summaries import BEST_CASE
+from mjfim.output.summaries.accuracy import BEST_CASE
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 

@@ -23,7 +23,9 @@ from mjfim.output.plots.style import (
     shorten_label,
     trajectory_style,
 )
-from mjfim.output.summaries import BEST_CASE, MAX_MATRIX, describe_design, describe_study
+from mjfim.output.summaries.accuracy import BEST_CASE
+from mjfim.output.summaries.design import describe_design
+from mjfim.output.summaries.monte_carlo import MAX_MATRIX, describe_study
 from mjfim.output.summary_parts import Cell, Name, Quantity, SummaryTable
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy

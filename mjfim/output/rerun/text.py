@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from mjfim.output.summaries import describe_design, describe_estimate
+from mjfim.output.summaries.design import describe_design
+from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summary_parts import Emphasis, Listing, Part, Summary, SummaryTable
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate

@@ -1,0 +1,1 @@
+"""Results in words and tables, for the terminal, Rerun and figures; a module per record."""

@@ -1,0 +1,64 @@
+"""A campaign in words and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjfim.model.parameters import ParameterSet
+from mjfim.output.summary_parts import Emphasis, Paragraph, Row, Summary, SummaryTable, columns
+from mjfim.records.campaign import Campaign
+from mjfim.records.estimate import Estimate
+
+
+def describe_campaign(campaign: Campaign, parameters: ParameterSet, *, simulated: bool) -> Summary:
+    """Describe the estimate after the last round of a campaign.
+
+    Args:
+        campaign: The campaign.
+        parameters: The parameters of the experiment.
+        simulated: True if the recordings were simulated at the true values.
+
+    Returns:
+        The estimates and the status; before the first estimate, the status alone.
+    """
+    status = Paragraph(text=str(campaign))
+    if campaign.estimate is None:
+        return Summary(title="Campaign", outcome="", parts=(status,))
+
+    headings = ["parameter", "guess", "estimate", "formal σ", "wanted σ"]
+    if simulated:
+        headings.append("error")
+
+    rows = []
+    for j in parameters.interest.tolist():
+        true = float(parameters.true[j]) if simulated else None
+        rows.append(_campaign_row(campaign, campaign.estimate, parameters, j=j, true=true))
+
+    table = SummaryTable(
+        key="campaign", title="Estimates", columns=columns(*headings), rows=tuple(rows)
+    )
+    return Summary(title="Campaign", outcome="", parts=(table, status))
+
+
+def _campaign_row(
+    campaign: Campaign,
+    estimate: Estimate,
+    parameters: ParameterSet,
+    *,
+    j: int,
+    true: float | None,
+) -> Row:
+    """Return the row of parameter j; `true` is its true value, None if that is not known."""
+    value, std = float(estimate.theta[j]), float(estimate.std[j])
+    wanted = float(campaign.wanted[j])
+    cells = [
+        estimate.parameters[j],
+        f"{parameters.guess[j]:.5g}",
+        f"{value:.5g}",
+        f"{std:.2g}",
+        f"{wanted:.2g}" if np.isfinite(wanted) else "-",
+    ]
+    if true is not None:
+        cells.append(f"{(value - true) / std:+.1f} σ")
+    emphasis = Emphasis.NORMAL if std <= wanted else Emphasis.WARNING
+    return Row(cells=tuple(cells), emphasis=emphasis)

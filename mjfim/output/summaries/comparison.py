@@ -1,0 +1,148 @@
+"""A comparison of methods in words and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjfim.output.summaries.accuracy import BEST_CASE
+from mjfim.output.summaries.widths import MAX_COLUMNS
+from mjfim.output.summary_parts import (
+    Cell,
+    Column,
+    Emphasis,
+    Name,
+    Paragraph,
+    Part,
+    Quantity,
+    Row,
+    Summary,
+    SummaryTable,
+    columns,
+)
+from mjfim.records.comparison import DESIGN, Comparison, MethodResult
+
+
+def describe_comparison(comparison: Comparison) -> Summary:
+    """Describe the result of each method with equal budgets, and which is the best.
+
+    Methods are in the order in which they ran.
+
+    Args:
+        comparison: The comparison.
+    """
+    parts: list[Part] = [_method_table(comparison)]
+    if len(comparison.wanted) <= MAX_COLUMNS:
+        parts.append(_method_accuracy_table(comparison))
+
+    for row in comparison.rows:
+        remarks = [] if row.sound else [row.outcome.value]
+        remarks += [row.note] if row.note else []
+        if remarks:
+            parts.append(Paragraph(text=f"{row.title}: {'; '.join(remarks)}"))
+
+    legend = (
+        "worst σ: standard deviation of the worst combination of parameters, relative to their "
+        "scales; worst margin: smallest margin of all limits, in percent of half of the range."
+    )
+    parts.append(Paragraph(text=f"{legend} {BEST_CASE}", emphasis=Emphasis.WEAK))
+    emphasis = Emphasis.STRONG if comparison.ok else Emphasis.STRONG_WARNING
+    parts += [Paragraph(text=sentence, emphasis=emphasis) for sentence in comparison.verdict]
+    return Summary(title="", outcome="", parts=tuple(parts))
+
+
+def budget_in_words(comparison: Comparison) -> str:
+    """Return the time and the MuJoCo steps that each method had.
+
+    Args:
+        comparison: The comparison.
+    """
+    budget = f"{comparison.seconds:g} s"
+    if np.isfinite(comparison.steps):
+        budget += f" or {comparison.steps / 1e6:.3g} million MuJoCo steps"
+    return budget
+
+
+def _method_table(comparison: Comparison) -> SummaryTable:
+    """Tabulate cost, criterion, worst standard deviation, effort and margin of each method."""
+    headings = ["method"]
+    if comparison.weighted:
+        headings.append("J")
+    headings += [f"φ ({comparison.criterion})", "J against design", "worst σ"]
+    headings += ["time", "steps", "worst margin"]
+    return SummaryTable(
+        key="methods",
+        title=f"{comparison.source}: each method with {budget_in_words(comparison)}",
+        columns=columns(*headings),
+        rows=tuple(
+            Row(cells=_method_cells(comparison, row), emphasis=_method_emphasis(comparison, row))
+            for row in comparison.rows
+        ),
+        unbroken=True,
+    )
+
+
+def _method_cells(comparison: Comparison, row: MethodResult) -> tuple[Cell, ...]:
+    """Return the cells of one method."""
+    design, (kind, relative_margin) = comparison.design, row.tightest
+
+    against_design = ""
+    if design is not None and row is not design and not np.isnan(row.cost):
+        against_design = f"{-100 * comparison.gain(row, design):+.3g} %"
+    margin = "-"
+    if kind and np.isfinite(relative_margin):
+        margin = f"{100.0 * relative_margin:.2g} % {kind.replace('_', ' ')}"
+
+    costs = [Quantity(value=row.criterion, digits=4)]
+    if comparison.weighted:
+        costs.insert(0, Quantity(value=row.cost, digits=4))
+    return (
+        _method_title(comparison, row),
+        *costs,
+        against_design,
+        Quantity(value=row.worst_relative_std),
+        f"{row.seconds:.1f} s",
+        f"{row.steps / 1e6:.2f} M",
+        margin,
+    )
+
+
+def _method_accuracy_table(comparison: Comparison) -> SummaryTable:
+    """Tabulate every method's standard deviations."""
+    rows = []
+    for row in comparison.rows:
+        cells = [Quantity(value=float(row.std[j])) for j in comparison.wanted]
+        rows.append(
+            Row(
+                cells=(_method_title(comparison, row), *cells),
+                emphasis=_method_emphasis(comparison, row),
+            )
+        )
+
+    names = [
+        Column(heading=Name(name=comparison.parameters[j], unit=comparison.units[j]))
+        for j in comparison.wanted
+    ]
+    return SummaryTable(
+        key="accuracy",
+        title="σ of each parameter",
+        columns=(*columns("method"), *names),
+        rows=tuple(rows),
+        unbroken=True,
+    )
+
+
+def _method_title(comparison: Comparison, row: MethodResult) -> str:
+    """Return a method's title; the best method has an arrow."""
+    return ("▶ " if row is comparison.best else "  ") + row.title
+
+
+def _method_emphasis(comparison: Comparison, row: MethodResult) -> Emphasis:
+    """Return the emphasis of a method.
+
+    It is strong for the design, a warning for better methods, and weak for unusable results.
+    """
+    if not row.sound:
+        return Emphasis.WEAK
+    if row.method == DESIGN:
+        return Emphasis.STRONG
+    return Emphasis.WARNING if row in comparison.beating else Emphasis.NORMAL
