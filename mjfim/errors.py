@@ -107,14 +107,27 @@ def listed(names: Sequence[str]) -> str:
     Returns:
         The names with commas between them; `none` if there are none.
     """
-    if not names:
+    return first_ones([shortened(name) for name in names])
+
+
+def first_ones(phrases: Sequence[str], separator: str = ", ", longest: int = LISTED_TEXT) -> str:
+    """List phrases for a message; of a long list the beginning and the number of the others.
+
+    Args:
+        phrases: The phrases, each of which is shown as it is or not at all.
+        separator: Text between two phrases.
+        longest: Length from which on phrases are only counted [characters].
+
+    Returns:
+        The phrases, at least the first one; `none` if there are none.
+    """
+    if not phrases:
         return "none"
 
-    texts = [shortened(name) for name in names]
-    lengths = itertools.accumulate(len(text) + 2 for text in texts)
-    count = max(1, sum(length <= LISTED_TEXT for length in lengths))
-    further = len(names) - count
-    return ", ".join(texts[:count]) + (f" and {further} more" if further else "")
+    lengths = itertools.accumulate(len(phrase) + len(separator) for phrase in phrases)
+    count = max(1, sum(length <= longest for length in lengths))
+    further = len(phrases) - count
+    return separator.join(phrases[:count]) + (f" and {further} more" if further else "")
 
 
 def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:

@@ -15,6 +15,8 @@ from mjfim.errors import (
     SimulationDivergedError,
     UnidentifiableError,
     explain_renamed_arguments,
+    first_ones,
+    listed,
 )
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.evaluation import design_warnings, evaluate_point, point_at_stated_rate
@@ -34,7 +36,7 @@ from mjfim.information.smoothness import roughness
 from mjfim.parallel import one_blas_thread
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.combinations import ParameterGroup, join_names
+from mjfim.records.combinations import GROUPS_TEXT, ParameterGroup, groups_in_words
 from mjfim.records.design import Design, Evaluation, Status
 from mjfim.records.events import DesignCallback
 
@@ -474,8 +476,7 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
         if not information.is_estimable(task.contrast).all():
             raise UnidentifiableError(
                 "cost.combination or cost.subset states a combination that cannot be identified; "
-                "identifiable are: "
-                + "; ".join(str(group) for group in identifiability.groups_along_all)
+                "identifiable are: " + groups_in_words(identifiability.groups_along_all)
             )
 
     if not along_all.basis.shape[1]:
@@ -484,7 +485,7 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     # Combinations that random controls excite, but not the initial one.
     if identifiability.along_trajectory.count > along_all.count:
         groups = identifiability.groups_along_trajectory
-        unexcited = "; ".join(_unexcited_group(group) for group in groups)
+        unexcited = first_ones([_unexcited_group(group) for group in groups], "; ", GROUPS_TEXT)
         raise UnidentifiableError(
             f"the initial control does not excite: {unexcited}. Other controls do: begin with one "
             "that moves the joints of these parameters, for example a multisine"
@@ -493,10 +494,10 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
 
 def _unexcited_group(group: ParameterGroup) -> str:
     """Name of a group that has an effect, but not along the initial control."""
-    return str(group) if group.combinations else join_names(group.members)
+    return group.short if group.combinations else group.short_names
 
 
 def _subject(names: Sequence[str]) -> str:
     """Beginning of a sentence about some parameters."""
-    quoted = ", ".join(f"parameters.{name}" for name in names)
+    quoted = listed([f"parameters.{name}" for name in names])
     return f"{quoted} {'changes' if len(names) == 1 else 'change'}"

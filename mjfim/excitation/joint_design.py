@@ -10,7 +10,13 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, SimulationDivergedError, explain_renamed_arguments
+from mjfim.errors import (
+    ExperimentError,
+    SimulationDivergedError,
+    explain_renamed_arguments,
+    first_ones,
+    listed,
+)
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -98,7 +104,7 @@ def _require_common_parameters(tasks: Sequence[DesignTask]) -> None:
     """Raise ExperimentError where there are fewer than two tasks, or their parameters differ."""
     names = [task.parameters.names for task in tasks]
     if len(tasks) < 2 or any(other != names[0] for other in names):
-        stated = "; ".join(", ".join(each) for each in names)
+        stated = first_ones([listed(each) for each in names], "; ")
         raise ExperimentError(
             "design_jointly takes two or more experiments with the same parameters in one order: "
             f"{stated}"

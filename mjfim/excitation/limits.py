@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.errors import ExperimentError, listed, unknown
+from mjfim.errors import ExperimentError, first_ones, listed, shortened, unknown
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import ScalarJoint, actuator_names, joint_names
 
@@ -211,7 +211,8 @@ def _stated_ranges(kind: _KindOfLimit) -> dict[str, Range]:
     """
     names, stated = list(kind.addresses), kind.stated
     if not names and not isinstance(stated, Mapping):
-        listing = "; ".join(f"{name!r} is {what}" for name, what in kind.excluded.items())
+        reasons = [f"{shortened(repr(name))} is {what}" for name, what in kind.excluded.items()]
+        listing = first_ones(reasons, "; ")
         raise ExperimentError(
             f"limits.{kind.kind} applies to nothing in this model: {listing}. It limits "
             f"{_applies_to(kind.kind)} only; remove the key"

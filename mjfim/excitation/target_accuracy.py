@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, UnidentifiableError, listed
+from mjfim.errors import ExperimentError, UnidentifiableError, first_ones, listed
 from mjfim.excitation.task import DesignTask
 from mjfim.records.design import Design
+
+# Longest list of identifiable combinations in a message [characters].
+LONGEST_COMBINATIONS = 150
 
 
 def target_accuracies(task: DesignTask) -> Array:
@@ -63,7 +66,14 @@ def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
         return
 
     names = listed([task.parameters.names[j] for j in unreachable])
-    known = f": {'; '.join(design.combinations)}" if design.combinations else ""
+
+    # A single combination of very many parameters is not shown.
+    known, words = "", first_ones(design.combinations, "; ", LONGEST_COMBINATIONS)
+    if design.combinations:
+        known = f": {words}"
+    if len(words) > 2 * LONGEST_COMBINATIONS:
+        known = " (`mjfim check` shows the combinations that it does identify)"
+
     raise UnidentifiableError(
         f"{task.experiment.source}: no standard deviation of {names} can be reached, because this "
         f"experiment does not identify every parameter by itself{known}. Remove one of them, give "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError, listed, unknown
 from mjfim.excitation.design_memory import require_memory_for_design
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.robust import ParameterSamples
@@ -170,7 +170,7 @@ def contrast_of(system: System) -> Array | None:
         if name not in wanted:
             raise ExperimentError(f"cost.{key}: {unknown('wanted parameter', name, wanted)}")
     if not chosen:
-        raise ExperimentError(f"cost.subset: it names no parameter; valid: {', '.join(wanted)}")
+        raise ExperimentError(f"cost.subset: it names no parameter; valid: {listed(wanted)}")
 
     # One combination of all parameters, or each chosen parameter in the unit of its scale.
     if cost.combination:

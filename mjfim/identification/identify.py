@@ -15,7 +15,7 @@ import numpy as np
 
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import SimulationDivergedError, explain_renamed_arguments
+from mjfim.errors import SimulationDivergedError, explain_renamed_arguments, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.extreme_values import describe_extreme_value
@@ -288,11 +288,12 @@ def _require_finite_cost(
     with np.errstate(over="ignore"):
         cost = problem.of_segments(subset).cost(_of_subset(begin, subset))
     if not np.isfinite(cost):
-        values = dict(zip(task.system.parameters.names, task.start, strict=True))
+        names = task.system.parameters.names
+        values = listed([f"{n} = {v:.6g}" for n, v in zip(names, task.start, strict=True)])
         extreme = describe_extreme_value(task.recordings, task.system.channels.control_columns)
         why = _why_diverged(problem, task.start)
         cause = f"; {extreme}; is it a fault of the log?" if extreme else f": {why}"
-        raise SimulationDivergedError(f"the simulation diverges at the start {values}{cause}")
+        raise SimulationDivergedError(f"the simulation diverges at the start ({values}){cause}")
 
 
 def _why_diverged(problem: FitProblem, theta: Array) -> str:

@@ -341,8 +341,8 @@ def _warnings_of_search(findings: _Findings) -> Iterator[str]:
 
     for group in accuracy.groups:
         yield (
-            f"not identifiable separately: {group}; what the recordings do not determine was held "
-            "at the start"
+            f"not identifiable separately: {group.short}; what the recordings do not determine "
+            "was held at the start"
         )
 
     if accuracy.singular:

@@ -27,7 +27,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.plant.noise import Noise
 from mjfim.plant.plant import Plant
 from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
-from mjfim.records.combinations import ParameterGroup, combination_matrix
+from mjfim.records.combinations import ParameterGroup, combination_matrix, groups_in_words
 from mjfim.records.design import CombinationAccuracy
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -205,8 +205,9 @@ def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
 
     units = [parameter.unit for parameter in parameters.parameters]
     groups = parameter_groups(null, parameters.names, parameters.magnitude, units)
-    listed = "; ".join(str(group) for group in groups)
-    raise UnidentifiableError(f"not every parameter is identifiable from this trajectory: {listed}")
+    raise UnidentifiableError(
+        f"not every parameter is identifiable from this trajectory: {groups_in_words(groups)}"
+    )
 
 
 def _identifiability(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.errors import listed
 from mjfim.information.null_space import LEAST_EFFECT, LEAST_RELATIVE_EFFECT
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.active_constraints import active_constraints
@@ -94,7 +95,7 @@ def roughness(
     if fine is None or coarse is None:
         return Roughness(
             error=np.inf,
-            parameter=", ".join(names),
+            parameter=listed(names),
             sample=0,
             time=0.0,
             causes=active_constraints(model, trajectory, range(trajectory.samples)),

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError
+from mjfim.errors import ExperimentError, listed
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.mujoco_log import silence_mujoco_log
@@ -158,7 +158,7 @@ class ParameterWriter:
                     else f"parameters.{parameter.name}.{key}"
                     for parameter in involved
                 )
-                raise ExperimentError(f"{', '.join(keys)}: {fault}")
+                raise ExperimentError(f"{listed([*keys])}: {fault}")
 
     def _write_numbers(self, model: Any, theta: Array) -> dict[tuple[str, int], Array]:
         """Write every single number in place.

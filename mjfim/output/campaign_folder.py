@@ -14,7 +14,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
-from mjfim.errors import ModelError, RecordingError, listed
+from mjfim.errors import ModelError, RecordingError, first_ones, listed
 from mjfim.experiment.system import System
 from mjfim.interruption import run_optional
 from mjfim.output import plots
@@ -277,4 +277,4 @@ def accuracy_sentence(estimate: Estimate, wanted: Array) -> str:
         if np.isfinite(wanted[j]):
             value, std = float(estimate.theta[j]), float(estimate.std[j])
             parts.append(f"{name} {format_with_uncertainty(value, std)} (wanted {wanted[j]:.3g})")
-    return ", ".join(parts)
+    return first_ones(parts) if parts else ""

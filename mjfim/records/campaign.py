@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.errors import first_ones
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
@@ -184,8 +185,13 @@ def missed_targets(names: Sequence[str], std: Array, wanted: Array) -> str:
         wanted: (p,) target standard deviations [theta-unit].
 
     Returns:
-        Text such as `m (σ 0.012, wanted 0.01)`; empty if no parameter misses its target.
+        Text such as `m (σ 0.012, wanted 0.01)`; of many parameters the worst ones and the number of
+        the others; empty if no parameter misses its target.
     """
     missed = np.flatnonzero(~(std <= wanted)).tolist()
     worst_first = sorted(missed, key=lambda j: -std[j] / wanted[j])
-    return ", ".join(f"{names[j]} (σ {std[j]:.3g}, wanted {wanted[j]:.3g})" for j in worst_first)
+    return (
+        first_ones([f"{names[j]} (σ {std[j]:.3g}, wanted {wanted[j]:.3g})" for j in worst_first])
+        if worst_first
+        else ""
+    )

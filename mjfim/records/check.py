@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.errors import first_ones
 from mjfim.records.combinations import ParameterGroup
 from mjfim.records.design import CombinationAccuracy
 from mjfim.records.serialization import SavedRecord
@@ -107,7 +108,7 @@ class Roughness:
     causes: tuple[str, ...]
 
     def __str__(self) -> str:
-        cause = ", ".join(self.causes)
+        cause = first_ones(self.causes) if self.causes else ""
         if not cause:
             cause = "no contact, friction or limit acts there; the motion may be chaotic"
         size = f"{100 * self.error:.2g} %" if np.isfinite(self.error) else "an unlimited amount"

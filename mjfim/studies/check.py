@@ -12,7 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import RecordingError, SimulationDivergedError
+from mjfim.errors import RecordingError, SimulationDivergedError, first_ones, shortened
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
@@ -33,7 +33,7 @@ from mjfim.records.check import (
     ParameterCheck,
     SelfTest,
 )
-from mjfim.records.combinations import ParameterGroup, join_names
+from mjfim.records.combinations import ParameterGroup, groups_in_words, join_names
 from mjfim.records.design import CombinationAccuracy
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
@@ -44,12 +44,6 @@ DEFAULT_RELATIVE_STD = 0.05
 
 # Number of repetitions above which a target accuracy counts as unreachable.
 MAX_REPETITIONS = 1_000_000_000
-
-# Number of characters above which a list of parameter groups is replaced by their number.
-MAX_LIST_LENGTH = 400
-
-# Largest number of confounded pairs that a sentence of the verdict lists.
-MAX_LISTED_PAIRS = 5
 
 # Largest number of samples of a recording along which the derivatives are tested.
 MAX_TESTED_SAMPLES = 2000
@@ -420,16 +414,6 @@ def _confounded_pairs(names: Sequence[str], correlation: Array) -> tuple[Confoun
     return tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation)))
 
 
-def _groups_in_words(groups: Sequence[ParameterGroup]) -> str:
-    """List of parameter groups, or only their number where the list would be too long."""
-    words = "; ".join(str(group) for group in groups)
-    if len(words) <= MAX_LIST_LENGTH:
-        return words
-
-    members = sum(len(group.members) for group in groups)
-    return f"{members} parameters in {len(groups)} groups (listed under combinations)"
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Verdict:
     """Findings of a check, from which sentences for the user are made.
@@ -497,16 +481,16 @@ class _Verdict:
         if unknown:
             yield (
                 "not identifiable separately from this initial state, with any tested control: "
-                f"{_groups_in_words(unknown)}. Remove or fix one parameter of each group, give it "
+                f"{groups_in_words(unknown)}. Remove or fix one parameter of each group, give it "
                 "a prior, or measure another output; a design uses the identifiable combinations"
             )
         if resolved:
-            names = "; ".join(join_names(group.members) for group in resolved)
+            names = first_ones([group.short_names for group in resolved], "; ")
             yield f"separated by priors only, not by data: {names}"
         if self.not_excited:
             yield (
                 f"not excited by {self.source}, but another control would show: "
-                f"{_groups_in_words(self.not_excited)}. Move those joints more"
+                f"{groups_in_words(self.not_excited)}. Move those joints more"
             )
 
     def _about_accuracy(self, identifiable: Sequence[ParameterCheck]) -> Iterator[str]:
@@ -535,11 +519,11 @@ class _Verdict:
         if not self.confounded:
             return
 
-        listed = self.confounded[:MAX_LISTED_PAIRS]
-        words = ", ".join(f"{p.first} / {p.second} ({p.correlation:+.3f})" for p in listed)
-        rest = len(self.confounded) - len(listed)
-        more = f" and {rest} more pairs" if rest else ""
+        pairs = [
+            f"{shortened(pair.first)} / {shortened(pair.second)} ({pair.correlation:+.3f})"
+            for pair in self.confounded
+        ]
         yield (
-            f"confounded (correlation of the estimates): {words}{more}; "
+            f"confounded pairs (correlation of the estimates): {first_ones(pairs)}; "
             "fixing one parameter of a pair makes the other more accurate"
         )

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDivergedError
+from mjfim.errors import SimulationDivergedError, first_ones
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
@@ -81,7 +81,7 @@ def self_test(
     sample, causes = active
     cause = (
         f"constraints are active from sample {sample} (t = {trajectory.t[sample]:.4g} s): "
-        f"{', '.join(causes)}"
+        f"{first_ones(causes)}"
     )
     return replace(tested, likely_cause=cause)
 

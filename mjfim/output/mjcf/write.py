@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
-from mjfim.errors import ModelError
+from mjfim.errors import ModelError, first_ones, listed
 from mjfim.experiment.system import System
 from mjfim.model.loading import compile_spec
 from mjfim.model.parameters import ParameterSet
@@ -62,6 +62,9 @@ ABSOLUTE_TOLERANCE = 1e-12
 # Constraint weights of bodies, which MuJoCo averages differently for 'simple' bodies.
 INVERSE_WEIGHT = "body_invweight0"
 
+# Longest list of objects in a remark on a written model [characters].
+REMARK_TEXT = 120
+
 
 def write_identified(path: Path, system: System, theta: Array) -> str | None:
     """Write the user's MJCF with parameter values.
@@ -95,14 +98,15 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
         if stated:
             remarks.append(
                 "it also states numbers that MuJoCo would otherwise derive from the identified "
-                f"values: {', '.join(stated)}"
+                f"values: {first_ones(stated, longest=REMARK_TEXT)}"
             )
 
     found = mujoco.MjModel.from_xml_path(str(path))
     reweighted = _reweighted_bodies(found, wanted, same_class=False)
     if reweighted and not unconstrained(found):
+        names = first_ones([*map(repr, reweighted)], longest=REMARK_TEXT)
         remarks.append(
-            f"contacts and other constraints of {', '.join(map(repr, reweighted))} are slightly "
+            f"contacts and other constraints of {names} are slightly "
             "softer or stiffer than in the fit, where MuJoCo could not treat these bodies as "
             "'simple' (body_invweight0)"
         )
@@ -132,8 +136,7 @@ def _write_edited(path: Path, system: System, theta: Array, wanted: Any) -> list
         different = _differences(found, wanted)
         if different:
             raise ModelError(
-                "with the identified values the text compiles to a different "
-                f"{', '.join(different)}"
+                f"with the identified values the text compiles to a different {listed(different)}"
             )
     return stated
 

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array, evenly_spread_indices
-from mjfim.errors import MjfimError
+from mjfim.errors import MjfimError, listed
 from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
@@ -98,7 +98,7 @@ def _checked_noise(estimate: Estimate, index: int, sigma: Sequence[float] | Arra
     outputs = estimate.recordings[index].outputs
     noise = np.asarray(sigma, dtype=np.float64)
     if noise.shape != (len(outputs),) or not (noise > 0.0).all():
-        raise MjfimError(f"sigma must hold one positive number for each of {', '.join(outputs)}")
+        raise MjfimError(f"sigma must hold one positive number for each of {listed(outputs)}")
     return noise
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mjfim.errors import listed
 from mjfim.output.summaries.accuracy import BEST_CASE, accuracy_table
 from mjfim.output.summary_parts import (
     Cell,
@@ -58,7 +59,7 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
         )
     )
     if design.nuisance:
-        names = ", ".join(design.nuisance)
+        names = listed(design.nuisance)
         parts.append(
             Paragraph(text=f"nuisance parameters, whose accuracy the design ignores: {names}")
         )

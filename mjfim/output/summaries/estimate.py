@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mjfim.errors import listed
 from mjfim.output.summaries.accuracy import NOT_ALONE
 from mjfim.output.summaries.widths import MAX_COLUMNS, shortened
 from mjfim.output.summary_parts import (
@@ -37,15 +38,15 @@ def describe_estimate(estimate: Estimate) -> Summary:
     # Parameters that differ between recordings: the table shows the first value only.
     for name, values in estimate.per_recording.items():
         if len(values) > 1:
-            listed = ", ".join(f"{value:.3g}" for value in values)
-            parts.append(Paragraph(text=f"{name} of each recording: {listed}"))
+            shown = listed([f"{value:.3g}" for value in values])
+            parts.append(Paragraph(text=f"{name} of each recording: {shown}"))
 
     verdict = (
         "not explained by noise: the formal σ underestimates the errors"
         if estimate.misfit
         else "consistent with noise"
     )
-    rms = ", ".join(f"{name} {value:.3g}" for name, value in estimate.residual_rms.items())
+    rms = listed([f"{name} {value:.3g}" for name, value in estimate.residual_rms.items()])
     parts.append(
         Paragraph(
             text=(
