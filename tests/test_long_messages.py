@@ -20,6 +20,7 @@ from mjfim.identification.report import _warnings_of_bounds, _warnings_of_search
 from mjfim.identification.task import _start
 from mjfim.output.campaign_folder import accuracy_sentence
 from mjfim.output.mjcf import write
+from mjfim.output.summaries.robustness import MAX_MISSED_LIMITS, _limit_sentences
 from mjfim.records.campaign import missed_targets
 from mjfim.records.check import ConfoundedPair, Roughness, SelfTest
 from mjfim.records.combinations import Combination, ParameterGroup, groups_in_words
@@ -111,6 +112,26 @@ def test_the_verdict_of_a_check_is_short() -> None:
         sentences = list(_Verdict(rows=rows, **findings).sentences())
         assert max(map(len, sentences)) < LONGEST_MESSAGE
         assert sum(" more" in sentence for sentence in sentences) == 3
+
+
+def test_a_robustness_study_has_a_sentence_for_the_limits_that_are_missed_most() -> None:
+    limits = [SimpleNamespace(kind="position", name=name, scale=2.0) for name in NAMES]
+    result = SimpleNamespace(
+        all_kept=0,
+        runs=3,
+        limits=limits,
+        kept=np.zeros((3, 300), dtype=bool),
+        margins=np.tile(-np.arange(300.0), (3, 1)),
+    )
+    first, *worst, others = _limit_sentences(result)
+    assert first == "0 of 3 robots keep all limits at every engine step"
+    assert len(worst) == MAX_MISSED_LIMITS
+    assert worst[-1] == "position of inertia_of_link_299 is exceeded by up to 598"
+    assert others.startswith(f"{300 - MAX_MISSED_LIMITS} more limits are exceeded or reached")
+
+    result.limits, result.margins = limits[:8], result.margins[:, :8]
+    result.kept = result.kept[:, :8]
+    assert len(list(_limit_sentences(result))) == 9
 
 
 def test_the_causes_of_a_rough_motion_are_short() -> None:

@@ -72,7 +72,7 @@ def campaign(
         bool,
         typer.Option(
             "--resume",
-            help="Continue a simulated campaign after its last complete round; settings as before.",
+            help="Continue a simulated campaign, with its settings, after its last complete round.",
         ),
     ] = False,
     force: Force = False,

@@ -153,8 +153,8 @@ def _say_if_default_ended(result: Design, has_default: bool) -> None:
     """Say that the default time has ended a design, and how to state another one."""
     if has_default and result.seconds >= DEFAULT_SECONDS:
         errors.print(
-            f"mjfim: {DEFAULT_SECONDS:g} s are used up, the default; `seconds` in the table "
-            "[descent] states another time",
+            f"mjfim: the design ended after {DEFAULT_SECONDS:g} s, the default time; `seconds` in "
+            "the table [descent] states another one",
             markup=False,
         )
 

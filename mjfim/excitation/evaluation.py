@@ -127,7 +127,9 @@ def criterion_of(task: DesignTask, control: Array) -> float:
 
     value = _evaluate_control(task, control).criterion
     if not (np.isfinite(value) and value > 0.0):
-        raise SimulationDivergedError(f"the criterion is {value}")
+        raise SimulationDivergedError(
+            f"the criterion of this control is {value}; it must be finite and positive"
+        )
     return value
 
 

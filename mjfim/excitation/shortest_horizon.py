@@ -270,7 +270,7 @@ class _HorizonSearch:
         if not self.stop.requested:
             self._raise_out_of_reach(largest)
         if not self.designs:
-            raise NoResultError("stopped before there was a design")
+            raise NoResultError("the search was stopped before it had found a design")
         return min(self.designs, key=lambda samples: self.tried[samples].ratio)
 
     def slack(self, samples: int) -> int:

@@ -131,7 +131,10 @@ class _Sizes:
         if file in self._known:
             return self._known[file]
         if file in self._open:
-            raise ModelError(f"{self._main}: the model {path} names itself in <asset><model>")
+            raise ModelError(
+                f"{self._main}: the model {path} names itself in <asset><model>; "
+                "remove this element"
+            )
 
         # A model that is named but not attached is read by MuJoCo all the same, once.
         self._open.append(file)

@@ -89,7 +89,7 @@ class Status(Enum):
         "result, raise it or start from this one"
     )
     BEST_SEEN = (
-        "ended without convergence: this is the best trajectory that was found, later ones cost "
+        "ended without convergence: this is the best trajectory that was found; later ones cost "
         "more or left the limits"
     )
     INFEASIBLE = (

@@ -414,6 +414,6 @@ def _doubts(estimate: Estimate, wanted: Array) -> Iterator[str]:
         if np.isfinite(target) and name in estimate.at_bound
     ]
     if at_bound:
-        yield f"has a target, but its estimate is at a bound: {listed(at_bound)}"
+        yield f"at a bound are the estimates of these parameters with a target: {listed(at_bound)}"
     elif not estimate.success and not estimate.combinations:
         yield f"the fit did not succeed: {estimate.status}"

@@ -530,7 +530,7 @@ class RobotBench:
         control = np.repeat(self.plan.ctrl, self.steps_per_row, axis=0)
         found = task.plant.derivatives.predict(theta, control)
         if found is None:
-            raise SimulationDivergedError("the plan diverges at the guess")
+            raise SimulationDivergedError("the plan diverges when it is simulated at the guess")
 
         J = task.system.noise.whitened_rows(found[1])
         return standard_deviations(J.T @ J + task.parameters.prior_information)

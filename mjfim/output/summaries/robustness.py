@@ -18,6 +18,9 @@ from mjfim.output.summary_parts import (
 )
 from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
 
+# Largest number of missed limits that have a sentence each.
+MAX_MISSED_LIMITS = 8
+
 
 def describe_robustness(result: Robustness) -> Summary:
     """Describe estimates and margins of a design on robots that differ from the model.
@@ -149,13 +152,24 @@ def _coverage_sentences(result: Robustness) -> Iterator[str]:
 
 
 def _limit_sentences(result: Robustness) -> Iterator[str]:
-    """Yield how many robots keep all limits, and a sentence for every limit that some do not."""
+    """Yield how many robots keep all limits, and a sentence for each limit that some do not.
+
+    Of many such limits, those that are exceeded most have a sentence.
+    """
     yield f"{result.all_kept} of {result.runs} robots keep all limits at every engine step"
 
     worst = result.margins.min(axis=0)
     missed = ~result.kept.all(axis=0)
-    for i in np.flatnonzero(missed).tolist():
+    worst_first = sorted(np.flatnonzero(missed).tolist(), key=lambda i: float(worst[i]))
+    for i in sorted(worst_first[:MAX_MISSED_LIMITS]):
         limit = result.limits[i]
         excess = -worst[i] * limit.scale
         manner = f"exceeded by up to {excess:.3g}" if excess > 0.0 else "reached and clamped"
         yield f"{limit.kind} of {limit.name} is {manner}"
+
+    others = len(worst_first) - MAX_MISSED_LIMITS
+    if others > 0:
+        yield (
+            f"{others} more limits are exceeded or reached, each by a smaller share of its range; "
+            "see limits in playback.json"
+        )
