@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -119,6 +120,83 @@ def test_a_design_is_the_same_in_all_units(tmp_path, name: str, tables: dict[str
     assert_same(found, expected, exact=("status", "warnings", "iterations"))
 
 
+# Limits with a single bound, also zero.
+ONE_SIDED = {
+    "position": {"slide": (-0.3, np.inf)},
+    "velocity": {"hinge": (-np.inf, 3.0)},
+    "acceleration": {"slide": (-8.0, np.inf)},
+    "control": {"force": (-np.inf, 5.0)},
+    "control_rate": {"force": (-60.0, np.inf)},
+    "force": {"force": (-5.0, np.inf)},
+}
+
+# A bob and walls of several shapes. MuJoCo searches for the distance of an ellipsoid with constants
+# of its own.
+WALLED = CART.replace(
+    '<body name="bob" pos="0 0 0.8">',
+    '<body name="bob" pos="0 0 0.8"><geom type="capsule" size="0.05 0.1" mass="0"/>',
+).replace(
+    "<worldbody>",
+    """<worldbody>
+    <geom type="box" pos="0.7 0 -0.8" size="0.1 0.2 0.1"/>
+    <geom type="sphere" pos="-0.6 0 -0.8" size="0.1"/>
+    <geom type="plane" pos="0 0 -1.2" size="5 5 0.1"/>""",
+)
+
+
+@pytest.mark.parametrize("name", ["long, light, slow", "short, heavy, quick"])
+def test_distances_and_their_reach_are_the_same_in_all_units(tmp_path, name: str) -> None:
+    original = stated(tmp_path / "original", limits={"clearance": 0.02})
+    (tmp_path / "original" / "cart.xml").write_text(WALLED)
+    motion = np.stack([np.linspace(-0.4, 0.4, 40), np.linspace(2.9, 3.4, 40)], axis=1)
+
+    found = []
+    for units in (Units(), SCALES[name]):
+        rescaled = rescale(original, units, tmp_path / "rescaled")
+        clearance = constraint_set_of(DesignTask.resolve(rescaled.experiment)).clearance
+        assert clearance is not None
+        measured = clearance.distances(motion * [units.length, 1.0], slopes=True)
+        assert measured.slope is not None
+        lengths = [clearance.distances.reach, clearance.least, clearance.scale]
+        slopes = measured.slope / [1.0, units.length]
+        found.append((np.array(lengths) / units.length, measured.d / units.length, slopes))
+
+    assert (found[0][1] < 0.0).any() and (found[0][1] == found[0][0][0]).any()
+    for value, expected in zip(found[1], found[0], strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_clearance_of_nearly_nothing_has_finite_margins(tmp_path) -> None:
+    original = stated(tmp_path, limits={"clearance": 1e-100})
+    (tmp_path / "cart.xml").write_text(WALLED)
+    clearance = constraint_set_of(DesignTask.resolve(original)).clearance
+    assert clearance is not None
+    assert clearance.scale > 1e-9
+
+
+@pytest.mark.parametrize("name", ["long, light, slow", "short, heavy, quick"])
+def test_a_design_within_single_bounds_is_the_same_in_all_units(tmp_path, name: str) -> None:
+    original = stated(tmp_path / "original", limits=ONE_SIDED)
+    expected = in_units(rescale(original, Units(), tmp_path / "own"), design(original))
+
+    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
+    found = in_units(rescaled, design(rescaled.experiment))
+    assert_same(found, expected, exact=("status", "warnings", "iterations"))
+
+
+@pytest.mark.parametrize("name", ["long", "short", "heavy", "light", "slow", "quick"])
+def test_the_control_of_least_drift_is_the_same_in_all_units(tmp_path, name: str) -> None:
+    """A tilted pendulum falls under every control."""
+    control = EXPERIMENT["initial"]["control"]
+    original = stated(tmp_path, initial={"qpos": (0.0, 2.0), "control": control})
+    expected = DesignTask.resolve(original).centres
+
+    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
+    found = DesignTask.resolve(rescaled.experiment).centres
+    factor = rescaled.controls["force"]
+    np.testing.assert_allclose(np.array(found) / factor, expected, rtol=1e-9, atol=1e-9)
+
+
 NUISANCE = {"initial": {"qpos:slide": 0.01, "qvel:slide": True}, "bias": {"qpos:hinge": True}}
 
 # Keys of experiments whose fits take different paths.
@@ -126,6 +204,7 @@ FITS: dict[str, dict[str, Any]] = {
     "stated start": {},
     "nuisance": {"nuisance": NUISANCE},
     "segments": {"fit": {"segments": 0.4}},
+    "delay": {"fit": {"segments": 0.4}, "nuisance": {"delay": True}},
 }
 
 

@@ -23,6 +23,9 @@ from mjfim.records.trajectory import Trajectory
 # has the weight 1 / N.
 END_WEIGHT = 0.1
 
+# Clearance over the reach of distances below which margins are relative to this share of the reach.
+NEGLIGIBLE_CLEARANCE = 1e-6
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ConstraintValues:
@@ -357,6 +360,11 @@ class ClearanceConstraint:
     distances: GeomDistances
     least: float
 
+    @property
+    def scale(self) -> float:
+        """Distance to which margins are relative: the clearance, unless it is negligible [m]."""
+        return max(self.least, NEGLIGIBLE_CLEARANCE * self.distances.reach)
+
     def tightened(self, fractions: Mapping[str, float]) -> ClearanceConstraint:
         """Raise the clearance by a fraction of it, at most half of the way to the reach."""
         raised = self.least * (1.0 + fractions.get("clearance", 0.0))
@@ -366,7 +374,7 @@ class ClearanceConstraint:
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
         margins = self._measured(values) - self.least
-        yield KindMargins("clearance", margins, self.least)
+        yield KindMargins("clearance", margins, self.scale)
 
     def barrier(self, values: ConstraintValues, delta: float) -> float:
         """See `Constraint.barrier`."""

@@ -24,11 +24,13 @@ from mjfim.excitation.limits import Limit, derivative_substeps_of, has_constant_
 from mjfim.excitation.task import DesignTask
 from mjfim.model.geom_distance import GeomDistances
 from mjfim.model.geom_pairs import find_geom_pairs
+from mjfim.model.sizes import model_length
 from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.plant.batch import SubstepObservations
 from mjfim.records.trajectory import Trajectory
 
-# Distance beyond the stated clearance up to which distances are measured [m].
+# Distance beyond the stated clearance up to which distances are measured, relative to the length of
+# the model.
 CLEARANCE_REACH = 0.1
 
 # Kinds of limits on quantities within samples, in the order of `SubstepObservations`.
@@ -231,7 +233,7 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
 
     clearance = None
     if stated.clearance is not None and includes_limits:
-        reach = stated.clearance + CLEARANCE_REACH
+        reach = stated.clearance + CLEARANCE_REACH * model_length(task.system.model)
         clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
 
     return ConstraintSet(
@@ -264,9 +266,10 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
     )
     lower = np.array([limit.lower for limit in ordered])
     upper = np.array([limit.upper for limit in ordered])
+    sizes = np.array([limit.size for limit in ordered])
     return SubstepConstraint(
         observations=observations,
-        bounds=Bounds.from_range(lower, upper),
+        bounds=Bounds.from_range(lower, upper, sizes),
         kinds=tuple(limit.kind for limit in ordered),
         names=tuple(limit.name for limit in ordered),
     )
@@ -300,10 +303,12 @@ def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, nu: int) -> Bounds
 
     lower = np.full(nu, -np.inf)
     upper = np.full(nu, np.inf)
+    sizes = np.ones(nu)
     for limit in rows:
         lower[limit.index] = limit.lower
         upper[limit.index] = limit.upper
-    return Bounds.from_range(lower, upper)
+        sizes[limit.index] = limit.size
+    return Bounds.from_range(lower, upper, sizes)
 
 
 def _control_sizes(task: DesignTask) -> Array:

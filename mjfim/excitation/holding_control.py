@@ -56,17 +56,20 @@ def least_drift_control(system: System, state: Array, guess: Array) -> Array:
         (nu,) control, which may violate limits.
     """
     control = np.array(guess)
-    steps = RELATIVE_DIFFERENCE * np.maximum(np.abs(control), system.plant.sizes.control)
+    sizes = np.maximum(np.abs(control), system.plant.sizes.control)
+    steps = RELATIVE_DIFFERENCE * sizes
+    state_sizes = system.plant.sizes.state
 
     for _ in range(NEWTON_STEPS):
         # The drift under the control, and under one control for each component that is moved.
         rows = _drift(system, state, np.vstack([control, control + np.diag(steps)]))
-        B = (rows[1:] - rows[0]).T / steps
+        B = (rows[1:] - rows[0]).T / RELATIVE_DIFFERENCE / state_sizes[:, None]
         if not np.isfinite(B).all():
             break
 
-        # The Gauss-Newton step makes the linearised drift as small as possible.
-        control = control - np.linalg.lstsq(B, rows[0])[0]
+        # The Gauss-Newton step makes the linearised drift as small as possible, relative to the
+        # sizes of states and controls.
+        control = control - sizes * np.linalg.lstsq(B, rows[0] / state_sizes)[0]
 
     return control
 

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, first_ones, listed, shortened, unknown
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import ScalarJoint, actuator_names, joint_names
+from mjfim.model.sizes import (
+    LEAST_MOVE_PER_SAMPLE,
+    actuator_force_sizes,
+    control_sizes,
+    force_sizes,
+    position_sizes,
+)
 
 Range = tuple[float, float]
 
@@ -34,6 +42,7 @@ class Limit:
             kinds in this order.
         lower: Lower bound, -inf without one [unit of the kind].
         upper: Upper bound, inf without one [unit of the kind].
+        size: Natural size of the quantity, stated where there is a single bound [unit of the kind].
     """
 
     kind: str
@@ -41,6 +50,7 @@ class Limit:
     index: int
     lower: float
     upper: float
+    size: float = 1.0
 
     def __post_init__(self) -> None:
         if not self.lower < self.upper:
@@ -53,12 +63,13 @@ class Limit:
     def scale(self) -> float:
         """Scale that makes margins relative [unit of the kind].
 
-        It is half of the range; with a single bound, the magnitude of the bound, at least 1.
+        It is half of the range; with a single bound, the magnitude of the bound, at least the
+        natural size of the quantity.
         """
         finite = [abs(bound) for bound in (self.lower, self.upper) if np.isfinite(bound)]
         if len(finite) == 2:
             return 0.5 * (self.upper - self.lower)
-        return max(*finite, 1.0)
+        return max(*finite, self.size)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +82,7 @@ class _KindOfLimit:
         addresses: Address of each joint or actuator that can have such a limit, by name.
         model_ranges: Ranges of the MJCF, by name.
         excluded: What the joints or actuators are that cannot have such a limit, by name.
+        sizes: (n,) natural sizes of the quantity, in the order of the addresses.
     """
 
     kind: str
@@ -78,10 +90,15 @@ class _KindOfLimit:
     addresses: Mapping[str, int]
     model_ranges: Mapping[str, Range]
     excluded: Mapping[str, str]
+    sizes: Array
 
 
 def limits_of(
-    model: Any, coordinates: tuple[ScalarJoint, ...], controls: tuple[str, ...], stated: Limits
+    model: Any,
+    coordinates: tuple[ScalarJoint, ...],
+    controls: tuple[str, ...],
+    stated: Limits,
+    period: float,
 ) -> tuple[Limit, ...]:
     """Collect all limits, ordered by kind.
 
@@ -90,6 +107,7 @@ def limits_of(
         coordinates: Its slide and hinge joints.
         controls: Names of its nu controls.
         stated: The `[limits]` table of the experiment file.
+        period: Sample period, from which the natural sizes of rates follow [s].
 
     Returns:
         The limits; where MJCF and file both have a range, the intersection of the two.
@@ -107,6 +125,9 @@ def limits_of(
     dofs = {name: c.v for name, c in joints.items()}
     inputs = {name: i for i, name in enumerate(controls)}
 
+    outputs = {n: int(model.actuator_outadr[i]) for n, i in scalar_actuators.items()}
+    sizes = _natural_sizes(model, list(dofs.values()), list(outputs.values()), period)
+
     turning, several = _joints_without_limits(model), _actuators_without_limits(model)
     kinds = (
         _KindOfLimit(
@@ -115,6 +136,7 @@ def limits_of(
             addresses={name: c.q for name, c in joints.items()},
             model_ranges=_position_ranges(model, coordinates),
             excluded=turning,
+            sizes=sizes["position"],
         ),
         _KindOfLimit(
             kind="velocity",
@@ -122,6 +144,7 @@ def limits_of(
             addresses=dofs,
             model_ranges={},
             excluded=turning,
+            sizes=sizes["velocity"],
         ),
         _KindOfLimit(
             kind="acceleration",
@@ -129,6 +152,7 @@ def limits_of(
             addresses=dofs,
             model_ranges={},
             excluded=turning,
+            sizes=sizes["acceleration"],
         ),
         _KindOfLimit(
             kind="control",
@@ -136,6 +160,7 @@ def limits_of(
             addresses=inputs,
             model_ranges=_control_ranges(model, controls),
             excluded={},
+            sizes=sizes["control"],
         ),
         _KindOfLimit(
             kind="control_rate",
@@ -143,13 +168,15 @@ def limits_of(
             addresses=inputs,
             model_ranges={},
             excluded={},
+            sizes=sizes["control_rate"],
         ),
         _KindOfLimit(
             kind="force",
             stated=stated.force,
-            addresses={n: int(model.actuator_outadr[i]) for n, i in scalar_actuators.items()},
+            addresses=outputs,
             model_ranges=_force_ranges(model, scalar_actuators),
             excluded=several,
+            sizes=sizes["force"],
         ),
         _KindOfLimit(
             kind="joint_force",
@@ -157,9 +184,35 @@ def limits_of(
             addresses=dofs,
             model_ranges=_joint_force_ranges(model, joints),
             excluded=turning,
+            sizes=sizes["joint_force"],
         ),
     )
     return tuple(limit for kind in kinds for limit in _limits_of_kind(kind))
+
+
+def _natural_sizes(
+    model: Any, dofs: Sequence[int], outputs: Sequence[int], period: float
+) -> dict[str, Array]:
+    """Natural sizes of the limited quantities by kind, in the order of their addresses.
+
+    Args:
+        model: MjModel.
+        dofs: Degrees of freedom of the joints that can have limits.
+        outputs: Addresses of the forces of the actuators that can have limits.
+        period: Sample period, from which the natural sizes of rates follow [s].
+    """
+    time = period / LEAST_MOVE_PER_SAMPLE
+    position = position_sizes(model)[dofs]
+    control = control_sizes(model, time)
+    return {
+        "position": position,
+        "velocity": position / time,
+        "acceleration": position / time**2,
+        "control": control,
+        "control_rate": control / time,
+        "force": actuator_force_sizes(model, time)[outputs],
+        "joint_force": force_sizes(model, time)[dofs],
+    }
 
 
 def _limits_of_kind(kind: _KindOfLimit) -> list[Limit]:
@@ -179,9 +232,18 @@ def _limits_of_kind(kind: _KindOfLimit) -> list[Limit]:
 
         lower, upper = _intersection(f"limits.{kind.kind}.{name}", ranges)
         if np.isfinite(lower) or np.isfinite(upper):
-            limits.append(Limit(kind=kind.kind, name=name, index=index, lower=lower, upper=upper))
+            limits.append(_limit(kind, name, lower, upper))
 
     return limits
+
+
+def _limit(kind: _KindOfLimit, name: str, lower: float, upper: float) -> Limit:
+    """Limit of one name; its natural size is stated where there is a single bound."""
+    index = kind.addresses[name]
+    limit = Limit(kind=kind.kind, name=name, index=index, lower=lower, upper=upper)
+    if np.isfinite(lower) and np.isfinite(upper):
+        return limit
+    return replace(limit, size=float(kind.sizes[list(kind.addresses).index(name)]))
 
 
 def _intersection(key: str, ranges: Sequence[Range]) -> Range:

@@ -152,7 +152,9 @@ class DesignTask:
     ) -> DesignTask:
         """Put a task together; `weighted`: weights or limits have to bound every control."""
         experiment, names = system.experiment, system.controls
-        limits = limits_of(system.model, system.coordinates, names, experiment.limits)
+        limits = limits_of(
+            system.model, system.coordinates, names, experiment.limits, system.grid.dt
+        )
 
         weight = by_name("cost.control", experiment.cost.control, names, "actuator")
         if weighted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from mjfim.model.targets import (
     InitialStateField,
     OutputBiasField,
     OutputDelayField,
+    TargetField,
 )
 from mjfim.model.variants import MocapPlacement
 
@@ -38,8 +40,26 @@ BARYCENTRIC_FIELDS = (
 # Fields of a body that hold the ten log-Cholesky coordinates of its inertia, in their order.
 LOGCHOLESKY_FIELDS = tuple(f"logcholesky[{i}]" for i in range(10))
 
-# Magnitude of a nuisance delay of the outputs [s].
-DELAY_MAGNITUDE = 0.01
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeasurementSizes:
+    """Sizes of parameters of the measurement, which no model shows.
+
+    Attributes:
+        period: Size of a delay: the sample period of the experiment [s].
+        sigma: (ny,) sizes of biases: the standard deviations of the outputs' noise [y-unit].
+    """
+
+    period: float
+    sigma: Array
+
+    def magnitude(self, field: TargetField, model: Any) -> float:
+        """Size with which a change of a field is compared [unit of the field]."""
+        if isinstance(field, OutputBiasField):
+            return float(self.sigma[field.output])
+        if isinstance(field, OutputDelayField):
+            return self.period
+        return field.magnitude(model)
 
 
 def resolve_parameters(
@@ -47,6 +67,7 @@ def resolve_parameters(
     source: ModelSource,
     outputs: Sequence[str],
     mocap: MocapPlacement | None,
+    sizes: MeasurementSizes,
 ) -> ParameterSet:
     """Resolve all parameters in the order of theta.
 
@@ -57,6 +78,7 @@ def resolve_parameters(
         source: Its model.
         outputs: Names of the measured columns.
         mocap: Where mocap bodies start; None where they start as compiled.
+        sizes: Sizes of parameters of the measurement.
 
     Returns:
         The p parameters.
@@ -64,12 +86,12 @@ def resolve_parameters(
     Raises:
         ExperimentError: A parameter cannot be resolved; the message names its key.
     """
-    nuisance = list(_nuisance_parameters(experiment.nuisance, source, outputs))
+    nuisance = list(_nuisance_parameters(experiment.nuisance, source, outputs, sizes))
 
     resolved: list[Parameter] = []
     for name, spec in experiment.parameters.items():
         if spec.inertial is None:
-            resolved.append(_single_parameter(name, spec, source, outputs))
+            resolved.append(_single_parameter(name, spec, source, outputs, sizes))
         else:
             resolved += _inertia_parameters(name, spec, source.model)
     resolved += nuisance
@@ -87,7 +109,11 @@ def resolve_parameters(
 
 
 def _single_parameter(
-    name: str, spec: ParameterSpec, source: ModelSource, outputs: Sequence[str]
+    name: str,
+    spec: ParameterSpec,
+    source: ModelSource,
+    outputs: Sequence[str],
+    sizes: MeasurementSizes,
 ) -> Parameter:
     """A parameter with targets or a function.
 
@@ -112,7 +138,7 @@ def _single_parameter(
             first = targets[0]
             if guess is None:
                 guess = (first.field.read(model) - first.offset) / first.scale
-            magnitude = first.field.magnitude(model) / abs(first.scale)
+            magnitude = sizes.magnitude(first.field, model) / abs(first.scale)
     except ExperimentError as error:
         raise ExperimentError(f"parameters.{name}: {error}") from None
 
@@ -230,7 +256,7 @@ def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[in
 
 
 def _nuisance_parameters(
-    stated: Nuisance, source: ModelSource, outputs: Sequence[str]
+    stated: Nuisance, source: ModelSource, outputs: Sequence[str], sizes: MeasurementSizes
 ) -> Iterator[Parameter]:
     """Parameters of the table `nuisance`.
 
@@ -260,7 +286,13 @@ def _nuisance_parameters(
     for name, prior in _priors_by_name("nuisance.bias", stated.bias, outputs):
         bias = OutputBiasField(list(outputs).index(name))
         target = Target(path=f"output/{name}:bias", field=bias)
-        yield _nuisance_parameter(f"bias {name}", target, prior, per_recording=stated.per_recording)
+        yield _nuisance_parameter(
+            f"bias {name}",
+            target,
+            prior,
+            magnitude=float(sizes.sigma[bias.output]),
+            per_recording=stated.per_recording,
+        )
 
     if stated.delay is not None:
         yield _nuisance_parameter(
@@ -268,7 +300,7 @@ def _nuisance_parameters(
             Target(path="output:delay", field=OutputDelayField()),
             stated.delay,
             unit="s",
-            magnitude=DELAY_MAGNITUDE,
+            magnitude=sizes.period,
             per_recording=stated.per_recording,
         )
 
@@ -290,8 +322,8 @@ def _nuisance_parameter(
     target: Target,
     prior: Any,
     *,
+    magnitude: float,
     unit: str = "",
-    magnitude: float = 1.0,
     per_recording: bool = False,
 ) -> Parameter:
     """A nuisance parameter whose guess is zero.

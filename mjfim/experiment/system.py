@@ -18,7 +18,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError
 from mjfim.experiment.initial_state import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
-from mjfim.experiment.parameters import resolve_parameters
+from mjfim.experiment.parameters import MeasurementSizes, resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.coordinates import ScalarJoint
@@ -113,7 +113,9 @@ class System:
         key = keyframe(model, "initial.keyframe", experiment.initial.keyframe)
         start = initial_state(experiment.initial, model, key)
         mocap = MocapPlacement.of(model, key)
-        parameters = resolve_parameters(experiment, source, outputs.names, mocap)
+        sigma = np.sqrt(np.diag(noise.covariance))
+        sizes = MeasurementSizes(period=1.0 / experiment.rate, sigma=sigma)
+        parameters = resolve_parameters(experiment, source, outputs.names, mocap, sizes)
 
         # The plant that the parameters act on.
         private = PlantModel(

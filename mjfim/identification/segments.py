@@ -28,9 +28,6 @@ MIN_SAMPLES = 4
 # Largest ratio of the lengths of segments that are simulated in one batch.
 MAX_LENGTH_RATIO = 1.1
 
-# Smallest time unit [s] of the polynomial fit around the begin of a segment.
-SMALLEST_TIME = 1e-12
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Segment:
@@ -201,7 +198,7 @@ def _local_fit(
         return float(y.mean()), 0.0
 
     # Times are scaled to [-1, 1], so that the fit is well conditioned.
-    unit = max(float(np.abs(times).max()), SMALLEST_TIME)
+    unit = float(np.abs(times).max()) or 1.0
     coefficients = np.polynomial.polynomial.polyfit(times / unit, y, degree)
     return float(coefficients[0]), float(coefficients[1] / unit)
 

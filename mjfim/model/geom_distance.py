@@ -17,7 +17,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.model.geom_pairs import GeomPair
-from mjfim.model.pair_distance import INFINITE_DISTANCE, Indices, PairDistances
+from mjfim.model.pair_distance import Indices, PairDistances
 
 # Largest number of lower bounds of distances that are held in memory at once. Where there are
 # more, the configurations are processed in blocks.
@@ -76,10 +76,6 @@ class GeomDistances:
                 "clearance: no two geoms can come near each other; needs a moving geom whose "
                 "contype and conaffinity match"
             )
-        if not 0.0 < reach < INFINITE_DISTANCE:
-            raise ExperimentError(
-                f"clearance: reach {reach:g} m; needs a positive, finite distance"
-            )
         self.reach = float(reach)
         self._max_bounds = max_bounds
 
@@ -108,6 +104,10 @@ class GeomDistances:
         self._model = copy.copy(model)
         self._data = mujoco.MjData(self._model)
         self._distances = PairDistances(self._model, self.pairs)
+        if not 0.0 < reach < self._distances.infinite:
+            raise ExperimentError(
+                f"clearance: reach {reach:g} m; needs a positive, finite distance"
+            )
 
     def __call__(self, qpos: Array, slopes: bool) -> SignedDistances:
         """Distances of every column at every configuration.
@@ -155,7 +155,7 @@ class GeomDistances:
                 break
             if not self._distances.exact[p]:
                 self._distances.set_pose(positions[k], frames[k])
-                distance = self._distances.distance(p, min(best, INFINITE_DISTANCE))
+                distance = self._distances.distance(p, min(best, self._distances.infinite))
             if distance < best:
                 best, row, pair = distance, int(k), self.pairs[p]
         return best, row, pair

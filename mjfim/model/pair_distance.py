@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.model.geom_pairs import GeomPair
+from mjfim.model.sizes import model_length
 
 # Array of indices.
 Indices = NDArray[np.intp]
@@ -38,22 +39,24 @@ BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 # Types of geoms whose distance to a plane is exact here.
 PRIMITIVES = (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX)
 
-# Tolerance and largest number of iterations of the convex collider. MuJoCo's defaults, 1e-6 and 35,
-# make the slopes of curved geoms inaccurate.
+# The distances below are relative to the length of the model.
+
+# Tolerance and largest number of iterations of the convex collider. MuJoCo's defaults, 1e-6 m and
+# 35, make the slopes of curved geoms inaccurate.
 CCD_TOLERANCE = 1e-10
 CCD_ITERATIONS = 200
 
-# Distance that is larger than any between geoms [m].
+# Distance that is larger than any between geoms.
 INFINITE_DISTANCE = 1e6
 
-# Radius that the axis of a capsule gets [m]. With radius 0 the collider sometimes reports deep
+# Radius that the axis of a capsule gets. With radius 0 the collider sometimes reports deep
 # penetration as contact at distance 0.
 AXIS_RADIUS = 1e-9
 
-# Distance below which the nearest points of two surfaces do not determine their normal [m].
+# Distance below which the nearest points of two surfaces do not determine their normal.
 TOUCHING_DISTANCE = 1e-8
 
-# Distance by which touching geoms are moved apart to find the normal [m].
+# Distance by which touching geoms are moved apart to find the normal.
 PARTING_DISTANCE = 1e-5
 
 
@@ -65,13 +68,17 @@ class PairDistances:
         second: (p,) numbers of the second geoms.
         planes: Numbers of the pairs whose second geom is a plane.
         exact: (p,) True where `lower_bounds` gives the distance itself: a primitive over a plane.
+        infinite: Distance that is larger than any between geoms [m].
     """
 
     def __init__(self, model: Any, pairs: Sequence[GeomPair]) -> None:
         """Prepare the computation for pairs of geoms of a model, which is copied."""
         self._model = copy.copy(model)
         self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
-        self._model.opt.ccd_tolerance = min(self._model.opt.ccd_tolerance, CCD_TOLERANCE)
+        self._length = model_length(model)
+        self.infinite = INFINITE_DISTANCE * self._length
+        tolerance = CCD_TOLERANCE * self._length
+        self._model.opt.ccd_tolerance = min(self._model.opt.ccd_tolerance, tolerance)
         self._model.opt.ccd_iterations = max(self._model.opt.ccd_iterations, CCD_ITERATIONS)
         self._data = mujoco.MjData(self._model)
 
@@ -92,7 +99,7 @@ class PairDistances:
         by_axis = (np.sort(kinds, axis=0) == [[CAPSULE], [BOX]]).all(axis=0)
         capsule = np.where(kinds[0] == CAPSULE, self.first, self.second)
         self._axis_offset = np.where(by_axis, self._model.geom_size[capsule, 0], 0.0)
-        axis_model = _with_capsule_axes(self._model)
+        axis_model = _with_capsule_axes(self._model, AXIS_RADIUS * self._length)
 
         # Arguments of MuJoCo's function, pair by pair.
         self._calls = [
@@ -219,7 +226,7 @@ class PairDistances:
         sign = np.where(signed < 0.0, -1.0, 1.0)
         normals = (segments[:, 3:] - segments[:, :3]) * sign[:, None]
 
-        for i in np.flatnonzero(np.abs(signed) < TOUCHING_DISTANCE):
+        for i in np.flatnonzero(np.abs(signed) < TOUCHING_DISTANCE * self._length):
             pose = positions[rows[i]], frames[rows[i]]
             normals[i] = self._normal_when_parted(pairs[i], *pose, reach)
 
@@ -234,7 +241,8 @@ class PairDistances:
         model, first, second, offset = self._calls[p]
         parted = positions.copy()
         between = parted[second] - parted[first]
-        parted[second] += PARTING_DISTANCE * between / (np.linalg.norm(between) or 1.0)
+        apart = PARTING_DISTANCE * self._length
+        parted[second] += apart * between / (np.linalg.norm(between) or 1.0)
         self.set_pose(parted, frames)
 
         segment = np.zeros(6)
@@ -244,12 +252,12 @@ class PairDistances:
         return np.asarray((segment[3:] - segment[:3]) * sign)
 
 
-def _with_capsule_axes(model: Any) -> Any:
-    """A copy of a model in which capsules are replaced by their axes: thin cylinders."""
+def _with_capsule_axes(model: Any, radius: float) -> Any:
+    """A copy of a model in which capsules are replaced by their axes: cylinders of a radius [m]."""
     axes = copy.copy(model)
     capsules = axes.geom_type == CAPSULE
     axes.geom_type[capsules] = CYLINDER
-    axes.geom_size[capsules, 0] = AXIS_RADIUS
+    axes.geom_size[capsules, 0] = radius
     return axes
 
 

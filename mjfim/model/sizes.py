@@ -112,11 +112,31 @@ def force_sizes(model: Any, time: float) -> Array:
     return np.asarray(inertia * position_sizes(model) / time**2)
 
 
+def actuator_force_sizes(model: Any, time: float) -> Array:
+    """Natural size of each force of an actuator.
+
+    It is the range of the force, else the force that accelerates the joint by its natural size in a
+    natural time, squared.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        time: Natural time of the motion [s].
+
+    Returns:
+        (nf,) positive sizes, by the address of the force [N or N m].
+    """
+    sizes = np.ones(len(model.actuator_acc0))
+    for actuator in range(model.nactuator):
+        first, count = int(model.actuator_outadr[actuator]), int(model.actuator_outnum[actuator])
+        sizes[first : first + count] = _actuator_force_size(model, actuator, time)
+    return sizes
+
+
 def _control_size(model: Any, actuator: int, control: int, time: float) -> float:
     """Natural size of a control of one actuator, see `control_sizes`."""
-    stated = np.abs(model.actuator_ctrlrange[control]).max(initial=0.0)
+    stated = _largest_finite(model.actuator_ctrlrange[control])
     if stated > 0.0:
-        return float(stated)
+        return stated
 
     gain = abs(float(model.actuator_gainprm[actuator, 0])) or 1.0
     bias = np.abs(model.actuator_biasprm[actuator])
@@ -128,17 +148,45 @@ def _control_size(model: Any, actuator: int, control: int, time: float) -> float
     if bias[2] > 0.0:
         return float(length / time * bias[2] / gain)
 
+    return _actuator_force_size(model, actuator, time) / gain
+
+
+def _actuator_force_size(model: Any, actuator: int, time: float) -> float:
+    """Natural size of the force of one actuator, see `actuator_force_sizes`."""
+    stated = _largest_finite(model.actuator_forcerange[actuator])
+    if stated > 0.0:
+        return stated
+
     output = int(model.actuator_outadr[actuator])
-    force = float(np.abs(model.actuator_forcerange[output]).max())
-    if not force > 0.0:
-        force = length / time**2 / (float(model.actuator_acc0[output]) or 1.0)
-    return force / gain
+    length = _transmission_size(model, actuator)
+    return length / time**2 / (_acceleration(model, actuator, output) or 1.0)
+
+
+def _acceleration(model: Any, actuator: int, output: int) -> float:
+    """Acceleration that a unit force of an actuator causes, 0 without any [1/s² per unit force]."""
+    if not _acts_on_joint(model, actuator):
+        return float(model.actuator_acc0[output])
+
+    # MuJoCo's `acc0` is a norm over all joints, which mixes rotations with translations.
+    gear = float(np.abs(model.actuator_gear[output]).max())
+    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    return gear * float(model.dof_invweight0[dof])
+
+
+def _acts_on_joint(model: Any, actuator: int) -> bool:
+    """True for an actuator on a joint."""
+    joint_like = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    return int(model.actuator_trntype[actuator]) in [int(kind) for kind in joint_like]
+
+
+def _largest_finite(bounds: Array) -> float:
+    """Largest magnitude of the finite bounds; 0 without one."""
+    return float(np.abs(bounds[np.isfinite(bounds)]).max(initial=0.0))
 
 
 def _transmission_size(model: Any, actuator: int) -> float:
     """Natural size of the length that an actuator acts on [m or rad, times the gear]."""
-    joint_like = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    if int(model.actuator_trntype[actuator]) not in [int(kind) for kind in joint_like]:
+    if not _acts_on_joint(model, actuator):
         return model_length(model)
 
     output = int(model.actuator_outadr[actuator])

@@ -26,8 +26,9 @@ SMOOTHED_IMPEDANCE = 1e-3
 # Smallest impedance that MuJoCo uses.
 MIN_IMPEDANCE = 1e-4
 
-# Smallest damping of a friction constraint for which a sticking speed is computed [1/s].
-MIN_DAMPING = 1e-9
+# Smallest damping of a friction constraint for which a sticking speed is computed, relative to one
+# per timestep.
+MIN_DAMPING = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,7 +62,10 @@ def smoothing_speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
         model: The model (`mujoco.MjModel`).
         fastest: (nv,) fastest speeds of the degrees of freedom [m/s or rad/s].
     """
-    sticking = np.concatenate([_sticking_speeds(arrays) for arrays in _friction_arrays(model)])
+    step = float(model.opt.timestep)
+    sticking = np.concatenate(
+        [_sticking_speeds(arrays, step) for arrays in _friction_arrays(model)]
+    )
     proportional = np.concatenate([SMOOTHING_SPEED_FRACTION * fastest, np.zeros(model.ntendon)])
     return tuple(np.maximum(sticking, proportional).tolist())
 
@@ -108,7 +112,7 @@ def _friction_arrays(model: Any) -> tuple[_FrictionArrays, _FrictionArrays]:
     return joints, tendons
 
 
-def _sticking_speeds(arrays: _FrictionArrays) -> Array:
+def _sticking_speeds(arrays: _FrictionArrays, timestep: float) -> Array:
     """(n,) speeds below which the engine's friction sticks.
 
     Below such a speed, friction brakes with less than its full force: the constraint asks for a
@@ -123,4 +127,5 @@ def _sticking_speeds(arrays: _FrictionArrays) -> Array:
     time_constant = np.where(standard, impedance * reference[:, 0], 1.0)
     damping = np.where(standard, 2.0 / time_constant, -reference[:, 1] / impedance)
 
-    return np.asarray(arrays.loss * arrays.inverse_weight / np.maximum(damping, MIN_DAMPING))
+    damping = np.maximum(damping, MIN_DAMPING / timestep)
+    return np.asarray(arrays.loss * arrays.inverse_weight / damping)

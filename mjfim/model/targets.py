@@ -254,8 +254,6 @@ class OutputBiasField(DeviationField):
 class OutputDelayField(DeviationField):
     """Time by which all outputs lag [s]."""
 
-    natural_magnitude: ClassVar[float] = 0.01
-
 
 TargetField = (
     ModelField

@@ -70,21 +70,21 @@ class Bounds:
     scale: Array
 
     @staticmethod
-    def from_range(lower: Array, upper: Array) -> Bounds:
+    def from_range(lower: Array, upper: Array, size: Array | float = 1.0) -> Bounds:
         """Bounds with half of the range as scale.
 
         Args:
             lower: (w,) lower bounds, -inf without one.
             upper: (w,) upper bounds, inf without one.
+            size: (w,) or one number for all; natural sizes of the numbers.
 
         Returns:
-            Bounds. The scale of one-sided bounds is the magnitude of the bound, at least 1; without
-            bounds it is 1.
+            Bounds. The scale of one-sided bounds is the magnitude of the bound, at least the
+            natural size; without bounds it is the natural size.
         """
         two_sided = np.isfinite(lower) & np.isfinite(upper)
         magnitude = np.where(np.isfinite(lower), np.abs(lower), np.abs(upper))
-        one_sided_scale = np.maximum(magnitude, 1.0)
-        one_sided_scale = np.where(np.isfinite(one_sided_scale), one_sided_scale, 1.0)
+        one_sided_scale = np.where(np.isfinite(magnitude), np.maximum(magnitude, size), size)
 
         # inf - inf gives NaN where a number is free; it is not used there.
         with np.errstate(invalid="ignore"):

@@ -127,12 +127,21 @@ class RolloutDerivatives(DifferenceSteps):
         Returns:
             (p,) factors of at least 1, or None if a perturbed rollout diverges.
         """
-        found = self.sensitivity(theta, trajectory)
-        if found is None:
+        outputs = self.plant.outputs
+        states = None if outputs.needs_sensors else trajectory.state
+        measured = self._rollout_differences(
+            theta, trajectory.state[0], trajectory.ctrl, SENSITIVITY_STEP, states=states
+        )
+        if measured is None:
             return None
 
+        # Sensors are relative to their largest values; those that stay zero do not count. The other
+        # outputs are states.
+        y, found = measured
+        is_sensor = np.array([output.sensor is not None for output in outputs.outputs])
+        largest = np.where(is_sensor, np.abs(y).max(axis=0, initial=0.0), 0.0)
         state_sizes = self.difference_sizes(trajectory)[: self.plant.space.nx]
-        sizes = np.concatenate([state_sizes, np.ones(len(self.plant.outputs))])
+        sizes = np.concatenate([state_sizes, np.where(largest > 0.0, largest, np.inf)])
         moves = np.concatenate([found.psi, found.G], axis=1) * self.plant.parameters.magnitude
         effect = (np.abs(moves).max(axis=0) / sizes[:, None]).max(axis=0)
         factors = MIN_PARAMETER_EFFECT / np.maximum(effect, TINY)

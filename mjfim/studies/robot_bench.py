@@ -16,7 +16,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.constraints import SUBSTEP_KINDS, constraint_set_of
+from mjfim.excitation.constraints import SUBSTEP_KINDS, ConstraintSet, constraint_set_of
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -34,16 +34,18 @@ from mjfim.studies.planned_controller import PlannedController, sensed_entries
 # Largest number of attempts to draw a robot whose bodies are physical.
 MAX_DRAWS = 500
 
-# Largest acceleration of a robot that counts as standing still [unit of the coordinate / s²].
-MAX_REST_ACCELERATION = 1e-5
+# Largest acceleration of a robot that counts as standing still, relative to the size of each
+# coordinate over the square of the horizon.
+MAX_REST_MOVE = 1e-4
 
 # Largest number of Newton steps in the search for the equilibrium.
 MAX_REST_STEPS = 50
 
-# Length of a Newton step below which the search for the equilibrium ends.
+# Length of a Newton step, relative to the sizes of the states, below which the search for the
+# equilibrium ends.
 REST_STEP_TOLERANCE = 1e-12
 
-# Perturbation of the state for the derivative of the acceleration.
+# Perturbation of the state for the derivative of the acceleration, relative to its sizes.
 REST_PERTURBATION = 1e-6
 
 # Delays at which further fits start where the first fit ends in a misfit [s].
@@ -109,7 +111,7 @@ class RobotBench:
             )
 
         self.constraints = constraint_set_of(self.stated)
-        self.limits = _assessed_limits(self.stated)
+        self.limits = _assessed_limits(self.stated, self.constraints)
         self._simulator = BatchSimulator(
             self.stated.system.model_at(self.stated.theta),
             sensors=self.stated.system.outputs.needs_sensors,
@@ -251,8 +253,8 @@ class RobotBench:
         if controller.rest is None:
             return self.task.plant.initial_state(theta)
 
-        state, acceleration = self._equilibrium(model, controller)
-        if acceleration <= MAX_REST_ACCELERATION:
+        state, acceleration, moves = self._equilibrium(model, controller)
+        if moves <= MAX_REST_MOVE:
             return state
         if self.late_steps == 0:
             return np.array(self.stated.plant.nominal_initial_state)
@@ -267,7 +269,7 @@ class RobotBench:
             f"(it accelerates by {acceleration:.2g} per s²): {advice}"
         )
 
-    def _equilibrium(self, model: Any, controller: PlannedController) -> tuple[Array, float]:
+    def _equilibrium(self, model: Any, controller: PlannedController) -> tuple[Array, float, float]:
         """Find an equilibrium of a robot by Newton's method.
 
         Args:
@@ -275,15 +277,21 @@ class RobotBench:
             controller: The controller.
 
         Returns:
-            (ns,) state with the smallest acceleration, and its largest acceleration there [unit of
-            the coordinate / s²].
+            (ns,) state with the smallest acceleration, its largest acceleration there [unit of the
+            coordinate / s²], and how far it moves within the horizon, relative to the sizes.
         """
         space = self.stated.space
         data = mujoco.MjData(model)
         state = np.array(self.stated.plant.nominal_initial_state)
 
-        # Positions and activations may change; velocities stay zero.
-        directions = np.delete(np.eye(space.nx), np.arange(space.nv, 2 * space.nv), axis=0)
+        # Positions and activations may change by multiples of their sizes; velocities stay zero.
+        sizes = self.stated.plant.sizes
+        every = np.diag(sizes.state)
+        directions = np.delete(every, np.arange(space.nv, 2 * space.nv), axis=0)
+
+        # Sizes of accelerations and of rates of activations.
+        time = self.stated.horizon
+        rates = np.concatenate([sizes.position / time**2, sizes.activation / time])
 
         def acceleration(x: Array) -> Array:
             """Accelerations and rates of the activations at a state."""
@@ -303,13 +311,14 @@ class RobotBench:
                 behind = acceleration(space.plus(state, -REST_PERTURBATION * direction))
                 columns.append(ahead - behind)
 
-            slope = np.stack(columns, 1) / (2.0 * REST_PERTURBATION)
-            step = np.linalg.lstsq(slope, -current, rcond=1e-9)[0]
+            slope = np.stack(columns, 1) / (2.0 * REST_PERTURBATION) / rates[:, None]
+            step = np.linalg.lstsq(slope, -current / rates, rcond=1e-9)[0]
             state = space.plus(state, step @ directions)
             if np.abs(step).max(initial=0.0) < REST_STEP_TOLERANCE:
                 break
 
-        return state, float(np.abs(acceleration(state)).max(initial=0.0))
+        found = np.abs(acceleration(state))
+        return state, float(found.max(initial=0.0)), float((found / rates).max(initial=0.0))
 
     # ---- one robot
 
@@ -488,7 +497,7 @@ class RobotBench:
                 margins.append(float(inside[i]))
             elif limit.kind == "clearance" and constraints.clearance is not None:
                 nearest = constraints.clearance.distances.nearest(qpos)[0]
-                margins.append(nearest / constraints.clearance.least - 1.0)
+                margins.append((nearest - limit.lower) / limit.scale)
             else:
                 values = (sent if limit.kind == "control" else rates)[:, limit.index]
                 margin = np.minimum(values - limit.lower, limit.upper - values).min()
@@ -536,14 +545,21 @@ class RobotBench:
         return standard_deviations(J.T @ J + task.parameters.prior_information)
 
 
-def _assessed_limits(task: DesignTask) -> tuple[Limit, ...]:
+def _assessed_limits(task: DesignTask, constraints: ConstraintSet) -> tuple[Limit, ...]:
     """All limits; first those on observed quantities, in the order of the observations."""
     within = [limit for kind in SUBSTEP_KINDS for limit in task.limits if limit.kind == kind]
     others = [limit for limit in task.limits if limit.kind not in SUBSTEP_KINDS]
 
-    clearance = task.experiment.limits.clearance
-    if clearance is not None:
+    if constraints.clearance is not None:
+        clearance, scale = constraints.clearance.least, constraints.clearance.scale
         others.append(
-            Limit(kind="clearance", name="nearest pair", index=0, lower=clearance, upper=np.inf)
+            Limit(
+                kind="clearance",
+                name="nearest pair",
+                index=0,
+                lower=clearance,
+                upper=np.inf,
+                size=scale,
+            )
         )
     return (*within, *others)

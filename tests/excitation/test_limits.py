@@ -46,7 +46,7 @@ def model() -> mujoco.MjModel:
 
 def limits(model: mujoco.MjModel, **tables: object) -> tuple[Limit, ...]:
     """Limits of the model and of tables of an experiment file."""
-    return limits_of(model, scalar_joints(model), control_names(model), Limits(**tables))
+    return limits_of(model, scalar_joints(model), control_names(model), Limits(**tables), 0.01)
 
 
 def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajectory:

@@ -383,7 +383,7 @@ BALL = """<mujoco><worldbody><body><freejoint name="free"/><geom size="0.1"/></b
 def test_a_limit_that_applies_to_nothing_is_refused(limits: dict[str, Any], message: str) -> None:
     model = mujoco.MjModel.from_xml_string(BALL)
     with pytest.raises(ExperimentError, match=re.escape(message)):
-        limits_of(model, scalar_joints(model), control_names(model), Limits(**limits))
+        limits_of(model, scalar_joints(model), control_names(model), Limits(**limits), 0.01)
 
 
 def test_a_jump_at_rest_is_warned_about(tmp_path: Path) -> None:
