@@ -49,7 +49,7 @@ from mjfim.studies.redesign import restate_experiment
 def campaign(
     experiment: ExperimentFile,
     output: Folder,
-    rounds: Annotated[int, typer.Option(help="Largest number of rounds.")] = 10,
+    rounds: Annotated[int, typer.Option(min=1, help="Largest number of rounds.")] = 10,
     wanted: Annotated[
         float | None,
         typer.Option(

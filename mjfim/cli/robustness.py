@@ -97,6 +97,11 @@ def robustness(
     The result says how many robots keep the limits, and how many of the 95 % intervals contain the
     true values.
     """
+    if reserve and design_folder is not None:
+        raise ExperimentError(
+            "--reserve is for a new design; leave out DESIGN_FOLDER, or leave out --reserve"
+        )
+
     stated = mjfim.Experiment.from_file(experiment)
     conditions = RobotConditions(
         wrong=wrong,

@@ -118,6 +118,7 @@ def _message(fault: Mapping[str, Any]) -> str:
     message: str = fault["msg"]
     return (
         message.removeprefix("Value error, ")
+        .replace("Input should be a valid integer", "should be an integer")
         .replace("Input should be a valid ", "should be a ")
         .replace("Input should", "should")
     )

@@ -182,12 +182,12 @@ class Robustness(SavedRecord):
     @property
     def observed(self) -> Array:
         """(p,) root mean square of the errors of the estimates [theta-unit]."""
-        return np.asarray(np.sqrt((self.error**2).mean(axis=0)))
+        return _root_mean_square(self.error)
 
     @property
     def formal(self) -> Array:
         """(p,) root mean square of the formal standard deviations [theta-unit]."""
-        return np.asarray(np.sqrt((self.std**2).mean(axis=0)))
+        return _root_mean_square(self.std)
 
     @property
     def kept(self) -> np.ndarray:
@@ -278,3 +278,10 @@ class Robustness(SavedRecord):
             "worst": self.margins[:, i].min() * limit.scale,
             "kept": int(self.kept[:, i].sum()),
         }
+
+
+def _root_mean_square(values: Array) -> Array:
+    """Root mean square over the rows of (n, p) values: (p,), NaN where there are no rows."""
+    if not len(values):
+        return np.full(values.shape[1:], np.nan)
+    return np.asarray(np.sqrt((values**2).mean(axis=0)))

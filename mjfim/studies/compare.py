@@ -111,7 +111,7 @@ def compare_task(
 ) -> Comparison:
     """Compare the design of a resolved task with baselines. See `compare`."""
     if not (seconds > 0.0 and np.isfinite(seconds)) or not (steps is None or steps > 0.0):
-        raise ExperimentError("compare: seconds and steps must be positive")
+        raise ExperimentError("compare: seconds must be positive and finite, and steps positive")
 
     chosen = (*chosen_methods(task, methods), DESIGN)
     evaluation = MethodEvaluation(task, _identifiable_combinations(task))

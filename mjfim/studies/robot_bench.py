@@ -89,6 +89,7 @@ class RobotBench:
                 conditions cannot be simulated.
             RecordingError: The design cannot be read.
         """
+        _require_finite(conditions)
         self.conditions = conditions
         self.stated = DesignTask.resolve(experiment, threads=1)
         self.plan = read_playback(table, self.stated.system.channels)
@@ -99,6 +100,13 @@ class RobotBench:
             raise ExperimentError(
                 f"{table}: the design lasts {duration:g} s, the experiment "
                 f"{self.stated.horizon:g} s; give the design of this experiment"
+            )
+
+        # A later control would never act.
+        if conditions.latency > duration:
+            raise ExperimentError(
+                f"latency: {conditions.latency:g} s is longer than the design, which lasts "
+                f"{duration:g} s; state a shorter delay"
             )
 
         self.steps_per_row = round(self.plan.period / self.timestep)
@@ -563,3 +571,19 @@ def _assessed_limits(task: DesignTask, constraints: ConstraintSet) -> tuple[Limi
             )
         )
     return (*within, *others)
+
+
+def _require_finite(conditions: RobotConditions) -> None:
+    """Require that the numbers of the conditions are finite and not negative.
+
+    Raises:
+        ExperimentError: A number is not.
+    """
+    numbers = {
+        "wrong": conditions.wrong,
+        "latency": conditions.latency,
+        "noise": conditions.loudness,
+    }
+    for name, value in numbers.items():
+        if not 0.0 <= value < np.inf:
+            raise ExperimentError(f"{name}: {value:g} is not a finite number of at least 0")

@@ -1022,7 +1022,7 @@ def test_all_faults_at_once(resolve: Callable[[str], DesignTask]) -> None:
     ("key", "value", "fragment"),
     [
         ("descent.starts", "true", "integer"),
-        ("descent.starts", '"3"', "integer"),
+        ("descent.starts", '"3"', "should be an integer"),
         ("descent.repeats", "[true]", "integer"),
         ("descent.coarse", "true", "integer"),
         ("fit.bootstrap", "10.0", "integer"),

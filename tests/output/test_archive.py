@@ -300,9 +300,11 @@ def test_corrupt_archives_are_refused(folder: Path, tmp_path: Path) -> None:
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    """A missing file and a file that is no archive are refused."""
+    """A missing file, a folder, and a file that is no archive are refused."""
     with pytest.raises(RecordingError, match=r"gone\.npz: no such design file"):
         archive.read_design(tmp_path / "gone.npz")
+    with pytest.raises(RecordingError, match=r"this is a folder; name the design file \(\.npz\)"):
+        archive.read_design(tmp_path)
     (tmp_path / "text.npz").write_text("hello", encoding="utf-8")
     with pytest.raises(RecordingError, match=r"text\.npz: not a design archive"):
         archive.read_design(tmp_path / "text.npz")

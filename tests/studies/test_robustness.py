@@ -617,6 +617,12 @@ def test_the_player_script_walks_through_the_plan(
     ("words", "said"),
     [
         (["--latency", 0.0031], "whole number of timesteps"),
+        (["--latency", "nan"], "latency: nan is not a finite number of at least 0"),
+        (["--latency", "inf"], "latency: inf is not a finite number of at least 0"),
+        (["--latency", "1e300"], "latency: 1e+300 s is longer than the design, which lasts 2 s"),
+        (["--latency", 0.0, "--wrong", "inf"], "wrong: inf is not a finite number"),
+        (["--latency", 0.0, "--noise", "inf"], "noise: inf is not a finite number"),
+        (["--latency", 0.0, "--reserve", "position=0.1"], "--reserve is for a new design"),
         (["--reserve", "speed=0.1"], "unknown kind of limit 'speed'"),
     ],
 )
@@ -626,3 +632,12 @@ def test_misuse_is_one_sentence(
     experiment, path = cart
     folder = [path.parent] if "--latency" in words else []
     misused(run("robustness", experiment.source, *folder, *words, "-o", tmp_path), said)
+
+
+@pytest.mark.filterwarnings("error")
+def test_without_an_estimate_the_errors_are_unknown(cart: tuple[mjfim.Experiment, Path]) -> None:
+    """Noise with which no fit begins leaves no estimate, and no mean of nothing."""
+    loud = RobotConditions(latency=0.0, loudness=1e300)
+    result = mjfim.assess_robustness(*cart, runs=1, conditions=loud)
+    assert np.isnan(result.observed).all() and np.isnan(result.formal).all()
+    assert not result.ok
