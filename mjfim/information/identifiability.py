@@ -48,6 +48,9 @@ FEW_SAMPLES = 60
 # parameter.
 SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
 
+# An effect on a whole motion is certain if it exceeds this multiple of the derivatives' error.
+CLEAR_EFFECT = 1e3
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Identifiability:
@@ -228,12 +231,14 @@ def _identifiability(
         single_steps: (t, k) directions without effect on single steps, or None.
         stop: Asked before every random trajectory; true leaves out the rest of them.
     """
+    single_steps = _hidden_from_rows(test, single_steps, J, error)
     along_trajectory = _null_space(test, [J], [error], single_steps)
     if not along_trajectory.count or stop():
         return _with_groups(test, along_trajectory, along_trajectory)
 
     tried = list(itertools.takewhile(lambda _: not stop(), test.probes(PROBES)))
     known = _single_step_null_space(test, [trajectory, *tried])
+    known = _hidden_from_rows(test, known, J, error)
     stack, errors = [J], [error]
 
     # Whole motions are differentiated only if single steps do not explain the null space.
@@ -374,6 +379,37 @@ def _rows_of_information(information: Array) -> Array:
 
     lengths = np.sqrt(values[kept])
     return np.asarray(lengths[:, None] * vectors.T[kept])
+
+
+def _hidden_from_rows(
+    test: IdentifiabilityTest, directions: Array | None, J: Array, error: Array
+) -> Array | None:
+    """Directions without effect on single steps that have none on a whole motion either.
+
+    An effect that is negligible in one step may add up over the motion.
+
+    Args:
+        test: The plant and its parameters.
+        directions: (t, k) directions without effect on single steps, or None.
+        J: (n, p) whitened rows of G along the motion.
+        error: (n, p) their change with a longer difference step.
+
+    Returns:
+        (t, j) combinations of the directions; None if there are no directions.
+    """
+    if directions is None or not directions.shape[1]:
+        return directions
+
+    interest = test.parameters.interest
+    sizes = test.parameters.magnitude[interest][:, None]
+    unit = directions / np.linalg.norm(directions / sizes, axis=0)
+
+    # Motions that cannot be differentiated accurately, as chaotic ones, are no evidence.
+    rounding = CLEAR_EFFECT * np.linalg.norm(error[:, interest] @ unit, 2)
+    square = np.zeros((unit.shape[1], unit.shape[1]))
+    effect = np.concatenate([J[:, interest] @ unit, square])
+    _, values, V = np.linalg.svd(effect, full_matrices=False)
+    return np.asarray(unit @ V[values <= max(LEAST_EFFECT, rounding)].T)
 
 
 def _hidden_from_earlier(test: IdentifiabilityTest, directions: Array) -> Array:

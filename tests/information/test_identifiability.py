@@ -13,7 +13,12 @@ import pytest
 from mjfim.errors import SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.design import design_task, require_designable
 from mjfim.excitation.task import DesignTask
-from mjfim.information.identifiability import PROBES, Identifiability, require_visible
+from mjfim.information.identifiability import (
+    PROBES,
+    Identifiability,
+    _single_step_null_space,
+    require_visible,
+)
 from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task
 
 PRODUCT = {
@@ -94,6 +99,17 @@ def test_parameters_hidden_by_the_initial_control_are_told_from_those_that_no_co
         require_designable(task, seen)
     assert "right" in str(caught.value)
     assert "left" not in str(caught.value)
+
+
+def test_a_small_effect_that_adds_up_over_the_motion_counts(tmp_path) -> None:
+    """A parameter is excited where the whole motion shows it, though hardly any single step."""
+    drag = {"drag": {"target": "joint/left:damping"}}
+    faint = {"kind": "sine", "amplitude": {"left": 5e-9, "right": 0.0}, "frequency": 0.5}
+    task = two_task(tmp_path, parameters=drag, initial={"control": faint}, horizon=4.0)
+
+    single_steps = _single_step_null_space(task.identifiability_test, [task.initial])
+    assert single_steps is not None and single_steps.shape == (1, 1)
+    assert look(task).along_trajectory.count == 0
 
 
 def test_at_rest_nothing_is_identifiable_and_along_random_controls_everything(tmp_path) -> None:
