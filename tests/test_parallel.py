@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -281,8 +282,8 @@ def test_seconds_end_a_design(tmp_path: Path, limits: dict[str, object]) -> None
     assert design.final.cost <= design.initial.cost
 
 
-@pytest.mark.parametrize("threads", [0, -1, 1_000_000])
-def test_impossible_numbers_of_threads_are_refused(threads: int) -> None:
+@pytest.mark.parametrize("threads", [0, -1, 1_000_000, 1.5, True])
+def test_impossible_numbers_of_threads_are_refused(threads: Any) -> None:
     """The message states the bounds, before anything is allocated."""
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     with pytest.raises(ExperimentError, match=rf"threads: {threads} .* from 1 to 1024"):
