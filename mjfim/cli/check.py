@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.arrays import Array
 from mjfim.cli.announcements import announce_check, announce_recordings
 from mjfim.cli.common import (
     AsJson,
@@ -21,6 +22,7 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
+from mjfim.errors import ExperimentError
 from mjfim.excitation.task_parts import require_design_keys, stated_control
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
@@ -73,7 +75,7 @@ def check(
         announce_check(system, trajectory.ctrl)
     else:
         require_design_keys(stated, "check without recordings")
-        announce_check(system, stated_control(system))
+        announce_check(system, _stated_control(system))
     with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
 
@@ -84,3 +86,15 @@ def check(
     if output is not None:
         errors.print(f"wrote {output}/", markup=False)
     raise typer.Exit(0 if result.ok else 1)
+
+
+def _stated_control(system: System) -> Array:
+    """Initial control that the experiment states: (N, nu) [unit of the actuator].
+
+    Raises:
+        ExperimentError: The horizon or the signal cannot be used; the message names the file.
+    """
+    try:
+        return stated_control(system)
+    except ExperimentError as error:
+        raise ExperimentError(f"{system.experiment.source}: {error}") from None

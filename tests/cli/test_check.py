@@ -11,7 +11,7 @@ from matplotlib.image import imread
 import mjfim
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots.check import check_figure
-from tests.support.cli import MODELS, loads, names, read, run
+from tests.support.cli import MODELS, loads, misused, names, read, run, write_experiment
 
 
 def test_a_table_and_a_conclusion_are_printed_and_nothing_is_written(study: Path) -> None:
@@ -95,3 +95,9 @@ def test_the_picture_shows_parameters_that_are_not_known_alone() -> None:
     shown = heat.images[0].get_array()
     assert shown.shape == (7, 7)
     assert np.ma.getmaskarray(shown)[:3].all()
+
+
+def test_a_wrong_horizon_is_refused_with_its_file(tmp_path: Path) -> None:
+    """The initial control is made before the check, and its faults name the file as well."""
+    wrong = write_experiment(tmp_path, horizon="1.005", start='{ kind = "sine" }')
+    misused(run("check", wrong), f"{wrong}: horizon: 1.005 s is not a whole number")
