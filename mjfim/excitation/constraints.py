@@ -30,7 +30,7 @@ from mjfim.plant.batch import SubstepObservations
 from mjfim.records.trajectory import Trajectory
 
 # Distance beyond the stated clearance up to which distances are measured, relative to the length of
-# the model.
+# the model; it is at least the clearance itself.
 CLEARANCE_REACH = 0.1
 
 # Kinds of limits on quantities within samples, in the order of `SubstepObservations`.
@@ -233,7 +233,8 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
 
     clearance = None
     if stated.clearance is not None and includes_limits:
-        reach = stated.clearance + CLEARANCE_REACH * model_length(task.system.model)
+        length = model_length(task.system.model)
+        reach = stated.clearance + max(CLEARANCE_REACH * length, stated.clearance)
         clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
 
     return ConstraintSet(
