@@ -45,6 +45,10 @@ FREE_START_SIGMA = 1e3
 # in their scales where there is no prior.
 MAX_DELAY_GROWTH = 5.0
 
+# Largest increase of a delay without a prior, relative to the duration of the shortest recording;
+# five samples of a fast log would be too short.
+MAX_DELAY_SHARE = 0.025
+
 # Number of stated samples of the longest recording along which difference steps are calibrated.
 CALIBRATION_SAMPLES = 1000
 
@@ -695,7 +699,9 @@ def _segments_of(
     if free_starts:
         _require_measured_starts(system)
         length = system.experiment.fit.segments
-        segments = cut_into_segments(system, recordings, length, _max_delay(parameters))
+        duration = min(float(recording.t[-1]) for recording in recordings)
+        delay = _max_delay(parameters, duration)
+        segments = cut_into_segments(system, recordings, length, delay)
         return segments, np.eye(system.space.nx)
 
     by_theta = parameters.initial_state_derivative(system.space.nx)
@@ -716,14 +722,25 @@ def _require_measured_starts(system: System) -> None:
         )
 
 
-def _max_delay(parameters: ParameterSet) -> float:
-    """Largest delay of the outputs that the search may try [s]."""
-    if not parameters.delay_derivative.any():
+def _max_delay(parameters: ParameterSet, duration: float) -> float:
+    """Largest delay of the outputs that the search may try [s].
+
+    Args:
+        parameters: The parameters.
+        duration: Duration of the shortest recording [s].
+    """
+    per_parameter = parameters.delay_derivative
+    if not per_parameter.any():
         return 0.0
 
-    spread = np.array([p.prior or p.scale for p in parameters.parameters])
-    latest = np.minimum(parameters.guess + MAX_DELAY_GROWTH * spread, parameters.upper)
-    return max(float(parameters.delay_derivative @ latest), 0.0)
+    growth = MAX_DELAY_GROWTH * np.array([p.prior or p.scale for p in parameters.parameters])
+    has_prior = np.array([p.prior is not None for p in parameters.parameters])
+    grows = ~has_prior & (per_parameter != 0.0)
+    share = MAX_DELAY_SHARE * duration / np.abs(per_parameter[grows])
+    growth[grows] = np.maximum(growth[grows], share)
+
+    latest = np.minimum(parameters.guess + growth, parameters.upper)
+    return max(float(per_parameter @ latest), 0.0)
 
 
 def _counted_values(recording: AlignedRecording, free_starts: bool) -> np.ndarray:
