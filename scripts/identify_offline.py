@@ -14,18 +14,13 @@ mjfim did not write is replaced with --force only, and inputs never.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from pathlib import Path
 
 import mjfim
 from mjfim.errors import MjfimError, NoResultError
-from mjfim.experiment.input_files import input_files
-from mjfim.experiment.system import System
-from mjfim.identification.identify import identify_system
-from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, Interruption
-from mjfim.output.manifest import OutputGuard, claimed
-from mjfim.output.mjcf.write import write_identified
-from mjfim.recordings.read import read_recording
+from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS, Interruption
 
 
 def main() -> int:
@@ -57,6 +52,14 @@ def main() -> int:
 
 def identify(experiment: Path, files: list[Path], *, force: bool) -> int:
     """Identify from recordings, and return the exit code."""
+    # These imports take a second, in which Ctrl-C is handled already.
+    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.system import System
+    from mjfim.identification.identify import identify_system
+    from mjfim.output.manifest import OutputGuard, claimed
+    from mjfim.output.mjcf.write import write_identified
+    from mjfim.recordings.read import read_recording
+
     # The experiment file says what is unknown, where to start, and how noisy each output is.
     system = System.resolve(mjfim.Experiment.from_file(experiment))
     recordings = [read_recording(path, system.channels) for path in files]
@@ -85,4 +88,9 @@ def identify(experiment: Path, files: list[Path], *, force: bool) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    exit_code = main()
+
+    # The result is written; signals while Python ends change nothing.
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    raise SystemExit(exit_code)
