@@ -289,14 +289,19 @@ def _candidates(system: System, free_starts: bool) -> Iterator[Candidate]:
             positive=True,
             value=0.0,
             linearised_at=0.0,
-            size=LINEARISATION_SIZE * system.plant.dt,
+            size=LINEARISATION_SIZE * _period(system),
         )
+
+
+def _period(system: System) -> float:
+    """Stated sample period [s]; logs of another rate are fitted with shorter samples."""
+    return 1.0 / system.experiment.rate
 
 
 def _joint_terms(system: System) -> Iterator[Candidate]:
     """Friction, damping, rotor inertia and stiffness of every joint with one degree of freedom."""
     model: Any = system.model
-    time = system.plant.dt / LEAST_MOVE_PER_SAMPLE
+    time = _period(system) / LEAST_MOVE_PER_SAMPLE
     force = LINEARISATION_SIZE * force_sizes(model, time)
     stiffness = force / position_sizes(model)
     sizes = {
