@@ -154,6 +154,10 @@ class _Search:
             iterations=order.max_iterations,
             stop=order.budget.stop,
         )
+
+        # The controls that hold the start are found once for all searches of a process, so their
+        # few steps do not count.
+        centre, *other_centres = task.centre, *task.centres[1:]
         steps_before = task.plant.engine_steps
 
         # An initial control may bring its curves, such as a Fourier series; else a limited
@@ -169,11 +173,11 @@ class _Search:
         method = InteriorPointMethod(
             base=smoothed(task, order.combinations),
             constraints=constraints,
-            centre=task.centre,
+            centre=centre,
             basis=basis,
             regulator=replace(regulator_for(task), feedback_threshold=threshold),
             schedule=order.schedule,
-            other_centres=task.centres[1:],
+            other_centres=tuple(other_centres),
             inside_first=order.inside_first,
         )
         return cls(
