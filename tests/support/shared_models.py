@@ -202,6 +202,6 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
             # command jumps.
             "control": {j: 5e5 if j in PANDA[:4] else 1.5e6 for j in PANDA},
         },
-        "descent": {"tolerance": 2e-2, "max_iterations": 20},
+        "descent": {"tolerance": 2e-2, "max_iterations": 40},
     },
 }
