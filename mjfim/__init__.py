@@ -135,5 +135,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """Names of the package, also those that are not imported yet."""
-    return sorted({*globals(), *__all__})
+    """Public names of the package, also those that are not imported yet."""
+    return sorted({*__all__, "__version__", "__doc__"})

@@ -101,7 +101,7 @@ class Round:
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Campaign(SavedRecord):
     """Result of a campaign: all rounds.
 

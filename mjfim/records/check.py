@@ -173,7 +173,7 @@ class SelfTest:
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Check(SavedRecord):
     """Result of `mjfim.check`: which parameters can be identified, and how well.
 

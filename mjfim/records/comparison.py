@@ -110,7 +110,7 @@ class MethodResult(RenamedFields):
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Comparison(SavedRecord):
     """Result of `mjfim.compare`: methods in the order in which they ran, all with equal budgets.
 

@@ -18,7 +18,7 @@ from mjfim.records.trajectory import Trajectory
 TRAJECTORY_ARRAYS = ("t", "qpos", "qvel", "act", "ctrl")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Evaluation(SavedRecord):
     """A trajectory and the information that it gives about the parameters.
 
@@ -267,7 +267,7 @@ def _npz_names() -> dict[str, str]:
     return names
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Design(SavedRecord):
     """Result of `mjfim.design`: the designed trajectory and the initial one.
 

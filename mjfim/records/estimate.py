@@ -17,7 +17,7 @@ from mjfim.records.trajectory import Trajectory
 NORMAL_95 = 1.96
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Estimate(SavedRecord):
     """Result of `mjfim.identify`: parameters estimated from recordings.
 
@@ -214,7 +214,7 @@ class WorstResidual:
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class PredictionErrors(SavedRecord):
     """Differences between a model's outputs and a recording.
 

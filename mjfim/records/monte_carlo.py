@@ -40,7 +40,7 @@ class TrialStatistics:
         freeze(self, "estimates", "mean", "covariance", "crlb", "efficiency", "efficiency_interval")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class MonteCarloStudy(SavedRecord):
     """Result of `mjfim.monte_carlo`: statistics of estimates along one or more trajectories.
 

@@ -12,7 +12,7 @@ from mjfim.errors import RecordingError
 from mjfim.records.serialization import SavedRecord
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Recording(SavedRecord):
     """Measured or simulated outputs under a known control, at the times of the log.
 

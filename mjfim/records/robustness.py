@@ -115,7 +115,7 @@ class AssessedLimit:
     scale: float
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Robustness(SavedRecord):
     """Result of a robustness study with n robots, g of which could be identified.
 

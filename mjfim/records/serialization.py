@@ -30,6 +30,7 @@ from pydantic_core import PydanticSerializationError
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import RecordingError, RenamedFields
+from mjfim.records.short_text import short_text
 from mjfim.records.unpacked_size import (
     DAMAGED_ARCHIVE,
     Header,
@@ -396,6 +397,9 @@ class SavedRecord(RenamedFields):
     file_stem: ClassVar[str]
     made_by: ClassVar[str]
     array_names: ClassVar[Mapping[str, str]] = {}
+
+    def __repr__(self) -> str:
+        return short_text(self)
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of the record's JSON file, which users and other programs read."""

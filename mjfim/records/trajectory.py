@@ -16,7 +16,7 @@ from mjfim.arrays import Array, freeze
 from mjfim.records.serialization import SavedRecord
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Trajectory(SavedRecord):
     """A feasible curve (x, u) of the plant: `x_{k+1} = F(x_k, u_k, theta)`.
 
