@@ -6,8 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
@@ -18,6 +16,7 @@ from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameters import Parameter, ParameterSet, Target
 from mjfim.model.paths import resolve, unit_of
+from mjfim.model.physical_bounds import physical_bounds
 from mjfim.model.targets import (
     InertiaField,
     InitialStateField,
@@ -149,7 +148,13 @@ def _single_parameter(
     if guess is None:
         raise ExperimentError(f"parameters.{name}.guess: a function needs a guess")
 
-    bounds = spec.bounds or (-np.inf, np.inf)
+    bounds = spec.bounds or physical_bounds(targets)
+    for key, value in (("guess", guess), ("true", spec.true)):
+        if spec.bounds is None and value is not None and not bounds[0] <= value <= bounds[1]:
+            raise ExperimentError(
+                f"parameters.{name}.{key}: {value:g} makes {targets[0].path} negative, which "
+                "is not physical; state another value, or `bounds` that contain it"
+            )
     if not bounds[0] <= guess <= bounds[1]:
         raise ExperimentError(
             f"parameters.{name}.guess: the value {guess:g} in the model is outside bounds "

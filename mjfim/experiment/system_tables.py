@@ -182,7 +182,11 @@ class ParameterSpec(Section):
     )
     bounds: Range | None = Field(
         default=None,
-        description="Lower and upper bound of the estimate [parameter unit]. Default: unbounded.",
+        description=(
+            "Lower and upper bound of the estimate [parameter unit]. Default: what physics allows: "
+            "masses, moments of inertia, damping, friction, armature and stiffness are at least 0. "
+            "State a negative lower bound to allow negative values."
+        ),
     )
     scale: Positive | Literal["guess"] | None = Field(
         default=None,
