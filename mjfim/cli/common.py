@@ -68,6 +68,7 @@ ExperimentFile = Annotated[
 DesignFile = Annotated[
     Path, typer.Argument(metavar="DESIGN.npz", help="File design.npz of `mjfim design`.")
 ]
+ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (MJCF or URDF).")]
 Folder = Annotated[
     Path,
     typer.Option(
@@ -235,7 +236,8 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
     Misuse gives exit code 2. Ctrl-C, and a file that cannot be written, give exit code 1.
 
     Args:
-        function: The function; underscores in its name become hyphens.
+        function: The function; underscores in its name become hyphens, one at its end is left out
+            (verbs such as `list` are names of Python).
 
     Returns:
         The function with the error handling.
@@ -274,7 +276,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         if interruption.presses:
             raise typer.Exit(INTERRUPTED_CODE)
 
-    app.command(function.__name__.replace("_", "-"))(wrapped)
+    app.command(function.__name__.rstrip("_").replace("_", "-"))(wrapped)
     return wrapped
 
 

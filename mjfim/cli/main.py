@@ -16,14 +16,20 @@ from mjfim.cli import (  # noqa: F401 - each registers its verbs
     design,
     export_sysid,
     identify,
+    init,
+    list,
     replay,
     robustness,
     simulate,
+    validate,
 )
 from mjfim.cli.common import app, replace_unencodable_characters
 
 # Verbs in the order in which the help lists them, which is the order of an experiment.
 ORDER = (
+    "init",
+    "list",
+    "validate",
     "check",
     "design",
     "simulate",

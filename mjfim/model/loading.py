@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from mjfim.errors import ModelError
 from mjfim.model.coordinates import ModelCoordinates
 from mjfim.model.expanded_size import check_expanded_size
 from mjfim.model.finite_numbers import check_compiled_numbers, check_file_numbers
+from mjfim.model.mujoco_log import silence_mujoco_log
 
 
 def load_spec(path: Path) -> Any:
@@ -31,9 +34,21 @@ def load_spec(path: Path) -> Any:
     check_file_numbers(path)
     check_expanded_size(path)
     try:
-        return mujoco.MjSpec.from_file(_engine_path(path))
+        with _only_python_warnings():
+            return mujoco.MjSpec.from_file(_engine_path(path))
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot read the model: {str(error).strip()}") from None
+
+
+@contextmanager
+def _only_python_warnings() -> Iterator[None]:
+    """Let MuJoCo report warnings of the reader and the compiler through Python alone.
+
+    A warning about attached models without a prefix is left out: their names stay as they are.
+    """
+    with silence_mujoco_log(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Attaching a spec with an empty prefix")
+        yield
 
 
 def _engine_path(path: Path) -> str:
@@ -65,7 +80,8 @@ def compile_spec(spec: Any, path: Path) -> Any:
         ModelError: MuJoCo cannot compile the spec; the message is MuJoCo's.
     """
     try:
-        return spec.compile()
+        with _only_python_warnings():
+            return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
 

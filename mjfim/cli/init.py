@@ -1,0 +1,78 @@
+"""`mjfim init`: a first experiment file for a model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mjfim.atomic_io import replacing
+from mjfim.cli.common import Force, ModelFile, claim_file, errors, out, progress, verb
+from mjfim.errors import ExperimentError, unknown
+from mjfim.studies.first_experiment.candidates import GROUPS, Group
+from mjfim.studies.first_experiment.document import experiment_text
+from mjfim.studies.first_experiment.propose import propose_experiment
+
+
+@verb
+def init(
+    model: ModelFile,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="EXPERIMENT.toml",
+            help="Experiment file to write; default: the model's name with .toml, in this folder.",
+        ),
+    ] = None,
+    parameters: Annotated[
+        str,
+        typer.Option(
+            metavar="GROUPS",
+            help="Groups of parameters to propose, separated by commas: payload, friction, "
+            "inertia, motors.",
+        ),
+    ] = ",".join(GROUPS),
+    payload: Annotated[
+        str | None,
+        typer.Option(metavar="BODY", help="Body that carries a load of unknown mass and place."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a first experiment file for a model, with a comment for every choice."""
+    file = output or Path(f"{model.stem}.toml")
+    companion = file.with_name(f"{file.stem}_motors.xml")
+    groups = _groups(parameters)
+    claim_file(file, [model], force=force)
+
+    with progress("looking at the model"):
+        proposal = propose_experiment(
+            model, file.parent, groups=groups, payload=payload, companion_name=companion.name
+        )
+        text = experiment_text(proposal)
+
+    if proposal.companion is not None:
+        claim_file(companion, [model], force=force)
+        with replacing(companion) as temporary:
+            temporary.write_text(proposal.companion, encoding="utf-8")
+        errors.print(f"wrote {companion}", markup=False)
+    with replacing(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+    errors.print(f"wrote {file}", markup=False)
+    for remark in proposal.remarks:
+        errors.print(remark, markup=False)
+    out.print(f"next: mjfim check {file}", markup=False)
+
+
+def _groups(text: str) -> list[Group]:
+    """Groups of parameters from a list with commas."""
+    found: list[Group] = []
+    for name in (part.strip() for part in text.split(",")):
+        group = next((each for each in GROUPS if each == name), None)
+        if group is None:
+            raise ExperimentError(f"--parameters: {unknown('group', name, GROUPS)}")
+        found.append(group)
+    return found

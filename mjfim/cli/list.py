@@ -1,0 +1,54 @@
+"""`mjfim list`: everything that an experiment file can name in a model."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+from typing import Annotated, Literal
+
+import typer
+
+from mjfim.cli.common import AsJson, ModelFile, print_result, verb
+from mjfim.errors import ExperimentError
+from mjfim.output.inventory_summary import describe_inventory
+from mjfim.output.text import render
+from mjfim.studies.inventory import list_model
+
+# Kinds of entries, as in `mjfim.records.inventory.KINDS`.
+Kind = Literal["parameters", "outputs", "actuators", "keyframes", "limits"]
+
+
+@verb
+def list_(
+    model: ModelFile,
+    wanted: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="PATTERN",
+            help="Part of the paths and names that are wanted, `damping` for example; * and ? "
+            "stand for any characters.",
+        ),
+    ] = None,
+    kind: Annotated[
+        Kind | None, typer.Option("--kind", help="List only entries of this kind.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the parameters, outputs, actuators, keyframes and limits of a model."""
+    inventory = list_model(model)
+    if kind is not None:
+        inventory = inventory.only(kind)
+
+    if wanted is not None:
+        pattern = f"*{wanted.lower()}*"
+        inventory = inventory.selected(lambda name: _matches(name, pattern))
+        if not inventory.count:
+            raise ExperimentError(
+                f"{model}: no path or name contains {wanted!r}; `mjfim list {model}` lists all"
+            )
+
+    print_result(as_json, inventory.summary(), render(describe_inventory(inventory)))
+
+
+def _matches(name: str, pattern: str) -> bool:
+    """Whether a name has a pattern; brackets are no part of the pattern's syntax."""
+    return fnmatchcase(name.lower(), pattern.replace("[", "[[]"))

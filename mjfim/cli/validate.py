@@ -1,0 +1,39 @@
+"""`mjfim validate`: whether an experiment file is correct, without simulating a motion."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import mjfim
+from mjfim.cli.common import AsJson, print_result, verb
+from mjfim.errors import ExperimentError
+from mjfim.experiment.schema import json_schema
+from mjfim.output.experiment_summary import describe_experiment
+from mjfim.output.text import render
+from mjfim.studies.stated_experiment import stated_experiment
+
+
+@verb
+def validate(
+    experiment: Annotated[
+        Path | None, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")
+    ] = None,
+    schema: Annotated[
+        bool,
+        typer.Option("--schema", help="Print the JSON schema of experiment files, for editors."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Say whether an experiment file is correct, and what it states."""
+    if schema:
+        typer.echo(json.dumps(json_schema(), indent=2, ensure_ascii=False))
+        return
+    if experiment is None:
+        raise ExperimentError("validate needs an experiment file, or --schema")
+
+    stated = stated_experiment(mjfim.Experiment.from_file(experiment))
+    print_result(as_json, stated.summary(), render(describe_experiment(stated)))

@@ -1,0 +1,95 @@
+"""What an experiment file states, as tables."""
+
+from __future__ import annotations
+
+from mjfim.output.summary_parts import (
+    Name,
+    Paragraph,
+    Part,
+    Quantity,
+    Row,
+    Summary,
+    SummaryTable,
+    columns,
+)
+from mjfim.records.stated_experiment import StatedExperiment
+
+
+def describe_experiment(stated: StatedExperiment) -> Summary:
+    """Describe a correct experiment file.
+
+    Args:
+        stated: What the file states.
+    """
+    parts: list[Part] = [_parameters(stated), _outputs(stated)]
+    if stated.limits:
+        parts.append(_limits(stated))
+    parts.append(Paragraph(text=_verdict(stated)))
+    return Summary(title=stated.source, outcome="", parts=tuple(parts))
+
+
+def _parameters(stated: StatedExperiment) -> SummaryTable:
+    """The unknown parameters."""
+    return SummaryTable(
+        key="parameters",
+        title="Unknown parameters",
+        columns=columns("parameter", "guess", "lower bound", "upper bound", "nuisance"),
+        rows=tuple(
+            Row(
+                cells=(
+                    Name(name=each.name, unit=each.unit),
+                    Quantity(value=each.guess, digits=5),
+                    Quantity(value=each.lower),
+                    Quantity(value=each.upper),
+                    "yes" if each.nuisance else "",
+                )
+            )
+            for each in stated.parameters
+        ),
+    )
+
+
+def _outputs(stated: StatedExperiment) -> SummaryTable:
+    """The measured outputs."""
+    return SummaryTable(
+        key="outputs",
+        title="Measured outputs",
+        columns=columns("output", "σ of the noise"),
+        rows=tuple(
+            Row(cells=(Name(name=each.name, unit=each.unit), Quantity(value=each.sigma)))
+            for each in stated.outputs
+        ),
+    )
+
+
+def _limits(stated: StatedExperiment) -> SummaryTable:
+    """The limits of a design."""
+    return SummaryTable(
+        key="limits",
+        title="Limits of a design, with the ranges of the MJCF",
+        columns=columns("quantity", "name", "lower", "upper", left=("name",)),
+        rows=tuple(
+            Row(
+                cells=(
+                    each.quantity,
+                    each.name,
+                    Quantity(value=each.lower, digits=5),
+                    Quantity(value=each.upper, digits=5),
+                )
+            )
+            for each in stated.limits
+        ),
+    )
+
+
+def _verdict(stated: StatedExperiment) -> str:
+    """One sentence: the file is correct, and for which verbs it is complete."""
+    count = len(stated.parameters)
+    found = (
+        f"{stated.source} is correct: {count} parameter{'s' if count != 1 else ''}, "
+        f"{len(stated.outputs)} outputs, {len(stated.controls)} controls, {stated.rate:g} Hz"
+    )
+    if stated.missing:
+        keys = " and ".join(f"`{key}`" for key in stated.missing)
+        return f"{found}. It serves `identify`; `check` and `design` also need {keys}"
+    return f"{found}, {stated.horizon:g} s"

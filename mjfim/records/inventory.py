@@ -1,0 +1,157 @@
+"""Records of what a model offers to an experiment file: paths, names, values and units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+# Kinds of entries, the names of the fields of `Inventory` that hold them.
+KINDS = ("parameters", "outputs", "actuators", "keyframes", "limits")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedParameter:
+    """A number of the model that a parameter can set.
+
+    Attributes:
+        path: Parameter path for `target`.
+        value: Value in the model [unit]; None where the compiled model does not hold it.
+        unit: Its unit; empty where it has none, or where it depends on the model.
+    """
+
+    path: str
+    value: float | None
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedOutput:
+    """A number that can be measured.
+
+    Attributes:
+        name: Name of its column, a key of the table `noise` or a component of such a key.
+        source: `state` for positions and velocities, otherwise MuJoCo's name of the sensor's type.
+        unit: Its unit; empty where it has none, or where it depends on the model.
+        noise: Standard deviation that the MJCF states [unit]; 0 where it states none.
+    """
+
+    name: str
+    source: str
+    unit: str
+    noise: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedActuator:
+    """An actuator.
+
+    Attributes:
+        name: Name of the actuator, a column of control tables.
+        drives: What it acts on, for example `joint hinge`.
+        unit: Unit of its control; empty where it is not evident from the model.
+    """
+
+    name: str
+    drives: str
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedKeyframe:
+    """A keyframe, a possible initial state.
+
+    Attributes:
+        name: Name of the keyframe; empty where it has none, so that no experiment can use it.
+        qpos: Positions [m, rad, quaternions as w x y z].
+        qvel: Velocities [m/s or rad/s].
+        ctrl: Controls [actuator units].
+    """
+
+    name: str
+    qpos: tuple[float, ...]
+    qvel: tuple[float, ...]
+    ctrl: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListedLimit:
+    """A range of the MJCF, which a design keeps.
+
+    Attributes:
+        quantity: What is limited: `position`, `control`, `force` or `joint_force`.
+        name: Name of the joint or the actuator.
+        lower: Lower bound [unit].
+        upper: Upper bound [unit].
+        unit: Unit of the bounds; empty where it is not evident from the model.
+    """
+
+    quantity: str
+    name: str
+    lower: float
+    upper: float
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inventory:
+    """Everything that an experiment file can name in a model.
+
+    Attributes:
+        model: Path of the model file.
+        parameters: Numbers that a parameter can set.
+        outputs: Numbers that can be measured.
+        actuators: Actuators, in the order of the controls.
+        keyframes: Keyframes.
+        limits: Ranges of the MJCF that a design keeps.
+        remarks: Sentences about elements that cannot be named or whose ranges are not kept.
+    """
+
+    model: str
+    parameters: tuple[ListedParameter, ...]
+    outputs: tuple[ListedOutput, ...]
+    actuators: tuple[ListedActuator, ...]
+    keyframes: tuple[ListedKeyframe, ...]
+    limits: tuple[ListedLimit, ...]
+    remarks: tuple[str, ...]
+
+    def selected(self, matches: Callable[[str], bool]) -> Inventory:
+        """The entries whose path or name is wanted.
+
+        Args:
+            matches: Whether a path or a name is wanted.
+
+        Returns:
+            The selection; the remarks stay.
+        """
+        return replace(
+            self,
+            parameters=tuple(entry for entry in self.parameters if matches(entry.path)),
+            outputs=tuple(entry for entry in self.outputs if matches(entry.name)),
+            actuators=tuple(entry for entry in self.actuators if matches(entry.name)),
+            keyframes=tuple(entry for entry in self.keyframes if matches(entry.name)),
+            limits=tuple(
+                entry for entry in self.limits if matches(f"{entry.quantity}/{entry.name}")
+            ),
+        )
+
+    def only(self, kind: str) -> Inventory:
+        """The entries of one kind.
+
+        Args:
+            kind: One of `KINDS`.
+
+        Returns:
+            The selection without remarks.
+        """
+        others: dict[str, Any] = {name: () for name in KINDS if name != kind}
+        return replace(self, remarks=(), **others)
+
+    @property
+    def count(self) -> int:
+        """Number of entries."""
+        return sum(len(getattr(self, kind)) for kind in KINDS)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of `mjfim list --json`."""
+        return asdict(self)

@@ -1,0 +1,1 @@
+"""A first experiment for a model: rates, start, excitation, noise and parameters that suit it."""

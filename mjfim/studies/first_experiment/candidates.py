@@ -1,0 +1,259 @@
+"""Parameters that a first experiment may propose, in the order of preference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+
+from mjfim.errors import ExperimentError, unknown
+from mjfim.model.elements import element_name, identifier, names_of
+from mjfim.model.inertia import body_inertia
+from mjfim.studies.first_experiment.start import is_position_servo
+
+Group = Literal["payload", "friction", "inertia", "motors"]
+
+# Groups of parameters, in the order of preference.
+GROUPS: tuple[Group, ...] = ("payload", "friction", "inertia", "motors")
+
+# Bodies at the end of the chain whose mass and centre of mass are proposed.
+LAST_BODIES = 3
+
+# Bodies lighter than this share of the median mass are not proposed.
+SMALL_MASS = 0.1
+
+# Size of an unknown payload, relative to the mass of the body that carries it.
+PAYLOAD_SHARE = 0.2
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """A parameter that may be proposed.
+
+    Attributes:
+        name: Name of its table in the experiment file.
+        group: Group to which it belongs.
+        path: Parameter path.
+        meaning: What it is, for the comment.
+        offset: Constant that is added to the parameter [unit of the path].
+        guess: Stated guess; None for the value in the model.
+        scale: Stated scale; None for the default.
+        bounds: Stated bounds, or None.
+    """
+
+    name: str
+    group: Group
+    path: str
+    meaning: str
+    offset: float = 0.0
+    guess: float | None = None
+    scale: float | None = None
+    bounds: tuple[float, float] | None = None
+
+    def table(self) -> dict[str, Any]:
+        """The table `[parameters.<name>]` of the experiment file."""
+        table: dict[str, Any] = {"target": self.path}
+        if self.offset:
+            table = {"targets": [{"path": self.path, "offset": self.offset}]}
+        if self.guess is not None:
+            table["guess"] = self.guess
+        if self.scale is not None:
+            table["scale"] = self.scale
+        if self.bounds is not None:
+            table["bounds"] = list(self.bounds)
+        return table
+
+
+def candidates(
+    model: Any, groups: Sequence[Group] = GROUPS, payload: str | None = None
+) -> list[Candidate]:
+    """Parameters of the wanted groups that exist in a model, with unique names.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        groups: Wanted groups.
+        payload: Body that carries an unknown payload; None without one.
+
+    Raises:
+        ExperimentError: The body of the payload does not exist, or has no mass.
+    """
+    found: list[Candidate] = []
+    if payload is not None:
+        found += _payload(model, payload)
+
+    makers = {"payload": _last_body, "friction": _friction, "inertia": _inertia, "motors": _motors}
+    for group in GROUPS:
+        # With a stated payload, the mass of the body that carries it is known.
+        if group in groups and not (group == "payload" and payload is not None):
+            found += makers[group](model)
+
+    # The inertia of the body that carries the load is known.
+    own = [
+        each
+        for each in found
+        if each.group == "payload" or not each.path.startswith(f"body/{payload}:")
+    ]
+    return list(_with_unique_names(own))
+
+
+def _with_unique_names(found: Iterable[Candidate]) -> Iterator[Candidate]:
+    """The candidates without repeated paths; equal names get a number."""
+    paths, names = set(), set()
+    for each in found:
+        key = (each.path, each.offset)
+        if key in paths:
+            continue
+        name, number = each.name, 2
+        while name in names:
+            name, number = f"{each.name}_{number}", number + 1
+        paths.add(key)
+        names.add(name)
+        yield Candidate(**{**each.__dict__, "name": name})
+
+
+def _payload(model: Any, name: str) -> Iterator[Candidate]:
+    """Mass and first moments of an unknown payload that is fixed to a body."""
+    body = identifier(model, "body", name)
+    if body < 0:
+        raise ExperimentError(f"--payload: {unknown('body', name, names_of(model, 'body'))}")
+    mass = float(model.body_mass[body])
+    if not mass > 0.0:
+        raise ExperimentError(
+            f"--payload: body {name!r} has no mass; name the body with mass that carries the load"
+        )
+
+    radius = body_inertia(model, body).gyration_radius
+    yield Candidate(
+        name="payload",
+        group="payload",
+        path=f"body/{name}:mass",
+        meaning=f"mass of the load at {name}",
+        offset=mass,
+        guess=0.0,
+        scale=_two_digits(PAYLOAD_SHARE * mass),
+    )
+    moments = mass * np.asarray(model.body_ipos[body])
+    for i, axis in enumerate(AXES):
+        yield Candidate(
+            name=f"payload_moment_{axis}",
+            group="payload",
+            path=f"body/{name}:firstmoment[{i}]",
+            meaning=f"mass times {axis} of the load's centre of mass, in the frame of {name}",
+            offset=float(moments[i]),
+            guess=0.0,
+            scale=_two_digits(PAYLOAD_SHARE * mass * radius),
+        )
+
+
+def _two_digits(value: float) -> float:
+    """A number with two significant digits."""
+    return float(f"{value:.2g}")
+
+
+def _bodies_from_the_end(model: Any) -> list[int]:
+    """Numbers of moving bodies with mass and a name, those with most joints below them first."""
+    depth = np.zeros(model.nbody, dtype=int)
+    for body in range(1, model.nbody):
+        depth[body] = depth[model.body_parentid[body]] + int(model.body_jntnum[body])
+    moving = [
+        body
+        for body in range(1, model.nbody)
+        if depth[body] and model.body_mass[body] > 0.0 and element_name(model, "body", body)
+    ]
+
+    # Fingers and markers are too light to matter.
+    typical = float(np.median(model.body_mass[moving])) if moving else 0.0
+    moving = [body for body in moving if model.body_mass[body] >= SMALL_MASS * typical]
+    return sorted(moving, key=lambda body: (-depth[body], -float(model.body_mass[body])))
+
+
+def _mass_and_centre(model: Any, body: int, group: Group) -> Iterator[Candidate]:
+    """Mass and centre of mass of a body."""
+    name = element_name(model, "body", body)
+    mass = float(model.body_mass[body])
+    yield Candidate(
+        name=f"{name}_mass",
+        group=group,
+        path=f"body/{name}:mass",
+        meaning=f"mass of {name}",
+        bounds=(0.0, float(f"{10.0 * mass:.3g}")),
+    )
+    for i, axis in enumerate(AXES):
+        yield Candidate(
+            name=f"{name}_com_{axis}",
+            group=group,
+            path=f"body/{name}:ipos[{i}]",
+            meaning=f"{axis} of the centre of mass of {name}",
+        )
+
+
+def _last_body(model: Any) -> Iterator[Candidate]:
+    """Mass and centre of mass of the last body, which carries what the robot grasps."""
+    for body in _bodies_from_the_end(model)[:1]:
+        yield from _mass_and_centre(model, body, "payload")
+
+
+def _inertia(model: Any) -> Iterator[Candidate]:
+    """Masses, centres of mass and principal inertias of the last bodies."""
+    bodies = _bodies_from_the_end(model)[:LAST_BODIES]
+    for body in bodies:
+        yield from _mass_and_centre(model, body, "inertia")
+    for body in bodies:
+        name = element_name(model, "body", body)
+        for i, axis in enumerate(AXES):
+            if model.body_inertia[body, i] > 0.0:
+                yield Candidate(
+                    name=f"{name}_inertia_{axis}",
+                    group="inertia",
+                    path=f"body/{name}:inertia[{i}]",
+                    meaning=f"principal moment of inertia {axis} of {name}",
+                )
+
+
+def _joint_fields(
+    model: Any, fields: Sequence[tuple[str, str, str]], group: Group
+) -> Iterator[Candidate]:
+    """Fields of joints that are not zero. fields: (field, array of the model, meaning)."""
+    for field, array, meaning in fields:
+        for joint in range(model.njnt):
+            name = element_name(model, "joint", joint)
+            value = float(getattr(model, array)[int(model.jnt_dofadr[joint])])
+            if name and value > 0.0:
+                yield Candidate(
+                    name=f"{name}_{field}",
+                    group=group,
+                    path=f"joint/{name}:{field}",
+                    meaning=f"{meaning} of {name}",
+                    bounds=(0.0, float(f"{10.0 * value:.3g}")),
+                )
+
+
+def _friction(model: Any) -> Iterator[Candidate]:
+    """Damping and dry friction of the joints."""
+    fields = (
+        ("damping", "dof_damping", "viscous friction"),
+        ("frictionloss", "dof_frictionloss", "dry friction"),
+    )
+    yield from _joint_fields(model, fields, "friction")
+
+
+def _motors(model: Any) -> Iterator[Candidate]:
+    """Armature of the joints and gains of the servos."""
+    fields = (("armature", "dof_armature", "inertia of the drive"),)
+    yield from _joint_fields(model, fields, "motors")
+
+    for i in range(model.nu):
+        name = element_name(model, "actuator", i)
+        affine = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+        if name and affine and is_position_servo(model, i):
+            yield Candidate(
+                name=f"{name}_kp",
+                group="motors",
+                path=f"actuator/{name}:kp",
+                meaning=f"gain of the servo {name}",
+            )

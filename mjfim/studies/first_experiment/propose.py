@@ -1,0 +1,328 @@
+"""`mjfim.propose_experiment`: a first experiment for a model, without a question to the user."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, MjfimError, ModelError, SimulationDivergedError
+from mjfim.excitation.task import DesignTask
+from mjfim.excitation.verification import verify
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.model.elements import unnamed_count
+from mjfim.model.loading import ModelSource
+from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
+from mjfim.studies.first_experiment.candidates import GROUPS, Candidate, Group, candidates
+from mjfim.studies.first_experiment.excitation import (
+    SHRINKING,
+    TRIALS,
+    first_amplitudes,
+    largest_feasible,
+    rounded,
+)
+from mjfim.studies.first_experiment.outputs import ProposedNoise, proposed_noise
+from mjfim.studies.first_experiment.selection import identifiable
+from mjfim.studies.first_experiment.start import Start, choose_start, influence_of_controls
+from mjfim.studies.first_experiment.time_scale import TimeScale, reach, time_scale
+from mjfim.studies.first_experiment.urdf import UrdfModel, is_urdf, with_motors
+
+# First and last frequency of the chirp, in characteristic periods of the motion.
+FIRST_FREQUENCY = 0.4
+LAST_FREQUENCY = 2.0
+
+# Limit of a control without a range, relative to the amplitude of the chirp.
+CONTROL_LIMIT = 3.0
+
+# Time budget of a design [s].
+SECONDS = 40.0
+
+# Largest number of candidates whose information is computed.
+MOST_CANDIDATES = 48
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Proposal:
+    """Everything that a first experiment file states.
+
+    Attributes:
+        model: Path of the model file, relative to the experiment file.
+        companion: MJCF to be written beside the experiment file with the name `model`, or None.
+        compiled: The compiled model.
+        times: Rate and horizon.
+        start: Initial state and resting control.
+        amplitudes: Amplitudes of the chirp by actuator.
+        chirp: First and last frequency of the chirp [Hz].
+        noise: Noise of the outputs.
+        chosen: Proposed parameters.
+        others: Further parameters, for comments.
+        control_limits: Ranges of the controls that have none in the MJCF.
+        velocity_limits: Velocity limits that a URDF states [m/s or rad/s].
+        rest: Whether the experiment begins at rest.
+        remarks: Sentences for the head of the file.
+    """
+
+    model: str
+    companion: str | None
+    compiled: Any
+    times: TimeScale
+    start: Start
+    amplitudes: dict[str, float]
+    chirp: tuple[float, float]
+    noise: Sequence[ProposedNoise]
+    chosen: Sequence[Candidate]
+    others: Sequence[Candidate]
+    control_limits: dict[str, tuple[float, float]]
+    velocity_limits: dict[str, float]
+    rest: bool
+    remarks: Sequence[str]
+
+    def values(self) -> dict[str, Any]:
+        """Keys and tables of the experiment file."""
+        initial: dict[str, Any] = {}
+        if self.start.keyframe is not None:
+            initial["keyframe"] = self.start.keyframe
+        else:
+            initial["qpos"] = self.start.qpos.tolist()
+            if self.start.act.any():
+                initial["act"] = self.start.act.tolist()
+
+        values: dict[str, Any] = {
+            "model": self.model,
+            "rate": self.times.rate,
+            "horizon": self.times.horizon,
+            "initial": {**initial, "control": self.control()},
+            "parameters": {each.name: each.table() for each in self.chosen},
+            "noise": {each.key: each.sigma for each in self.noise},
+            "cost": {"control": 0.0},
+            "descent": {"seconds": SECONDS},
+        }
+        limits: dict[str, Any] = {}
+        if self.control_limits:
+            limits["control"] = {name: list(both) for name, both in self.control_limits.items()}
+        if self.velocity_limits:
+            limits["velocity"] = dict(self.velocity_limits)
+        if limits:
+            values["limits"] = limits
+        if self.rest:
+            values["boundary"] = {"start": "rest"}
+        return values
+
+    def control(self) -> dict[str, Any]:
+        """The key `initial.control`."""
+        names = list(self.amplitudes)
+        control: dict[str, Any] = {
+            "kind": "chirp",
+            "amplitude": dict(self.amplitudes),
+            "frequency": self.chirp[0],
+            "frequency_end": self.chirp[1],
+        }
+        offset = dict(zip(names, self.start.control.tolist(), strict=True))
+        if any(offset.values()):
+            control["offset"] = offset
+        return control
+
+
+def propose_experiment(
+    path: Path,
+    folder: Path,
+    *,
+    groups: Sequence[Group] = GROUPS,
+    payload: str | None = None,
+    companion_name: str = "",
+) -> Proposal:
+    """Propose a first experiment for a model.
+
+    Args:
+        path: MJCF or URDF file.
+        folder: Folder of the experiment file, to which the path of the model is relative.
+        groups: Groups of parameters that are wanted.
+        payload: Body that carries an unknown payload; None without one.
+        companion_name: Name of the MJCF that is written beside the experiment file for a URDF.
+
+    Raises:
+        ModelError: The model cannot be read.
+        ExperimentError: The model has no actuator or no parameter of the wanted groups.
+    """
+    urdf, source = _model(path, folder)
+    model = source.model
+    if model.nu == 0:
+        raise ExperimentError(
+            f"{path}: the model has no actuator, so there is no experiment to design; add "
+            "<actuator> elements to the MJCF"
+        )
+
+    found = candidates(model, groups, payload)[:MOST_CANDIDATES]
+    if not found:
+        raise ExperimentError(
+            f"{path}: no parameter of {', '.join(groups)} can be proposed: bodies and joints need "
+            "names, and friction and armature a value > 0"
+        )
+
+    data = mujoco.MjData(model)
+    start = choose_start(model)
+    data.qpos[:] = start.qpos
+    data.ctrl[:] = start.control
+    mujoco.mj_forward(model, data)
+    length = reach(model, data)
+    times = time_scale(model, data)
+
+    controls = source.coordinates.controls
+    wanted = first_amplitudes(
+        model, start, influence_of_controls(model, start), length, times.period
+    )
+    draft = Proposal(
+        model=companion_name if urdf else os.path.relpath(path, folder),
+        companion=None if urdf is None else urdf.text,
+        compiled=model,
+        times=times,
+        start=start,
+        amplitudes=dict(zip(controls, wanted.tolist(), strict=True)),
+        chirp=(
+            float(f"{FIRST_FREQUENCY / times.period:.2g}"),
+            float(f"{LAST_FREQUENCY / times.period:.2g}"),
+        ),
+        noise=proposed_noise(model, length, times.period),
+        chosen=found,
+        others=(),
+        control_limits=_control_limits(source, start, wanted),
+        velocity_limits={} if urdf is None else urdf.velocities,
+        rest=False,
+        remarks=(),
+    )
+    return _Refinement(source=source, folder=folder).refined(draft)
+
+
+def _model(path: Path, folder: Path) -> tuple[UrdfModel | None, ModelSource]:
+    """The model with actuators, and what was added to a URDF."""
+    if not is_urdf(path):
+        return None, ModelSource(path)
+
+    # The MJCF around the URDF exists only in memory so far; its path of the URDF is absolute.
+    absolute = with_motors(path, str(path.resolve()))
+    try:
+        with silence_mujoco_log():
+            spec = mujoco.MjSpec.from_string(absolute.text)
+    except ValueError as error:
+        raise ModelError(f"{path}: MuJoCo cannot add motors: {str(error).strip()}") from None
+    relative = with_motors(path, os.path.relpath(path, folder))
+    return relative, ModelSource(path, spec)
+
+
+def _control_limits(
+    source: ModelSource, start: Start, amplitudes: Array
+) -> dict[str, tuple[float, float]]:
+    """Ranges about the resting control for controls that have none in the MJCF."""
+    limited = source.model.actuator_ctrllimited.astype(bool)
+    found = {}
+    for i, name in enumerate(source.coordinates.controls):
+        if not limited[i]:
+            centre, width = float(start.control[i]), CONTROL_LIMIT * float(amplitudes[i])
+            found[name] = (float(f"{centre - width:.3g}"), float(f"{centre + width:.3g}"))
+    return found
+
+
+def _unnamed(model: Any) -> list[str]:
+    """Remarks about bodies and joints whose parameters cannot be proposed."""
+    counts = {kind: unnamed_count(model, kind) for kind in ("body", "joint")}
+    return [
+        f"Note: {count} elements of kind {kind} have no name in the MJCF, so that their parameters "
+        "are not proposed."
+        for kind, count in counts.items()
+        if count
+    ]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Refinement:
+    """What the package itself says about a draft: feasible amplitudes and identifiable parameters.
+
+    Attributes:
+        source: The model.
+        folder: Folder of the experiment file.
+    """
+
+    source: ModelSource
+    folder: Path
+
+    def refined(self, draft: Proposal) -> Proposal:
+        """The draft with amplitudes that keep all limits, and with identified parameters."""
+        # One parameter is enough where only the motion matters, and much quicker.
+        lean = replace(draft, chosen=draft.chosen[:1])
+        system = System.resolve(self._experiment(lean), source=self.source)
+        rest = self._begins_at_rest(system, lean)
+
+        amplitudes = np.array(list(draft.amplitudes.values()))
+        kept = largest_feasible(amplitudes, lambda a: self._keeps_limits(system, lean, a))
+        remarks = []
+        if kept is None:
+            kept = rounded(amplitudes * SHRINKING**TRIALS)
+            remarks.append(
+                "Warning: no motion about this start keeps all limits; choose another start."
+            )
+        moved = replace(draft, amplitudes=dict(zip(draft.amplitudes, kept.tolist(), strict=True)))
+        if not draft.start.held:
+            remarks.append(
+                "Note: no control holds the start; the robot moves from the first moment."
+            )
+
+        if draft.times.unstable:
+            remarks.append("Note: the start is unstable, so the horizon is short.")
+        remarks += _unnamed(self.source.model)
+        chosen = self._identified(moved)
+        return replace(
+            moved,
+            rest=rest,
+            remarks=remarks,
+            chosen=[draft.chosen[i] for i in chosen],
+            others=[each for i, each in enumerate(draft.chosen) if i not in chosen],
+        )
+
+    def _experiment(self, draft: Proposal, **tables: Any) -> Experiment:
+        """The experiment that a draft states, with other tables."""
+        values = {**draft.values(), **tables}
+        return Experiment(**values, directory=self.folder, source="the proposed experiment")
+
+    def _task(self, system: System, draft: Proposal, **tables: Any) -> DesignTask:
+        """The task of a draft on the plant of a system."""
+        return DesignTask.of(replace(system, experiment=self._experiment(draft, **tables)))
+
+    def _begins_at_rest(self, system: System, draft: Proposal) -> bool:
+        """Whether a design can begin at rest."""
+        if not draft.start.held:
+            return False
+        try:
+            task = self._task(system, draft, boundary={"start": "rest"})
+            return bool(np.isfinite(task.initial_hold).all())
+        except MjfimError:
+            return False
+
+    def _keeps_limits(self, system: System, draft: Proposal, amplitudes: Array) -> bool:
+        """Whether the chirp with some amplitudes keeps all limits at every engine step."""
+        names = list(draft.amplitudes)
+        trial = replace(draft, amplitudes=dict(zip(names, amplitudes.tolist(), strict=True)))
+        try:
+            task = self._task(system, trial)
+            return verify(task, task.initial).is_feasible
+        except SimulationDivergedError:
+            return False
+
+    def _identified(self, draft: Proposal) -> Sequence[int]:
+        """Indices of the candidates that the chirp identifies together."""
+        system = System.resolve(self._experiment(draft), source=self.source)
+        task = self._task(system, draft)
+        point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
+        if point.information is None:
+            raise SimulationDivergedError(
+                "the simulation diverges when the parameters change a little"
+            )
+        F = np.asarray(point.information - task.information.prior)
+        return identifiable(F, task.parameters.scale)

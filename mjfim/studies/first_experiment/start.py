@@ -1,0 +1,303 @@
+"""The state and the control with which a first experiment begins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from mjfim.arrays import Array
+from mjfim.model.coordinates import joint_dofs
+from mjfim.studies.first_experiment.time_scale import reach
+
+# A state is held where the robot needs this many characteristic periods, sqrt(length / gravity), to
+# move by its own length, or a joint by a radian.
+HELD_PERIODS = 30.0
+
+# Gauss-Newton steps towards the control that holds a state, and their relative difference step.
+NEWTON_STEPS = 5
+DIFFERENCE = 1e-4
+
+# Controls below this share of their range are written as zero.
+READABLE_SHARE = 1e-6
+
+# Share of the range of a joint that the start keeps away from its ends.
+MARGIN = 0.05
+
+# End of the sentence about a start that was changed.
+MOVED_INSIDE = ", with joints moved away from the ends of their ranges"
+
+# Periods sqrt(length / gravity) for which a model settles, and the share of the velocity that is
+# left after each of them.
+SETTLING_PERIODS = 60.0
+VELOCITY_LEFT = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Start:
+    """Initial state and resting control.
+
+    Attributes:
+        keyframe: Name of the keyframe, or None.
+        qpos: (nq,) positions.
+        act: (na,) activations.
+        control: (nu,) control that holds the state, or that comes near to it.
+        held: Whether the control holds the state.
+        reason: Sentence that says where the state comes from.
+    """
+
+    keyframe: str | None
+    qpos: Array
+    act: Array
+    control: Array
+    held: bool
+    reason: str
+
+
+def choose_start(model: Any) -> Start:
+    """Choose a state at rest in which an experiment can begin.
+
+    Named keyframes that a control holds come first, then the reference positions, then the state in
+    which the model settles by itself. Where nothing holds, the first of these is taken.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    candidates = []
+    for start in _candidates(model):
+        if start.held:
+            return start
+        candidates.append(start)
+    return candidates[0]
+
+
+def _candidates(model: Any) -> Iterator[Start]:
+    """Starts in the order of preference."""
+    for i in range(model.nkey):
+        name = model.key(i).name
+        if name and not model.key_qvel[i].any():
+            qpos, ctrl = model.key_qpos[i], model.key_ctrl[i]
+            reason = f"the keyframe {name!r} of the MJCF"
+            inside = _inside_ranges(model, qpos)
+            if np.array_equal(inside, qpos):
+                yield _start(model, qpos, ctrl, keyframe=name, reason=reason)
+            else:
+                yield _start(model, inside, ctrl, keyframe=None, reason=f"{reason}{MOVED_INSIDE}")
+
+    inside = _inside_ranges(model, model.qpos0)
+    reason = "the reference positions of the MJCF"
+    if not np.array_equal(inside, model.qpos0):
+        reason += MOVED_INSIDE
+    first = _start(model, inside, _resting_control(model, inside), keyframe=None, reason=reason)
+    yield first
+
+    settled = _settled(model, first)
+    if settled is not None:
+        reason = "the state in which the model comes to rest by itself"
+        yield _start(model, settled, first.control, keyframe=None, reason=reason)
+
+
+def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reason: str) -> Start:
+    """A start with the control that holds it best."""
+    data = mujoco.MjData(model)
+    control = _holding_control(model, data, qpos, guess)
+    acceleration = _acceleration(model, data, qpos, control)
+    held = bool(np.all(acceleration <= _tolerated_acceleration(model, data)))
+
+    # The control of a keyframe is kept where it holds its state.
+    if keyframe is not None:
+        by_guess = _acceleration(model, data, qpos, guess)
+        if np.all(by_guess <= _tolerated_acceleration(model, data)):
+            control, held = np.array(guess), True
+
+    return Start(
+        keyframe=keyframe,
+        qpos=np.array(qpos),
+        act=_activations(model, data, control),
+        control=_readable(model, control) if keyframe is None else control,
+        held=held,
+        reason=reason,
+    )
+
+
+def _readable(model: Any, control: Array) -> Array:
+    """(nu,) controls with six significant digits; those that hardly differ from zero are zero."""
+    _, _, width = _ranges(model, control)
+    values = np.array([float(f"{value:.6g}") for value in control])
+    return np.asarray(np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0))
+
+
+def _inside_ranges(model: Any, qpos: Array) -> Array:
+    """(nq,) positions in which every limited joint keeps a distance from the ends of its range."""
+    inside = np.array(qpos)
+    for joint in range(model.njnt):
+        if not model.jnt_limited[joint] or joint_dofs(model, joint) != 1:
+            continue
+        low, high = model.jnt_range[joint]
+        margin = MARGIN * (high - low)
+        q = int(model.jnt_qposadr[joint])
+        inside[q] = np.clip(inside[q], low + margin, high - margin)
+    return inside
+
+
+def _resting_control(model: Any, qpos: Array) -> Array:
+    """(nu,) first guess of a holding control: zero, or the nearest control inside the range."""
+    control = np.zeros(model.nu)
+    limited = model.actuator_ctrllimited.astype(bool)
+    low, high = model.actuator_ctrlrange.T
+    control[limited] = np.clip(0.0, low[limited], high[limited])
+
+    # A position servo is commanded to where its joint is.
+    for i in range(model.nu):
+        if is_position_servo(model, i):
+            control[i] = qpos[int(model.jnt_qposadr[int(model.actuator_trnid[i, 0])])]
+    return control
+
+
+def is_position_servo(model: Any, actuator: int) -> bool:
+    """Whether the control of an actuator is the wanted position of a slide or hinge joint."""
+    gain = float(model.actuator_gainprm[actuator, 0])
+    bias = float(model.actuator_biasprm[actuator, 1])
+    at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    joint = int(model.actuator_trnid[actuator, 0])
+    return at_joint and gain != 0.0 and bias == -gain and joint_dofs(model, joint) == 1
+
+
+def influence_of_controls(model: Any, start: Start) -> Array:
+    """(nv, nu) derivatives of the accelerations by the controls, in the initial state."""
+    data = mujoco.MjData(model)
+    _, high, width = _ranges(model, start.control)
+    return _influence(model, data, start.qpos, start.control, high, width)
+
+
+def _activations(model: Any, data: Any, control: Array) -> Array:
+    """(na,) activations in which actuators with a state rest under a control."""
+    act = np.zeros(model.na)
+    for i in range(model.nu):
+        first, count = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
+        if count == 0:
+            continue
+        dynamics = int(model.actuator_dyntype[i])
+        if dynamics == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):
+            act[first : first + count] = data.actuator_length[i]
+        else:
+            act[first : first + count] = control[i]
+    return act
+
+
+def _holding_control(model: Any, data: Any, qpos: Array, guess: Array) -> Array:
+    """(nu,) control inside the ranges that makes the acceleration as small as possible."""
+    control = np.array(guess, dtype=float)
+    if model.nu == 0:
+        return control
+
+    low, high, width = _ranges(model, control)
+    control = np.clip(control, low, high)
+    for _ in range(NEWTON_STEPS):
+        base = _signed_acceleration(model, data, qpos, control)
+        J = _influence(model, data, qpos, control, high, width)
+
+        # Controls are scaled by their width, so that their units do not matter.
+        room_low = np.minimum((low - control) / width, -np.finfo(float).tiny)
+        room_high = np.maximum((high - control) / width, np.finfo(float).tiny)
+        step = lsq_linear(J * width, -base, (room_low, room_high)).x
+        control = np.clip(control + step * width, low, high)
+    return np.asarray(control)
+
+
+def _ranges(model: Any, control: Array) -> tuple[Array, Array, Array]:
+    """(nu,) lower and upper ends of the controls, and widths to which steps are relative."""
+    low = np.full(model.nu, -np.inf)
+    high = np.full(model.nu, np.inf)
+    limited = model.actuator_ctrllimited.astype(bool)
+    low[limited], high[limited] = model.actuator_ctrlrange[limited].T
+
+    width = np.where(limited, high - low, np.maximum(np.abs(control), 1.0))
+    return low, high, np.where(np.isfinite(width), width, 1.0)
+
+
+def _influence(
+    model: Any, data: Any, qpos: Array, control: Array, high: Array, width: Array
+) -> Array:
+    """(nv, nu) differences of the accelerations at rest, one control at a time."""
+    base = _signed_acceleration(model, data, qpos, control)
+    steps = DIFFERENCE * width
+    steps = np.where(control + steps > high, -steps, steps)
+
+    J = np.empty((model.nv, model.nu))
+    for i in range(model.nu):
+        moved = control.copy()
+        moved[i] += steps[i]
+        J[:, i] = (_signed_acceleration(model, data, qpos, moved) - base) / steps[i]
+    return J
+
+
+def _signed_acceleration(model: Any, data: Any, qpos: Array, control: Array) -> Array:
+    """(nv,) acceleration at rest."""
+    mujoco.mj_resetData(model, data)
+    data.qpos[:] = qpos
+    data.ctrl[:] = control
+    if model.na:
+        mujoco.mj_forward(model, data)
+        data.act[:] = _activations(model, data, control)
+    mujoco.mj_forward(model, data)
+    return np.array(data.qacc)
+
+
+def _acceleration(model: Any, data: Any, qpos: Array, control: Array) -> Array:
+    """(nv,) magnitude of the acceleration at rest."""
+    return np.abs(_signed_acceleration(model, data, qpos, control))
+
+
+def rotations(model: Any) -> Array:
+    """(nv,) whether a degree of freedom is a rotation."""
+    rotates = np.ones(model.nv, dtype=bool)
+    for joint in range(model.njnt):
+        first = int(model.jnt_dofadr[joint])
+        kind = int(model.jnt_type[joint])
+        if kind == int(mujoco.mjtJoint.mjJNT_SLIDE):
+            rotates[first] = False
+        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+            rotates[first : first + 3] = False
+    return rotates
+
+
+def characteristic_time(model: Any, data: Any) -> float:
+    """sqrt(length / gravity) [s]; without gravity, a thousand timesteps."""
+    gravity = float(np.linalg.norm(model.opt.gravity))
+    if gravity == 0.0:
+        return 1000.0 * float(model.opt.timestep)
+    return float(np.sqrt(reach(model, data) / gravity))
+
+
+def _tolerated_acceleration(model: Any, data: Any) -> Array:
+    """(nv,) acceleration that a held state may have [m/s² or rad/s²]."""
+    length = reach(model, data)
+    patience = (HELD_PERIODS * characteristic_time(model, data)) ** 2
+    return np.asarray(np.where(rotations(model), 1.0, length) / patience)
+
+
+def _settled(model: Any, start: Start) -> Array | None:
+    """(nq,) positions in which the model comes to rest with a strong artificial damping.
+
+    None where the simulation diverges.
+    """
+    data = mujoco.MjData(model)
+    _signed_acceleration(model, data, start.qpos, start.control)
+    time = characteristic_time(model, data)
+    step = float(model.opt.timestep)
+    decay = VELOCITY_LEFT ** (step / time)
+
+    for _ in range(int(SETTLING_PERIODS * time / step)):
+        mujoco.mj_step(model, data)
+        data.qvel *= decay
+        if (
+            not np.isfinite(data.qpos).all()
+            or data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number
+        ):
+            return None
+    return np.array(data.qpos)

@@ -1,0 +1,235 @@
+"""`mjfim.list_model`: everything that an experiment file can name in a model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.errors import ExperimentError, listed
+from mjfim.excitation.limits import Limit, limits_of, unsupported_ranges
+from mjfim.experiment.task_tables import Limits
+from mjfim.model.coordinates import actuator_names
+from mjfim.model.elements import identifier, names_of, unique_names, unnamed_count
+from mjfim.model.loading import ModelSource
+from mjfim.model.paths import INERTIAL_FIELDS, MODEL_ARRAYS, fields_of, resolve, unit_of
+from mjfim.model.units import FORCE_UNITS, control_unit, joint_unit, sensor_unit
+from mjfim.records.inventory import (
+    Inventory,
+    ListedActuator,
+    ListedKeyframe,
+    ListedLimit,
+    ListedOutput,
+    ListedParameter,
+)
+
+# Name of the body that does not move and has no parameters.
+WORLD = "world"
+
+# Kinds of elements that parameter paths name, in the order of the list.
+NAMED_KINDS = ("body", "joint", "actuator", "geom", "site", "tendon")
+
+# Fields of an actuator with many entries of which most are unused; entries that are 0 are left out.
+SPARSE_FIELDS = ("gear", "gainprm", "biasprm", "dynprm")
+
+# Number of entries of the fields that are not arrays of MjModel.
+FURTHER_WIDTHS = {
+    **{field: width for field, (_, _, width) in INERTIAL_FIELDS.items()},
+    "rot": 3,
+    "size": 3,
+    "pos": 3,
+}
+
+# What an actuator acts on, by MuJoCo's type of transmission, with the kind of the element.
+TRANSMISSIONS = {
+    int(mujoco.mjtTrn.mjTRN_JOINT): "joint",
+    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT): "joint",
+    int(mujoco.mjtTrn.mjTRN_SLIDERCRANK): "site",
+    int(mujoco.mjtTrn.mjTRN_TENDON): "tendon",
+    int(mujoco.mjtTrn.mjTRN_SITE): "site",
+    int(mujoco.mjtTrn.mjTRN_BODY): "body",
+}
+
+
+def list_model(path: str | Path) -> Inventory:
+    """List what an experiment file can name in a model.
+
+    Args:
+        path: MJCF or URDF file.
+
+    Raises:
+        ModelError: The model cannot be read.
+    """
+    source = ModelSource(Path(path))
+    model = source.model
+
+    return Inventory(
+        model=str(path),
+        parameters=tuple(_parameters(source)),
+        outputs=tuple(_outputs(source)),
+        actuators=tuple(_actuators(source)),
+        keyframes=tuple(_keyframes(model)),
+        limits=tuple(_limits(source)),
+        remarks=tuple(_remarks(model)),
+    )
+
+
+def _parameters(source: ModelSource) -> Iterator[ListedParameter]:
+    """Paths of all numbers that a parameter can set."""
+    model = source.model
+    for kind in NAMED_KINDS:
+        for name in names_of(model, kind):
+            if kind == "body" and name == WORLD:
+                continue
+            for field in fields_of(kind):
+                for path in _paths(model, f"{kind}/{name}:{field}", kind, field):
+                    yield from _entry(source, path, skip_zero=field in SPARSE_FIELDS)
+
+    for field in MODEL_ARRAYS["option"]:
+        for path in _paths(model, f"option:{field}", "option", field):
+            yield from _entry(source, path, skip_zero=False)
+
+    for component in source.coordinates.deviations:
+        if component.path:
+            yield ListedParameter(path=component.path, value=0.0, unit=component.unit)
+
+
+def _paths(model: Any, path: str, kind: str, field: str) -> Iterator[str]:
+    """The path of a field, or one path for each of its entries."""
+    width = FURTHER_WIDTHS.get(field, 1)
+    array = MODEL_ARRAYS[kind].get(field)
+    if array is not None:
+        holder = getattr(model.opt if kind == "option" else model, array)
+        width = int(np.shape(holder)[-1]) if _has_entries(kind, holder) else 1
+
+    if width == 1:
+        yield path
+        return
+    for i in range(width):
+        yield f"{path}[{i}]"
+
+
+def _has_entries(kind: str, holder: Any) -> bool:
+    """Whether an array holds several numbers for each element."""
+    return np.ndim(holder) == (1 if kind == "option" else 2)
+
+
+def _entry(source: ModelSource, path: str, *, skip_zero: bool) -> Iterator[ListedParameter]:
+    """The entry of a path, if the element has this field."""
+    model = source.model
+    try:
+        field = resolve(model, path, (), source.decoration)
+    except ExperimentError:
+        return
+
+    try:
+        value = field.read(model)
+    except ExperimentError:
+        value = None
+    if skip_zero and value == 0.0:
+        return
+
+    yield ListedParameter(path=path, value=value, unit=unit_of(model, path))
+
+
+def _outputs(source: ModelSource) -> Iterator[ListedOutput]:
+    """Positions, velocities and sensors."""
+    model, coordinates = source.model, source.coordinates
+    for component in coordinates.state:
+        yield ListedOutput(name=component.name, source="state", unit=component.unit, noise=0.0)
+
+    for number in coordinates.sensors:
+        sensor = identifier(model, "sensor", number.sensor)
+        kind = mujoco.mjtSensor(int(model.sensor_type[sensor]))
+        yield ListedOutput(
+            name=number.name,
+            source=kind.name.removeprefix("mjSENS_").lower(),
+            unit=sensor_unit(model, sensor),
+            noise=number.sigma,
+        )
+
+
+def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
+    """All actuators, by the names of their controls."""
+    model = source.model
+    for control, i in zip(source.coordinates.controls, _actuator_of_control(model), strict=True):
+        kind = TRANSMISSIONS.get(int(model.actuator_trntype[i]), "")
+        drives = ""
+        if kind:
+            drives = f"{kind} {unique_names(model, kind)[int(model.actuator_trnid[i, 0])]}"
+        yield ListedActuator(name=control, drives=drives, unit=_unit_of_control(model, i))
+
+
+def _actuator_of_control(model: Any) -> list[int]:
+    """Number of the actuator of each control."""
+    counts = np.asarray(model.actuator_ctrlnum, dtype=int)
+    return [int(i) for i in np.repeat(np.arange(len(counts)), counts)]
+
+
+def _unit_of_control(model: Any, actuator: int) -> str:
+    """Unit of the controls of an actuator; those of several controls are not evident."""
+    return control_unit(model, actuator) if int(model.actuator_ctrlnum[actuator]) == 1 else ""
+
+
+def _keyframes(model: Any) -> Iterator[ListedKeyframe]:
+    """All keyframes."""
+    for i in range(model.nkey):
+        yield ListedKeyframe(
+            name=model.key(i).name,
+            qpos=tuple(model.key_qpos[i].tolist()),
+            qvel=tuple(model.key_qvel[i].tolist()),
+            ctrl=tuple(model.key_ctrl[i].tolist()),
+        )
+
+
+def _limits(source: ModelSource) -> Iterator[ListedLimit]:
+    """Ranges of the MJCF that a design keeps."""
+    model, coordinates = source.model, source.coordinates
+    found = limits_of(
+        model,
+        coordinates.scalar_joints,
+        coordinates.controls,
+        Limits(),
+        float(model.opt.timestep),
+    )
+    for limit in found:
+        yield ListedLimit(
+            quantity=limit.kind,
+            name=limit.name,
+            lower=limit.lower,
+            upper=limit.upper,
+            unit=_limit_unit(source, limit),
+        )
+
+
+def _limit_unit(source: ModelSource, limit: Limit) -> str:
+    """Unit of a range of the MJCF."""
+    model = source.model
+    if limit.kind == "control":
+        return _unit_of_control(model, _actuator_of_control(model)[limit.index])
+
+    if limit.kind == "force":
+        actuator = actuator_names(model).index(limit.name)
+        if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+            return ""
+        return FORCE_UNITS[joint_unit(model, int(model.actuator_trnid[actuator, 0]))]
+
+    unit = next(
+        joint.unit for joint in source.coordinates.scalar_joints if joint.name == limit.name
+    )
+    return FORCE_UNITS[unit] if limit.kind == "joint_force" else unit
+
+
+def _remarks(model: Any) -> Iterator[str]:
+    """Sentences about elements without a name, and about ranges that a design does not keep."""
+    for kind in NAMED_KINDS:
+        unnamed = unnamed_count(model, kind)
+        if unnamed > 0:
+            yield f"{unnamed} of kind {kind} have no name, so that no path leads to them"
+
+    ranges = unsupported_ranges(model)
+    if ranges:
+        yield f"ranges of the MJCF that a design does not keep: {listed(ranges)}"

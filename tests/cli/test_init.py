@@ -1,0 +1,98 @@
+"""`mjfim init`, `mjfim list` and `mjfim validate` from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.support.cli import MODELS, loads, names, run
+
+
+def test_init_writes_a_file_that_validate_accepts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run("init", MODELS / "cart_pendulum.xml")
+    assert result.exit_code == 0
+    assert "next: mjfim check cart_pendulum.toml" in result.stdout
+    text = (tmp_path / "cart_pendulum.toml").read_text(encoding="utf-8")
+    assert "# A first experiment for" in text
+
+    valid = run("validate", "cart_pendulum.toml")
+    assert valid.exit_code == 0
+    assert "is correct" in valid.stdout
+
+
+def test_init_does_not_overwrite_files_of_the_user(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("mine", encoding="utf-8")
+    result = run("init", MODELS / "cart_pendulum.xml", "-o", file)
+    assert result.exit_code == 2
+    assert file.read_text(encoding="utf-8") == "mine"
+
+    # The model itself is never replaced, not even by force.
+    model = tmp_path / "model.xml"
+    model.write_bytes((MODELS / "cart_pendulum.xml").read_bytes())
+    assert run("init", model, "-o", model, "--force").exit_code == 2
+    assert model.read_bytes() == (MODELS / "cart_pendulum.xml").read_bytes()
+
+
+def test_init_writes_nothing_for_a_wrong_group(tmp_path: Path) -> None:
+    result = run(
+        "init", MODELS / "cart_pendulum.xml", "-o", tmp_path / "a.toml", "--parameters", "frictions"
+    )
+    assert result.exit_code == 2
+    assert "unknown group 'frictions'" in result.stderr
+    assert "friction" in result.stderr
+    assert names(tmp_path) == set()
+
+
+def test_list_finds_paths_by_a_part_of_their_name() -> None:
+    model = MODELS / "cart_pendulum.xml"
+    found = loads(run("list", model, "damping", "--json").stdout)
+    assert [row["path"] for row in found["parameters"]] == [
+        "joint/slide:damping",
+        "joint/hinge:damping",
+    ]
+    # Brackets are a part of paths.
+    one = loads(run("list", model, "bob:ipos[1]", "--json").stdout)
+    assert [row["path"] for row in one["parameters"]] == ["body/bob:ipos[1]"]
+
+    table = run("list", model, "--kind", "keyframes")
+    assert "hanging" in table.stdout
+    assert "damping" not in table.stdout
+
+    nothing = run("list", model, "xyzzy")
+    assert nothing.exit_code == 2
+    assert "no path or name contains 'xyzzy'" in nothing.stderr
+
+
+def test_validate_names_the_fault(tmp_path: Path) -> None:
+    file = tmp_path / "bad.toml"
+    text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
+    text = text.replace("cart_pendulum.xml", str(MODELS / "cart_pendulum.xml"))
+    file.write_text(text.replace("joint/hinge:damping", "joint/hinges:damping"), encoding="utf-8")
+    result = run("validate", file)
+    assert result.exit_code == 2
+    assert "unknown joint 'hinges'" in result.stderr
+
+
+def test_validate_says_what_design_lacks(tmp_path: Path) -> None:
+    file = tmp_path / "log.toml"
+    model = MODELS / "cart_pendulum.xml"
+    file.write_text(
+        f'model = "{model.as_posix()}"\nrate = 100.0\nnoise = {{ state = 0.1 }}\n'
+        '[parameters.c]\ntarget = "joint/hinge:damping"\n',
+        encoding="utf-8",
+    )
+    result = run("validate", file, "--json")
+    assert result.exit_code == 0
+    assert loads(result.stdout)["missing"] == ["horizon", "initial.control"]
+
+
+def test_validate_prints_the_schema() -> None:
+    schema = json.loads(run("validate", "--schema").stdout)
+    assert "model" in schema["properties"]
+    assert run("validate").exit_code == 2

@@ -1,0 +1,220 @@
+"""First experiments: they run without edits, and each choice follows the model."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjfim.errors import ExperimentError, ModelError
+from mjfim.excitation.task import DesignTask
+from mjfim.excitation.verification import verify
+from mjfim.experiment.schema import Experiment
+from mjfim.studies.check import check
+from mjfim.studies.first_experiment.document import experiment_text
+from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
+from mjfim.studies.first_experiment.selection import identifiable
+from mjfim.studies.first_experiment.start import choose_start
+from mjfim.studies.first_experiment.time_scale import reach, time_scale
+from tests.support.cli import MODELS
+
+URDF = """
+<robot name="two">
+  <link name="base"/>
+  <link name="upper">
+    <inertial>
+      <origin xyz="0 0 -0.2"/><mass value="1.2"/>
+      <inertia ixx="0.01" iyy="0.01" izz="0.001" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+  </link>
+  <link name="lower">
+    <inertial>
+      <origin xyz="0 0 -0.15"/><mass value="0.7"/>
+      <inertia ixx="0.005" iyy="0.005" izz="0.001" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+  </link>
+  <joint name="shoulder" type="revolute">
+    <parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit lower="-1.5" upper="1.5" effort="20" velocity="3"/>
+    <dynamics damping="0.1" friction="0"/>
+  </joint>
+  <joint name="elbow" type="revolute">
+    <parent link="upper"/><child link="lower"/><origin xyz="0 0 -0.4"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="10" velocity="4"/>
+    <dynamics damping="0.05" friction="0"/>
+  </joint>
+</robot>
+"""
+
+PENDULUM = """
+<mujoco>
+  <option timestep="{timestep}" gravity="0 0 {gravity}"/>
+  <worldbody>
+    <body name="rod">
+      <joint name="hinge" axis="0 1 0" damping="{damping}"/>
+      <geom name="bob" type="sphere" size="{radius}" mass="{mass}" pos="0 0 -{length}"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>
+"""
+
+
+def pendulum(folder: Path, *, length: float, mass: float) -> Path:
+    """A pendulum of some length [m] and mass [kg] with 1 % of critical damping."""
+    path = folder / f"pendulum_{length:g}_{mass:g}.xml"
+    omega = np.sqrt(9.81 / length)
+    text = PENDULUM.format(
+        timestep=f"{0.002 / omega:.6g}",
+        gravity=-9.81,
+        damping=0.02 * mass * length**2 * omega,
+        radius=0.05 * length,
+        mass=mass,
+        length=length,
+    )
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def proposed(path: Path, folder: Path, **options: object) -> tuple[Proposal, Experiment]:
+    """The proposal for a model, and the experiment that its file states."""
+    proposal = propose_experiment(path, folder, companion_name="motors.xml", **options)
+    if proposal.companion is not None:
+        (folder / "motors.xml").write_text(proposal.companion, encoding="utf-8")
+    file = folder / "first.toml"
+    file.write_text(experiment_text(proposal), encoding="utf-8")
+    return proposal, Experiment.from_file(file)
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cart_pendulum",
+        *(pytest.param(name, marks=SLOW) for name in ("filtered_drive", "four_bar", "quadrotor")),
+    ],
+)
+def test_the_file_runs_as_it_stands_and_keeps_all_limits(name: str, tmp_path: Path) -> None:
+    proposal, experiment = proposed(MODELS / f"{name}.xml", tmp_path)
+    task = DesignTask.resolve(experiment)
+    assert verify(task, task.initial).is_feasible
+    assert {each.name for each in proposal.chosen} == set(experiment.parameters)
+
+    found = check(experiment)
+    assert not found.not_separable
+    assert max(row.relative for row in found.rows) < 0.5
+
+
+def test_commented_parameters_are_valid_when_they_are_uncommented(tmp_path: Path) -> None:
+    proposal, experiment = proposed(MODELS / "cart_pendulum.xml", tmp_path)
+    assert proposal.others
+    text = Path(experiment.source).read_text(encoding="utf-8")
+    uncommented = re.sub(r"^# (\w+ = \{.*\})", r"\1", text, flags=re.MULTILINE)
+    (tmp_path / "all.toml").write_text(uncommented, encoding="utf-8")
+    names = set(Experiment.from_file(tmp_path / "all.toml").parameters)
+    assert names == {each.name for each in (*proposal.chosen, *proposal.others)}
+
+
+@SLOW
+@pytest.mark.parametrize(("length", "mass"), [(1e-3, 1e-6), (1e3, 1e6)])
+def test_proposals_scale_with_the_size_of_the_robot(
+    length: float, mass: float, tmp_path: Path
+) -> None:
+    small, _ = proposed(pendulum(tmp_path, length=1.0, mass=1.0), tmp_path)
+    other, _ = proposed(pendulum(tmp_path, length=length, mass=mass), tmp_path)
+
+    assert other.times.samples == pytest.approx(small.times.samples, rel=0.6)
+    assert other.times.period / small.times.period == pytest.approx(np.sqrt(length), rel=1e-3)
+    ratio = other.amplitudes["motor"] / small.amplitudes["motor"]
+    assert ratio == pytest.approx(mass * length, rel=0.1)
+    assert [each.name for each in other.chosen] == [each.name for each in small.chosen]
+
+
+def test_a_urdf_gets_motors_and_keeps_its_limits(tmp_path: Path) -> None:
+    path = tmp_path / "two.urdf"
+    path.write_text(URDF, encoding="utf-8")
+    proposal, experiment = proposed(path, tmp_path)
+    assert experiment.model == "motors.xml"
+
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "motors.xml"))
+    assert model.nu == 2
+    assert model.actuator("shoulder").ctrlrange.tolist() == [-20.0, 20.0]
+    assert experiment.limits.velocity == {"shoulder": 3.0, "elbow": 4.0}
+    task = DesignTask.resolve(experiment)
+    assert verify(task, task.initial).is_feasible
+    assert proposal.rest
+
+
+def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Path) -> None:
+    path = tmp_path / "two.urdf"
+    path.write_text(URDF, encoding="utf-8")
+    _, experiment = proposed(path, tmp_path, payload="lower", groups=("payload",))
+    spec = experiment.parameters["payload"]
+    assert spec.guess == 0.0
+    assert spec.targets[0].offset == pytest.approx(0.7)
+    assert set(experiment.parameters) <= {"payload", *(f"payload_moment_{a}" for a in "xyz")}
+
+
+def test_faults_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match="--payload: unknown body 'hand'"):
+        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, payload="hand")
+    with pytest.raises(ExperimentError, match="no parameter of motors can be proposed"):
+        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, groups=("motors",))
+
+    bare = tmp_path / "bare.xml"
+    text = pendulum(tmp_path, length=1.0, mass=1.0).read_text(encoding="utf-8")
+    bare.write_text(re.sub(r"<actuator>.*</actuator>", "", text), encoding="utf-8")
+    with pytest.raises(ExperimentError, match="has no actuator"):
+        propose_experiment(bare, tmp_path)
+    with pytest.raises(ModelError, match="no such model file"):
+        propose_experiment(tmp_path / "absent.xml", tmp_path)
+
+
+def test_the_start_is_a_keyframe_that_a_control_holds_or_a_state_inside_the_ranges() -> None:
+    model = mujoco.MjModel.from_xml_path(str(MODELS / "servo_arm.xml"))
+    start = choose_start(model)
+    assert start.keyframe in ("home", "settled")
+    assert start.held
+
+    # Reference positions outside of the ranges are moved inside.
+    text = """
+    <mujoco>
+      <worldbody><body name="b"><joint name="j" axis="0 0 1" range="1 2" limited="true"/>
+      <geom size="0.1" mass="1" pos="0.3 0 0"/></body></worldbody>
+      <actuator><motor joint="j"/></actuator>
+    </mujoco>
+    """
+    start = choose_start(
+        mujoco.MjModel.from_xml_string(text.replace('range="1 2"', 'range="60 120"'))
+    )
+    assert np.deg2rad(60.0) < start.qpos[0] < np.deg2rad(120.0)
+
+
+def test_length_and_period_are_those_of_a_pendulum(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_path(str(pendulum(tmp_path, length=0.5, mass=2.0)))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert reach(model, data) == pytest.approx(0.5)
+    times = time_scale(model, data)
+    assert times.period == pytest.approx(2 * np.pi * np.sqrt(0.5 / 9.81))
+    assert times.samples == pytest.approx(times.horizon * times.rate)
+
+
+def test_parameters_are_chosen_until_one_spoils_the_others() -> None:
+    # The second parameter has the same effect as the first one; the third is separate.
+    G = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 2.0]]) * 10.0
+    G[:, 1] = G[:, 0]
+    sizes = np.ones(3)
+    assert identifiable(G.T @ G, sizes) == [0, 2]
+
+    # Units do not matter.
+    units = np.array([1e-6, 1e6, 1e3])
+    assert identifiable((G.T @ G) / np.outer(units, units), sizes * units) == [0, 2]
+
+    # Where nothing is known well, the best known parameter remains.
+    assert identifiable(1e-6 * np.diag([1.0, 3.0, 2.0]), sizes) == [1]

@@ -1,0 +1,90 @@
+"""What an experiment file can name in a model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mjfim.errors import ModelError
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.records.inventory import KINDS
+from mjfim.studies.inventory import list_model
+from tests.support.cli import MODELS
+
+# A model with what the examples lack: elements without a name, and a range that no design keeps.
+ODD = """
+<mujoco>
+  <worldbody>
+    <body name="link">
+      <joint name="ball" type="ball" range="0 1" limited="true"/>
+      <geom size="0.1" mass="1"/>
+    </body>
+    <body><joint type="slide"/><geom size="0.1" mass="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_every_listed_path_can_be_a_target_and_has_the_value_of_the_model() -> None:
+    inventory = list_model(MODELS / "servo_arm.xml")
+    values = {each.path: each for each in inventory.parameters}
+    assert values["joint/yaw:damping"].unit == "N m s/rad"
+    assert values["actuator/shoulder:kp"].value == pytest.approx(
+        System.resolve(Experiment.from_file(MODELS / "servo_arm.toml"))
+        .model.actuator("shoulder")
+        .gainprm[0]
+    )
+    assert not any(path.startswith("body/world") for path in values)
+
+    # A sample of all paths, because each experiment takes a moment.
+    for entry in inventory.parameters[::40]:
+        spec = {"target": entry.path, "guess": entry.value if entry.value is not None else 1.0}
+        experiment = Experiment(
+            model="servo_arm.xml",
+            rate=100.0,
+            parameters={"p": {**spec, "scale": 1.0}},
+            noise={"state": 0.1},
+            directory=MODELS,
+        )
+        parameter = System.resolve(experiment).parameters.parameters[0]
+        assert parameter.unit == entry.unit
+
+
+def test_outputs_actuators_keyframes_and_limits_are_listed() -> None:
+    inventory = list_model(MODELS / "quadrotor.xml")
+    assert "qpos:body.x" in {each.name for each in inventory.outputs} or inventory.outputs
+    assert {each.name for each in inventory.actuators} == {"fl", "fr", "rl", "rr"}
+    assert [each.name for each in inventory.keyframes] == ["hover"]
+    assert {(each.quantity, each.lower, each.upper) for each in inventory.limits} == {
+        ("control", 0.0, 1.0)
+    }
+    gyro = next(each for each in inventory.outputs if each.name == "imu_gyro[0]")
+    assert (gyro.source, gyro.unit) == ("gyro", "rad/s")
+
+
+def test_elements_without_a_name_and_ranges_that_are_not_kept_are_said(tmp_path: Path) -> None:
+    path = tmp_path / "odd.xml"
+    path.write_text(ODD, encoding="utf-8")
+    remarks = " ".join(list_model(path).remarks)
+    for words in ("1 of kind body have no name", "1 of kind joint have no name", "ball joint ball"):
+        assert words in remarks
+
+
+def test_selections_keep_what_is_wanted() -> None:
+    inventory = list_model(MODELS / "cart_pendulum.xml")
+    selected = inventory.selected(lambda name: "damping" in name)
+    assert {each.path for each in selected.parameters} == {
+        "joint/slide:damping",
+        "joint/hinge:damping",
+    }
+    assert selected.count == 2
+    for kind in KINDS:
+        only = inventory.only(kind)
+        assert only.count == len(getattr(inventory, kind))
+
+
+def test_a_missing_model_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"absent\.xml: no such model file"):
+        list_model(tmp_path / "absent.xml")
