@@ -184,7 +184,7 @@ class ParameterSpec(Section):
         default=None,
         description=(
             "Lower and upper bound of the estimate [parameter unit]. Default: what physics allows: "
-            "masses, moments of inertia, damping, friction, armature and stiffness are at least 0. "
+            "damping, friction, armature and stiffness are at least 0, and inertias are physical. "
             "State a negative lower bound to allow negative values."
         ),
     )

@@ -9,9 +9,9 @@ import numpy as np
 from mjfim.model.parameters import Target
 from mjfim.model.paths import ParameterPath
 
-# Fields that cannot be negative, by kind of element.
+# Fields that cannot be negative, by kind of element. Bodies are not among them: their masses and
+# inertias are kept physical together, see `ParameterWriter.unphysical_bodies`.
 NOT_NEGATIVE = {
-    "body": ("mass", "inertia"),
     "joint": ("damping", "frictionloss", "armature", "stiffness"),
     "tendon": ("damping", "frictionloss", "armature", "stiffness"),
     "geom": ("mass", "density", "size", "friction"),

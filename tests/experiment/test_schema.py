@@ -295,7 +295,7 @@ def test_contract_resolves(resolve: Callable[[str], DesignTask]) -> None:
     assert task.parameters.guess.tolist() == [2.5, -0.75, 1.0]  # c: the model's own damping
     assert task.parameters.true.tolist() == [2.0, -0.75, 1.0]
     assert task.parameters.scale.tolist() == [1.0, 0.75, 1.0]
-    assert task.parameters.lower.tolist() == [0.1, -np.inf, -np.inf]
+    assert task.parameters.lower.tolist() == [0.1, -np.inf, 0.0]
     assert task.parameters.prior_information.tolist() == np.diag([4.0, 0.0, 0.0]).tolist()
     assert (
         task.system.grid.substeps,

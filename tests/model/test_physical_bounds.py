@@ -29,7 +29,7 @@ def parameters(**specs: dict[str, Any]) -> ParameterSet:
 def test_numbers_that_cannot_be_negative_have_a_bound_and_others_have_none() -> None:
     found = parameters(
         damping={"target": "joint/hinge:damping"},
-        mass={"target": "body/bob:mass"},
+        armature={"target": "joint/slide:armature", "scale": 1.0},
         place={"target": "body/bob:pos[2]"},
     )
     assert found.lower.tolist() == [0.0, 0.0, -np.inf]
@@ -39,7 +39,7 @@ def test_numbers_that_cannot_be_negative_have_a_bound_and_others_have_none() -> 
 def test_scale_and_offset_move_and_turn_the_bound() -> None:
     found = parameters(
         load={
-            "targets": [{"path": "body/bob:mass", "offset": 2.0}],
+            "targets": [{"path": "joint/slide:damping", "offset": 2.0}],
             "guess": 0.0,
             "scale": 1.0,
         },
