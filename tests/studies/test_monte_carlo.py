@@ -214,6 +214,7 @@ def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experim
     np.testing.assert_allclose(np.linalg.inv(prior.information["final"]), prior.sets["final"].crlb)
 
 
+@pytest.mark.slow
 def test_a_request_to_stop_keeps_the_finished_trials(
     design: mjfim.Design, experiment: Experiment
 ) -> None:
