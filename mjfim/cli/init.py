@@ -13,6 +13,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.studies.first_experiment.candidates import GROUPS, Group
 from mjfim.studies.first_experiment.document import experiment_text
 from mjfim.studies.first_experiment.propose import propose_experiment
+from mjfim.studies.first_experiment.urdf import is_urdf
 
 
 @verb
@@ -46,6 +47,8 @@ def init(
     companion = file.with_name(f"{file.stem}_motors.xml")
     groups = _groups(parameters)
     claim_file(file, [model], force=force)
+    if is_urdf(model):
+        claim_file(companion, [model], force=force)
 
     with progress("looking at the model"):
         proposal = propose_experiment(
@@ -54,7 +57,6 @@ def init(
         text = experiment_text(proposal)
 
     if proposal.companion is not None:
-        claim_file(companion, [model], force=force)
         with replacing(companion) as temporary:
             temporary.write_text(proposal.companion, encoding="utf-8")
         errors.print(f"wrote {companion}", markup=False)

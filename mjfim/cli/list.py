@@ -9,7 +9,7 @@ import typer
 
 from mjfim.cli.common import AsJson, ModelFile, print_result, verb
 from mjfim.errors import ExperimentError
-from mjfim.output.inventory_summary import describe_inventory
+from mjfim.output.summaries.inventory import describe_inventory
 from mjfim.output.text import render
 from mjfim.studies.inventory import list_model
 

@@ -12,7 +12,7 @@ import mjfim
 from mjfim.cli.common import AsJson, print_result, verb
 from mjfim.errors import ExperimentError
 from mjfim.experiment.schema import json_schema
-from mjfim.output.experiment_summary import describe_experiment
+from mjfim.output.summaries.stated_experiment import describe_experiment
 from mjfim.output.text import render
 from mjfim.studies.stated_experiment import stated_experiment
 

@@ -287,7 +287,9 @@ def _choose(
 ) -> tuple[RunResult, DesignPoint]:
     """Choose the best run and the point of the design.
 
-    The point is that of the initial control where no run found a better one.
+    The point is that of the initial control where no run found a better one: a search that was
+    stopped early may have seen controls on a coarse level only, which are slightly worse. An
+    initial control that breaks a limit is chosen only if no run has a point.
     """
     if not results:
         results.append(RunResult(name="initial control", status=Status.INTERRUPTED))
@@ -303,10 +305,18 @@ def _choose(
     if best.point is None and not interrupted:
         raise SimulationDivergedError("the simulation diverges from every start")
 
-    # Without hard limits a design is never worse than the initial control.
-    is_worse = best.cost > first.cost and not stage.task.is_limited
-    chosen = first if best.point is None or is_worse else best.point
-    return best, chosen
+    if best.point is None or (best.cost > first.cost and _keeps_limits(stage.task, first)):
+        return best, first
+
+    return best, best.point
+
+
+def _keeps_limits(task: DesignTask, point: DesignPoint) -> bool:
+    """Check whether the trajectory of a point keeps the hard limits, if there are any."""
+    if not task.is_limited:
+        return True
+
+    return point.trajectory is not None and verify(task, point.trajectory).is_feasible
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,7 +12,13 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, first_ones, listed, shortened, unknown
 from mjfim.experiment.task_tables import Limits
-from mjfim.model.coordinates import ScalarJoint, actuator_names, joint_names
+from mjfim.model.coordinates import (
+    ScalarJoint,
+    actuator_names,
+    control_names,
+    joint_names,
+    scalar_joints,
+)
 from mjfim.model.sizes import (
     LEAST_MOVE_PER_SAMPLE,
     actuator_force_sizes,
@@ -190,6 +196,16 @@ def limits_of(
     return tuple(limit for kind in kinds for limit in _limits_of_kind(kind))
 
 
+def limits_of_model(model: Any) -> tuple[Limit, ...]:
+    """Collect the limits that the MJCF states by itself, ordered by kind.
+
+    Args:
+        model: MjModel.
+    """
+    timestep = float(model.opt.timestep)
+    return limits_of(model, scalar_joints(model), control_names(model), Limits(), timestep)
+
+
 def _natural_sizes(
     model: Any, dofs: Sequence[int], outputs: Sequence[int], period: float
 ) -> dict[str, Array]:
@@ -297,12 +313,12 @@ def _stated_ranges(kind: _KindOfLimit) -> dict[str, Range]:
 
 
 def _applies_to(kind: str) -> str:
-    """What a kind of limit applies to, in words."""
+    """Elements to which a kind of limit applies, in words."""
     return "slides and hinges" if kind in JOINT_KINDS else "actuators with a single force"
 
 
 def _joints_without_limits(model: Any) -> dict[str, str]:
-    """What the ball and free joints are, by name."""
+    """Kinds of the ball and free joints, in words by name."""
     words = {
         int(mujoco.mjtJoint.mjJNT_BALL): "a ball joint",
         int(mujoco.mjtJoint.mjJNT_FREE): "a free joint",
@@ -312,7 +328,7 @@ def _joints_without_limits(model: Any) -> dict[str, str]:
 
 
 def _actuators_without_limits(model: Any) -> dict[str, str]:
-    """What the actuators with several forces are, by name."""
+    """Numbers of forces of the actuators that have several, in words by name."""
     counts = zip(actuator_names(model), model.actuator_outnum.tolist(), strict=True)
     return {name: f"an actuator with {count} forces" for name, count in counts if count != 1}
 

@@ -211,9 +211,7 @@ def control_labels(model: Any) -> tuple[str, ...]:
     labels: list[str] = []
     for i, name in enumerate(actuator_names(model)):
         count = int(model.actuator_ctrlnum[i])
-
-        # The units of several controls of one actuator are not evident.
-        unit = control_unit(model, i) if count == 1 else ""
+        unit = control_unit(model, i)
         suffix = f"[{unit}]" if unit else "(control)"
 
         labels += [f"{control} {suffix}" for control in _indexed(name, count)]

@@ -120,7 +120,7 @@ def sensor_unit(model: Any, sensor: int) -> str:
 
 
 def control_unit(model: Any, actuator: int) -> str:
-    """Unit of the control of an actuator.
+    """Unit of the control of an actuator; the units of several controls are not evident.
 
     It is evident for actuators that act on one joint with a gear of 1: a direct drive (gain 1, no
     bias) takes a force, a position servo (`biasprm[1] = -gain`) takes the joint's coordinate.
@@ -134,7 +134,7 @@ def control_unit(model: Any, actuator: int) -> str:
     """
     gear = model.actuator_gear[int(model.actuator_outadr[actuator]), 0]
     at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
-    if not at_joint or gear != 1:
+    if not at_joint or gear != 1 or int(model.actuator_ctrlnum[actuator]) != 1:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])

@@ -61,7 +61,7 @@ class StatedLimit:
 
 @dataclass(frozen=True, kw_only=True)
 class StatedExperiment:
-    """What a correct experiment file states.
+    """Contents of a correct experiment file.
 
     Attributes:
         source: Path of the experiment file.

@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, listed
-from mjfim.excitation.limits import Limit, limits_of, unsupported_ranges
-from mjfim.experiment.task_tables import Limits
+from mjfim.excitation.limits import Limit, limits_of_model, unsupported_ranges
 from mjfim.model.coordinates import actuator_names
 from mjfim.model.elements import identifier, names_of, unique_names, unnamed_count
 from mjfim.model.loading import ModelSource
@@ -160,18 +159,13 @@ def _actuators(source: ModelSource) -> Iterator[ListedActuator]:
         drives = ""
         if kind:
             drives = f"{kind} {unique_names(model, kind)[int(model.actuator_trnid[i, 0])]}"
-        yield ListedActuator(name=control, drives=drives, unit=_unit_of_control(model, i))
+        yield ListedActuator(name=control, drives=drives, unit=control_unit(model, i))
 
 
 def _actuator_of_control(model: Any) -> list[int]:
     """Number of the actuator of each control."""
     counts = np.asarray(model.actuator_ctrlnum, dtype=int)
     return [int(i) for i in np.repeat(np.arange(len(counts)), counts)]
-
-
-def _unit_of_control(model: Any, actuator: int) -> str:
-    """Unit of the controls of an actuator; those of several controls are not evident."""
-    return control_unit(model, actuator) if int(model.actuator_ctrlnum[actuator]) == 1 else ""
 
 
 def _keyframes(model: Any) -> Iterator[ListedKeyframe]:
@@ -187,15 +181,7 @@ def _keyframes(model: Any) -> Iterator[ListedKeyframe]:
 
 def _limits(source: ModelSource) -> Iterator[ListedLimit]:
     """Ranges of the MJCF that a design keeps."""
-    model, coordinates = source.model, source.coordinates
-    found = limits_of(
-        model,
-        coordinates.scalar_joints,
-        coordinates.controls,
-        Limits(),
-        float(model.opt.timestep),
-    )
-    for limit in found:
+    for limit in limits_of_model(source.model):
         yield ListedLimit(
             quantity=limit.kind,
             name=limit.name,
@@ -209,7 +195,7 @@ def _limit_unit(source: ModelSource, limit: Limit) -> str:
     """Unit of a range of the MJCF."""
     model = source.model
     if limit.kind == "control":
-        return _unit_of_control(model, _actuator_of_control(model)[limit.index])
+        return control_unit(model, _actuator_of_control(model)[limit.index])
 
     if limit.kind == "force":
         actuator = actuator_names(model).index(limit.name)

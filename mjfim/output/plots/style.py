@@ -90,6 +90,7 @@ def own_style(draw: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
 
     @wraps(draw)
     def with_own_style(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
+        """Draw with matplotlib's default style, whatever the user has set."""
         with STYLE_LOCK, matplotlib.style.context("default"):
             return draw(*arguments, **options)
 

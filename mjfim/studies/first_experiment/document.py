@@ -8,9 +8,7 @@ from typing import Any
 import tomlkit
 from tomlkit.items import InlineTable, Table
 
-from mjfim.excitation.limits import limits_of
-from mjfim.experiment.task_tables import Limits
-from mjfim.model.coordinates import control_names, scalar_joints
+from mjfim.excitation.limits import limits_of_model
 from mjfim.model.paths import unit_of
 from mjfim.studies.first_experiment.candidates import Candidate
 from mjfim.studies.first_experiment.propose import SECONDS, Proposal
@@ -41,7 +39,7 @@ def experiment_text(proposal: Proposal) -> str:
     document.add("horizon", _commented(values["horizon"], "duration of the experiment [s]"))
     document.add(tomlkit.nl())
 
-    document.add("initial", _initial(proposal))
+    document.add("initial", _initial(proposal, values["initial"]))
     document.add("parameters", _parameters(proposal))
     document.add("noise", _noise(proposal))
     document.add("limits", _limits(proposal, values.get("limits", {})))
@@ -88,7 +86,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _initial(proposal: Proposal) -> Table:
+def _initial(proposal: Proposal, values: Mapping[str, Any]) -> Table:
     """Initial state and control."""
     table = tomlkit.table()
     start = proposal.start
@@ -101,7 +99,6 @@ def _initial(proposal: Proposal) -> Table:
     if others:
         table.add(tomlkit.comment(f"Other keyframes: {', '.join(others)}."))
 
-    values = proposal.values()["initial"]
     for key in ("keyframe", "qpos", "act"):
         if key in values:
             table.add(key, values[key])
@@ -135,7 +132,7 @@ def _parameters(proposal: Proposal) -> Table:
 
 
 def _meaning(proposal: Proposal, each: Candidate) -> str:
-    """What a parameter is, with its unit."""
+    """Meaning of a parameter, with its unit."""
     unit = unit_of(proposal.compiled, each.path)
     return f"{each.meaning} [{unit}]" if unit else each.meaning
 
@@ -157,14 +154,7 @@ def _limits(proposal: Proposal, stated: Mapping[str, Any]) -> Table:
     """Stated limits; those of the MJCF as comments."""
     model = proposal.compiled
     table = tomlkit.table()
-    found = limits_of(
-        model,
-        scalar_joints(model),
-        control_names(model),
-        Limits(),
-        float(model.opt.timestep),
-    )
-    kinds = list(dict.fromkeys(limit.kind for limit in found))
+    kinds = list(dict.fromkeys(limit.kind for limit in limits_of_model(model)))
     if kinds:
         names = ", ".join(kind.replace("_", " ") for kind in kinds)
         table.add(tomlkit.comment(f"The ranges of the MJCF always hold ({names}):"))

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.studies.first_experiment.start import Start, is_position_servo, rotations
+from mjfim.model.sizes import translations
+from mjfim.studies.first_experiment.start import Start, is_position_servo
 
 # Share of the range of a control that the first trial uses to each side of the resting control.
 RANGE_SHARE = 0.5
@@ -40,7 +41,7 @@ def first_amplitudes(
         moves a joint by half a radian or by half of the robot's length. A control that rests at an
         end of its range gets 0.
     """
-    distance = np.where(rotations(model), ANGLE, LENGTH_SHARE * length)
+    distance = np.where(translations(model), LENGTH_SHARE * length, ANGLE)
     wanted = distance * (2.0 * np.pi / period) ** 2
 
     amplitudes = np.ones(model.nu)

@@ -33,7 +33,7 @@ from mjfim.studies.first_experiment.outputs import ProposedNoise, proposed_noise
 from mjfim.studies.first_experiment.selection import identifiable
 from mjfim.studies.first_experiment.start import Start, choose_start, influence_of_controls
 from mjfim.studies.first_experiment.time_scale import TimeScale, reach, time_scale
-from mjfim.studies.first_experiment.urdf import UrdfModel, is_urdf, with_motors
+from mjfim.studies.first_experiment.urdf import UrdfModel, is_urdf, read_urdf
 
 # First and last frequency of the chirp, in characteristic periods of the motion.
 FIRST_FREQUENCY = 0.4
@@ -152,7 +152,7 @@ def propose_experiment(
         ModelError: The model cannot be read.
         ExperimentError: The model has no actuator or no parameter of the wanted groups.
     """
-    urdf, source = _model(path, folder)
+    urdf, source = _model(path)
     model = source.model
     if model.nu == 0:
         raise ExperimentError(
@@ -181,7 +181,7 @@ def propose_experiment(
     )
     draft = Proposal(
         model=companion_name if urdf else os.path.relpath(path, folder),
-        companion=None if urdf is None else urdf.text,
+        companion=None if urdf is None else urdf.mjcf(os.path.relpath(path, folder)),
         compiled=model,
         times=times,
         start=start,
@@ -201,20 +201,19 @@ def propose_experiment(
     return _Refinement(source=source, folder=folder).refined(draft)
 
 
-def _model(path: Path, folder: Path) -> tuple[UrdfModel | None, ModelSource]:
+def _model(path: Path) -> tuple[UrdfModel | None, ModelSource]:
     """The model with actuators, and what was added to a URDF."""
     if not is_urdf(path):
         return None, ModelSource(path)
 
     # The MJCF around the URDF exists only in memory so far; its path of the URDF is absolute.
-    absolute = with_motors(path, str(path.resolve()))
+    urdf = read_urdf(path)
     try:
         with silence_mujoco_log():
-            spec = mujoco.MjSpec.from_string(absolute.text)
+            spec = mujoco.MjSpec.from_string(urdf.mjcf(str(path.resolve())))
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot add motors: {str(error).strip()}") from None
-    relative = with_motors(path, os.path.relpath(path, folder))
-    return relative, ModelSource(path, spec)
+    return urdf, ModelSource(path, spec)
 
 
 def _control_limits(
@@ -243,7 +242,7 @@ def _unnamed(model: Any) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Refinement:
-    """What the package itself says about a draft: feasible amplitudes and identifiable parameters.
+    """Test of a draft by the package itself: feasible amplitudes and identifiable parameters.
 
     Attributes:
         source: The model.

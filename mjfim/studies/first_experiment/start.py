@@ -12,7 +12,8 @@ from scipy.optimize import lsq_linear
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs
-from mjfim.studies.first_experiment.time_scale import reach
+from mjfim.model.sizes import translations
+from mjfim.studies.first_experiment.time_scale import free_time, pendulum_time, reach
 
 # A state is held where the robot needs this many characteristic periods, sqrt(length / gravity), to
 # move by its own length, or a joint by a radian.
@@ -253,32 +254,16 @@ def _acceleration(model: Any, data: Any, qpos: Array, control: Array) -> Array:
     return np.abs(_signed_acceleration(model, data, qpos, control))
 
 
-def rotations(model: Any) -> Array:
-    """(nv,) whether a degree of freedom is a rotation."""
-    rotates = np.ones(model.nv, dtype=bool)
-    for joint in range(model.njnt):
-        first = int(model.jnt_dofadr[joint])
-        kind = int(model.jnt_type[joint])
-        if kind == int(mujoco.mjtJoint.mjJNT_SLIDE):
-            rotates[first] = False
-        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
-            rotates[first : first + 3] = False
-    return rotates
-
-
-def characteristic_time(model: Any, data: Any) -> float:
-    """sqrt(length / gravity) [s]; without gravity, a thousand timesteps."""
-    gravity = float(np.linalg.norm(model.opt.gravity))
-    if gravity == 0.0:
-        return 1000.0 * float(model.opt.timestep)
-    return float(np.sqrt(reach(model, data) / gravity))
-
-
 def _tolerated_acceleration(model: Any, data: Any) -> Array:
     """(nv,) acceleration that a held state may have [m/s² or rad/s²]."""
     length = reach(model, data)
-    patience = (HELD_PERIODS * characteristic_time(model, data)) ** 2
-    return np.asarray(np.where(rotations(model), 1.0, length) / patience)
+    patience = (HELD_PERIODS * _time(model, data)) ** 2
+    return np.asarray(np.where(translations(model), length, 1.0) / patience)
+
+
+def _time(model: Any, data: Any) -> float:
+    """Time of a pendulum of the robot's length, or of a model without gravity [s]."""
+    return pendulum_time(model, data) or free_time(model)
 
 
 def _settled(model: Any, start: Start) -> Array | None:
@@ -288,7 +273,7 @@ def _settled(model: Any, start: Start) -> Array | None:
     """
     data = mujoco.MjData(model)
     _signed_acceleration(model, data, start.qpos, start.control)
-    time = characteristic_time(model, data)
+    time = _time(model, data)
     step = float(model.opt.timestep)
     decay = VELOCITY_LEFT ** (step / time)
 

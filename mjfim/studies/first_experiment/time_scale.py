@@ -66,11 +66,11 @@ def time_scale(model: Any, data: Any) -> TimeScale:
         model: The compiled model (`mujoco.MjModel`).
         data: Its data (`mujoco.MjData`) in the initial state, after `mj_forward`.
     """
-    period = _period(model, data)
+    eigenvalues = _eigenvalues(model, data)
+    period = _period(model, data, eigenvalues)
     rate = _rate(float(model.opt.timestep), SAMPLES_PER_PERIOD / period)
 
     # Without feedback, a motion about an unstable state stays near it for a short time only.
-    eigenvalues = _eigenvalues(model, data)
     growth = float(np.log(np.abs(eigenvalues).max(initial=1.0))) / float(model.opt.timestep)
     longest = PERIODS * period
     unstable = growth * longest > LARGEST_GROWTH
@@ -124,16 +124,35 @@ def _moved(model: Any, joint: int) -> Array:
     return np.array(found or [top])
 
 
-def _period(model: Any, data: Any) -> float:
-    """Characteristic period [s]: that of a pendulum of the robot's length, or of a slow pole."""
-    gravity = float(np.linalg.norm(model.opt.gravity))
-    if gravity > 0.0 and not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
-        return 2.0 * np.pi * float(np.sqrt(reach(model, data) / gravity))
+def pendulum_time(model: Any, data: Any) -> float | None:
+    """Time of a pendulum of the robot's length, sqrt(length / gravity) [s]; None without gravity.
 
-    speeds = _pole_speeds(_eigenvalues(model, data), float(model.opt.timestep))
+    Args:
+        model: The compiled model.
+        data: Its data in the initial state, after `mj_forward`.
+    """
+    gravity = float(np.linalg.norm(model.opt.gravity))
+    is_off = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY))
+    if gravity == 0.0 or is_off:
+        return None
+    return float(np.sqrt(reach(model, data) / gravity))
+
+
+def free_time(model: Any) -> float:
+    """Time that stands for that of a motion which neither gravity nor a pole determines [s]."""
+    return STEPS_OF_FREE_MODEL * float(model.opt.timestep)
+
+
+def _period(model: Any, data: Any, eigenvalues: Array) -> float:
+    """Characteristic period [s]: that of a pendulum of the robot's length, or of a slow pole."""
+    time = pendulum_time(model, data)
+    if time is not None:
+        return 2.0 * np.pi * time
+
+    speeds = _pole_speeds(eigenvalues, float(model.opt.timestep))
     if len(speeds):
         return 2.0 * np.pi / float(speeds.min())
-    return STEPS_OF_FREE_MODEL * float(model.opt.timestep)
+    return free_time(model)
 
 
 def _eigenvalues(model: Any, data: Any) -> Array:

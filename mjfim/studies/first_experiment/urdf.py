@@ -19,16 +19,55 @@ COMMENT = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class UrdfModel:
-    """An MJCF around a URDF.
+class Motor:
+    """A motor for one joint.
 
     Attributes:
-        text: Contents of the MJCF.
+        joint: Name of the joint, and of the motor.
+        effort: Lower and upper end of the force [N or N m]; None where the URDF states none.
+    """
+
+    joint: str
+    effort: tuple[float, float] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class UrdfModel:
+    """A URDF and the motors that it lacks.
+
+    Attributes:
+        name: Name of the robot.
+        motors: One motor for each revolute or prismatic joint.
         velocities: Velocity limits of the URDF by joint name [m/s or rad/s]. MJCF has none.
     """
 
-    text: str
+    name: str
+    motors: tuple[Motor, ...]
     velocities: dict[str, float]
+
+    def mjcf(self, file: str) -> str:
+        """Text of an MJCF that attaches the URDF and adds the motors.
+
+        Args:
+            file: Path of the URDF, relative to the MJCF or absolute.
+        """
+        root = ElementTree.Element("mujoco", model=f"{self.name} with motors")
+        root.append(ElementTree.Comment(COMMENT))
+        asset = ElementTree.SubElement(root, "asset")
+        ElementTree.SubElement(asset, "model", name="robot", file=file)
+        world = ElementTree.SubElement(root, "worldbody")
+        ElementTree.SubElement(world, "attach", model="robot", prefix="")
+
+        actuators = ElementTree.SubElement(root, "actuator")
+        for motor in self.motors:
+            attributes = {"name": motor.joint, "joint": motor.joint}
+            if motor.effort is not None:
+                low, high = motor.effort
+                attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
+            ElementTree.SubElement(actuators, "motor", attributes)
+
+        ElementTree.indent(root)
+        return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def is_urdf(path: Path) -> bool:
@@ -45,43 +84,32 @@ def is_urdf(path: Path) -> bool:
     return False
 
 
-def with_motors(path: Path, file: str) -> UrdfModel:
-    """Add motors to a URDF.
+def read_urdf(path: Path) -> UrdfModel:
+    """Read a URDF, and give each joint a motor.
 
     Args:
         path: The URDF.
-        file: Path of the URDF relative to the MJCF.
 
     Raises:
         ModelError: The URDF cannot be read, or has no joint to drive.
     """
     spec = load_spec(path)
-    joints = [
-        joint
+    driven = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    motors = tuple(
+        Motor(joint=joint.name, effort=_effort(joint))
         for joint in spec.joints
-        if joint.name and joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    ]
-    if not joints:
+        if joint.name and joint.type in driven
+    )
+    if not motors:
         raise ModelError(f"{path}: the URDF has no revolute or prismatic joint that a motor drives")
 
-    root = ElementTree.Element("mujoco", model=f"{spec.modelname} with motors")
-    root.append(ElementTree.Comment(COMMENT))
-    asset = ElementTree.SubElement(root, "asset")
-    ElementTree.SubElement(asset, "model", name="robot", file=file)
-    world = ElementTree.SubElement(root, "worldbody")
-    ElementTree.SubElement(world, "attach", model="robot", prefix="")
+    return UrdfModel(name=spec.modelname, motors=motors, velocities=_velocities(path))
 
-    actuators = ElementTree.SubElement(root, "actuator")
-    for joint in joints:
-        attributes = {"name": joint.name, "joint": joint.name}
-        low, high = joint.actfrcrange
-        if low < high:
-            attributes["ctrlrange"] = f"{low:.9g} {high:.9g}"
-        ElementTree.SubElement(actuators, "motor", attributes)
 
-    ElementTree.indent(root)
-    text = ElementTree.tostring(root, encoding="unicode") + "\n"
-    return UrdfModel(text=text, velocities=_velocities(path))
+def _effort(joint: Any) -> tuple[float, float] | None:
+    """Range of the force on a joint; None without one."""
+    low, high = joint.actfrcrange
+    return (float(low), float(high)) if low < high else None
 
 
 def _velocities(path: Path) -> dict[str, float]:
