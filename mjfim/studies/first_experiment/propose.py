@@ -42,8 +42,15 @@ LAST_FREQUENCY = 2.0
 # Limit of a control without a range, relative to the amplitude of the chirp.
 CONTROL_LIMIT = 3.0
 
-# Time budget of a design [s].
-SECONDS = 40.0
+# Time budget of a design [s]. With the start of Python and the pictures, the verb takes less than a
+# minute.
+SECONDS = 30.0
+
+# Share of half of a range that the first motion keeps away from the ends of forces and positions.
+# Where a force is at its end, a small change of a parameter meets the clamp, and derivatives do not
+# exist. A control may rest at the end of its range.
+ROOM = 0.05
+WITHOUT_ROOM = ("control",)
 
 # Largest number of candidates whose information is computed.
 MOST_CANDIDATES = 48
@@ -260,7 +267,9 @@ class _Refinement:
         rest = self._begins_at_rest(system, lean)
 
         amplitudes = np.array(list(draft.amplitudes.values()))
-        kept = largest_feasible(amplitudes, lambda a: self._keeps_limits(system, lean, a))
+        kept = largest_feasible(amplitudes, lambda a: self._room(system, lean, a) >= ROOM)
+        if kept is None:
+            kept = largest_feasible(amplitudes, lambda a: self._room(system, lean, a) >= 0.0)
         remarks = []
         if kept is None:
             kept = rounded(amplitudes * SHRINKING**TRIALS)
@@ -304,15 +313,23 @@ class _Refinement:
         except MjfimError:
             return False
 
-    def _keeps_limits(self, system: System, draft: Proposal, amplitudes: Array) -> bool:
-        """Whether the chirp with some amplitudes keeps all limits at every engine step."""
+    def _room(self, system: System, draft: Proposal, amplitudes: Array) -> float:
+        """Smallest distance of the chirp with some amplitudes from the limits, at every engine step.
+
+        It is relative to half of the range, and negative where a limit is broken.
+        """
         names = list(draft.amplitudes)
         trial = replace(draft, amplitudes=dict(zip(names, amplitudes.tolist(), strict=True)))
         try:
             task = self._task(system, trial)
-            return verify(task, task.initial).is_feasible
+            found = verify(task, task.initial)
         except SimulationDivergedError:
-            return False
+            return -np.inf
+        if not found.is_feasible:
+            return -np.inf
+
+        kinds = found.relative_margins.keys() - found.unenforced - set(WITHOUT_ROOM)
+        return min((found.relative_margins[kind] for kind in kinds), default=np.inf)
 
     def _identified(self, draft: Proposal) -> Sequence[int]:
         """Indices of the candidates that the chirp identifies together."""

@@ -1,0 +1,354 @@
+"""Walk from model files to identified parameters by the command line, as a new user does.
+
+    python -m scripts.newcomer MODEL.xml MODEL.urdf -o out/newcomer
+
+For each model, in a folder of its own and without an edit: `mjfim init`, `check`, `design`,
+`simulate` of a robot whose parameters differ from those of the model, and `identify` from that
+recording, which begins with the values of the model. The claim of `design` that all limits hold is
+judged by plain MuJoCo at every engine step. The result is a table in Markdown (stdout) and
+newcomer.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import tomlkit
+
+# Difference between the parameters of the simulated robot and those of the model, relative to them.
+DIFFERENCE = 0.05
+
+# Longest time of one verb; none should come near to it [s].
+PATIENCE = 600.0
+
+# Excess beyond a limit that rounding explains, as a fraction of half of the range.
+ROUNDING = 1e-6
+
+# Files in the folder of a model.
+EXPERIMENT, ROBOT, LOG = "first.toml", "robot.toml", "log.csv"
+
+VERBS = ("init", "check", "design", "simulate", "identify")
+
+
+@dataclass(kw_only=True)
+class Walk:
+    """What happened to one model.
+
+    Attributes:
+        model: Name of the model.
+        edits: Edits of the experiment file that were needed; this script makes none.
+        codes: Exit codes by verb; None where a verb did not end in time.
+        seconds: Duration by verb, with the start of Python and the pictures [s].
+        messages: Last line on stderr of the verbs with another exit code than 0.
+        gain: Smallest eigenvalue of the information, optimized over initial; None without a design.
+        feasible_start: Whether the initial control keeps all limits.
+        claimed: Whether `design` says that all limits hold.
+        violations: What plain MuJoCo finds beyond its limit in the design.
+        inside: Number of true parameters inside their 95 % intervals.
+        parameters: Number of parameters.
+        misfit: Whether `identify` found a misfit.
+    """
+
+    model: str
+    edits: int = 0
+    codes: dict[str, int | None] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    messages: dict[str, str] = field(default_factory=dict)
+    gain: float | None = None
+    feasible_start: bool | None = None
+    claimed: bool | None = None
+    violations: list[str] = field(default_factory=list)
+    inside: int | None = None
+    parameters: int | None = None
+    misfit: bool | None = None
+
+    def row(self) -> list[str]:
+        """Cells of the table."""
+        return [
+            self.model,
+            str(self.edits),
+            *(self._cell(verb) for verb in ("init", "check", "design", "identify")),
+            self._gain(),
+            "—" if self.inside is None else f"{self.inside} of {self.parameters}",
+            self._limits(),
+        ]
+
+    def _cell(self, verb: str) -> str:
+        """Exit code and duration of a verb."""
+        if verb not in self.codes:
+            return "—"
+        code = self.codes[verb]
+        return f"{'no end' if code is None else code} ({self.seconds[verb]:.0f} s)"
+
+    def _gain(self) -> str:
+        """Gain of information; a start that breaks limits is no fair comparison."""
+        if self.gain is None:
+            return "—"
+        return f"{self.gain:.3g}" + ("" if self.feasible_start else " (start breaks limits)")
+
+    def _limits(self) -> str:
+        """Whether the limits hold."""
+        if self.claimed is None:
+            return "—"
+        if self.violations:
+            return f"no: {self.violations[0]}" if self.claimed else "not claimed"
+        return "yes" if self.claimed else "yes, not claimed"
+
+
+HEADER = (
+    "model",
+    "edits",
+    "init",
+    "check",
+    "design",
+    "identify",
+    "λ_min gain",
+    "within 95 %",
+    "limits held",
+)
+
+
+def markdown(walks: Sequence[Walk]) -> str:
+    """The table of all models."""
+    rows = [list(HEADER), ["---"] * len(HEADER), *(walk.row() for walk in walks)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + "\n"
+
+
+def walk(model: Path, folder: Path) -> Walk:
+    """Make all steps for one model.
+
+    Args:
+        model: The model file.
+        folder: Fresh folder for the files.
+    """
+    folder.mkdir(parents=True)
+    found = Walk(model=folder.name)
+    if _run(found, folder, "init", str(model.resolve()), "-o", EXPERIMENT) != 0:
+        return found
+    _run(found, folder, "check", EXPERIMENT)
+    if _run(found, folder, "design", EXPERIMENT, "-o", "design") not in (0, 1):
+        return found
+    _judge_design(found, folder)
+
+    _write_robot(folder)
+    simulated = ("simulate", ROBOT, "design/design.npz", "-o", LOG)
+    if _run(found, folder, *simulated) == 0:
+        _run(found, folder, "identify", EXPERIMENT, LOG, "-o", "fit")
+        _judge_estimate(found, folder)
+    return found
+
+
+def _run(found: Walk, folder: Path, verb: str, *words: str) -> int | None:
+    """Call a verb as a user does; keep its output, exit code and duration."""
+    specification = importlib.util.find_spec("mjfim")
+    home = Path(str(specification and specification.origin)).parents[1]
+    environment = {**os.environ, "PYTHONPATH": str(home)}
+    begun = time.perf_counter()
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-m", "mjfim", verb, *words],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            encoding="utf-8",
+            timeout=PATIENCE,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        code, said, result = None, f"no end after {PATIENCE:g} s", ""
+    else:
+        code, said, result = ended.returncode, ended.stderr, ended.stdout
+
+    found.codes[verb] = code
+    found.seconds[verb] = time.perf_counter() - begun
+    (folder / f"{verb}.txt").write_text(f"{result}\n{said}", encoding="utf-8")
+    if code != 0:
+        told = [line for line in said.splitlines() if line.startswith("mjfim: ")]
+        found.messages[verb] = (told or said.splitlines() or [""])[-1]
+    return code
+
+
+def _write_robot(folder: Path) -> None:
+    """Write the experiment of the simulated robot: the same with other true values."""
+    design = _read(folder / "design" / "design.json")
+    document = tomlkit.parse((folder / EXPERIMENT).read_text(encoding="utf-8"))
+    tables: Any = document["parameters"]
+    for name, value in zip(design["parameters"], design["theta"], strict=True):
+        tables[name]["true"] = (1.0 + DIFFERENCE) * value
+    (folder / ROBOT).write_text(tomlkit.dumps(document), encoding="utf-8")
+
+
+def _judge_estimate(found: Walk, folder: Path) -> None:
+    """Compare the estimate with the parameters of the simulated robot."""
+    file = folder / "fit" / "estimate.json"
+    if not file.is_file():
+        return
+    estimate = _read(file)
+    robot = tomllib.loads((folder / ROBOT).read_text(encoding="utf-8"))["parameters"]
+    true = np.array([robot[name]["true"] for name in estimate["parameters"]])
+    low, high = np.array(estimate["interval"])[: len(true)].T
+    found.inside = int(((low <= true) & (true <= high)).sum())
+    found.parameters = len(true)
+    found.misfit = bool(estimate["misfit"])
+
+
+def _judge_design(found: Walk, folder: Path) -> None:
+    """Compare the design with its start, and its claim with plain MuJoCo."""
+    design = _read(folder / "design" / "design.json")
+    smallest = [design[name]["eigenvalues"][0] for name in ("initial", "final")]
+    found.gain = smallest[1] / smallest[0] if smallest[0] > 0.0 else None
+    found.feasible_start = not design["limits"]["initial"]
+    found.claimed = bool(design["limits"]["satisfied"])
+
+    stated = tomllib.loads((folder / EXPERIMENT).read_text(encoding="utf-8"))
+    model = mujoco.MjModel.from_xml_path(str(folder / stated["model"]))
+    with np.load(folder / "design" / "design.npz") as arrays:
+        trajectory = {name: arrays[name] for name in ("t", "qpos", "qvel", "act", "ctrl")}
+    found.violations = violations(model, trajectory, stated.get("limits", {}))
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """Read a JSON file that holds one object."""
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return found
+
+
+def violations(
+    model: Any, trajectory: Mapping[str, np.ndarray], stated: Mapping[str, Any]
+) -> list[str]:
+    """Play a design in plain MuJoCo, and describe each range that it leaves.
+
+    Forces are those that the actuators ask for: a copy of the model without the clamps of forces
+    shows them in the states of the untouched model.
+
+    Args:
+        model: The untouched model (`mujoco.MjModel`).
+        trajectory: t, qpos, qvel, act and ctrl of design.npz.
+        stated: Table `limits` of the experiment file: ranges of controls and velocities by name.
+
+    Returns:
+        One sentence for each range.
+    """
+    unclamped = copy.copy(model)
+    unclamped.actuator_forcelimited[:] = 0
+    unclamped.jnt_actfrclimited[:] = 0
+    data, shown = mujoco.MjData(model), mujoco.MjData(unclamped)
+    data.qpos[:], data.qvel[:] = trajectory["qpos"][0], trajectory["qvel"][0]
+    data.act[:] = trajectory["act"][0]
+    times, worst = trajectory["t"], dict[str, tuple[float, float]]()
+
+    for k, ctrl in enumerate(trajectory["ctrl"]):
+        data.ctrl[:] = ctrl
+        steps = round((times[k + 1] - times[k]) / model.opt.timestep)
+        for _ in range(steps):
+            for name, excess in _excesses(model, unclamped, (data, shown), stated):
+                if excess > worst.get(name, (ROUNDING, 0.0))[0] or np.isnan(excess):
+                    worst[name] = (excess, float(data.time))
+            mujoco.mj_step(model, data)
+    return [
+        f"{name} by {100.0 * excess:.3g} % of half its range at {moment:.3g} s"
+        for name, (excess, moment) in worst.items()
+    ]
+
+
+def _excesses(
+    model: Any, unclamped: Any, simulations: tuple[Any, Any], stated: Mapping[str, Any]
+) -> Iterator[tuple[str, float]]:
+    """Name and excess of every limited quantity in the present state of a simulation."""
+    data, shown = simulations
+    shown.qpos[:], shown.qvel[:], shown.act[:] = data.qpos, data.qvel, data.act
+    shown.ctrl[:] = data.ctrl
+    mujoco.mj_forward(unclamped, shown)
+
+    scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    for i in range(model.njnt):
+        if int(model.jnt_type[i]) not in scalar:
+            continue
+        name, v = model.joint(i).name or str(i), int(model.jnt_dofadr[i])
+        if model.jnt_limited[i]:
+            position = data.qpos[int(model.jnt_qposadr[i])]
+            yield f"position of {name}", _excess(position, model.jnt_range[i])
+        if model.jnt_actfrclimited[i]:
+            yield f"force at {name}", _excess(shown.qfrc_actuator[v], model.jnt_actfrcrange[i])
+        if name in stated.get("velocity", {}):
+            bound = stated["velocity"][name]
+            ends = bound if isinstance(bound, list) else (-bound, bound)
+            yield f"velocity of {name}", _excess(data.qvel[v], ends)
+
+    for i in range(model.nactuator):
+        name = model.actuator(i).name or str(i)
+        control, force = int(model.actuator_ctrladr[i]), int(model.actuator_outadr[i])
+        if model.actuator_forcelimited[i] and int(model.actuator_outnum[i]) == 1:
+            range_ = model.actuator_forcerange[i]
+            yield f"force of {name}", _excess(shown.actuator_force[force], range_)
+        if model.actuator_ctrllimited[control]:
+            range_ = model.actuator_ctrlrange[control]
+            yield f"control of {name}", _excess(data.ctrl[control], range_)
+        if name in stated.get("control", {}):
+            bound = stated["control"][name]
+            ends = bound if isinstance(bound, list) else (-bound, bound)
+            yield f"control of {name}", _excess(data.ctrl[control], ends)
+
+
+def _excess(value: float, ends: Sequence[float]) -> float:
+    """Excess of a value beyond a range, as a fraction of half of the range; negative inside."""
+    low, high = ends
+    return float(max(low - value, value - high) / (0.5 * (high - low)))
+
+
+def _names(models: Sequence[Path]) -> list[str]:
+    """A name for each model that no other one has: that of the file, else with its folder."""
+    stems = [model.stem for model in models]
+    return [
+        stem if stems.count(stem) == 1 else f"{model.resolve().parent.name}_{stem}"
+        for model, stem in zip(models, stems, strict=True)
+    ]
+
+
+def main() -> int:
+    """Walk through all models, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="MJCF or URDF")
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/newcomer"))
+    parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
+    options = parser.parse_args()
+
+    walks = []
+    for model, name in zip(options.models, _names(options.models), strict=True):
+        folder = options.output / name
+        if folder.exists():
+            parser.error(f"{folder} exists; every model needs a fresh folder")
+        walks.append(walk(model, folder))
+        print(f"{name}: {walks[-1].codes}", file=sys.stderr)
+        record = json.dumps([asdict(each) for each in walks], indent=2, ensure_ascii=False)
+        (options.output / "newcomer.json").write_text(record + "\n", encoding="utf-8")
+
+    print(record if options.json else markdown(walks))
+    return 0 if all(_is_done(each) for each in walks) else 1
+
+
+def _is_done(found: Walk) -> bool:
+    """Whether the walk went to its end, and no claim was wrong."""
+    ended = [found.codes.get(verb) in (0, 1) for verb in VERBS]
+    return all(ended) and not (found.claimed and found.violations)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

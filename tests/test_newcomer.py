@@ -1,0 +1,70 @@
+"""The walk of a newcomer: its judge finds what plain MuJoCo shows, and its table says it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from scripts.newcomer import Walk, markdown, violations
+
+SERVO = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 0"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="hinge" axis="0 1 0" range="-60 60" damping="1"/>
+      <geom size="0.1" mass="1" pos="0.5 0 0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="servo" joint="hinge" kp="20" ctrlrange="-2 2" forcerange="-5 5"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def judged(amplitude: float, stated: dict[str, object] | None = None) -> list[str]:
+    """Violations of a servo that follows one slow wave [rad]."""
+    model = mujoco.MjModel.from_xml_string(SERVO)
+    t = 0.01 * np.arange(401)
+    trajectory = {
+        "t": t,
+        "qpos": np.zeros((401, 1)),
+        "qvel": np.zeros((401, 1)),
+        "act": np.zeros((401, 0)),
+        "ctrl": amplitude * np.sin(0.5 * np.pi * t[:-1, None]),
+    }
+    return violations(model, trajectory, stated or {})
+
+
+def test_the_judge_sees_each_kind_of_limit() -> None:
+    assert judged(0.2) == []
+    assert [text.split(" by ")[0] for text in judged(1.2)] == ["position of hinge"]
+
+    stated = {"velocity": {"hinge": 0.1}, "control": {"servo": [-0.1, 0.3]}}
+    found = {text.split(" by ")[0] for text in judged(0.2, stated)}
+    assert found == {"velocity of hinge", "control of servo"}
+
+    # MuJoCo clamps the force; the judge sees what the servo asks for.
+    kinds = {text.split(" by ")[0] for text in judged(2.5)}
+    assert {"force of servo", "control of servo", "position of hinge"} == kinds
+
+
+def test_the_table_has_a_row_for_each_model() -> None:
+    done = Walk(
+        model="arm",
+        codes={"init": 0, "check": 1, "design": 0, "identify": None},
+        seconds={"init": 2.0, "check": 3.4, "design": 50.0, "identify": 600.0},
+        gain=12.34,
+        feasible_start=False,
+        claimed=True,
+        violations=["force of servo by 3 % of half its range at 1 s"],
+        inside=9,
+        parameters=10,
+    )
+    refused = Walk(model="odd", codes={"init": 2}, seconds={"init": 1.0})
+    lines = markdown([done, refused]).splitlines()
+    assert len(lines) == 4
+    assert lines[2].startswith("| arm | 0 | 0 (2 s) | 1 (3 s) | 0 (50 s) | no end (600 s) |")
+    assert "12.3 (start breaks limits) | 9 of 10 | no: force of servo" in lines[2]
+    assert lines[3] == "| odd | 0 | 2 (1 s) | — | — | — | — | — | — |"
