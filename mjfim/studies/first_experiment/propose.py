@@ -314,7 +314,7 @@ class _Refinement:
             return False
 
     def _room(self, system: System, draft: Proposal, amplitudes: Array) -> float:
-        """Smallest distance of the chirp with some amplitudes from the limits, at every engine step.
+        """Smallest distance of the chirp with some amplitudes from the limits in any engine step.
 
         It is relative to half of the range, and negative where a limit is broken.
         """
