@@ -134,6 +134,8 @@ def _values(field: Schema, tables: Schema) -> str:
         return f"`{json.dumps(field['const'])}`"
     if "enum" in field:
         return ", ".join(f"`{json.dumps(value)}`" for value in field["enum"])
+    if field.get("format") == "quantity":
+        return "text with unit"
     if field["type"] == "array":
         return _array(field, tables)
     if field["type"] == "object":

@@ -15,6 +15,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, Verification
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.stated_units import probable_degrees
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.parallel import one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
@@ -233,3 +234,4 @@ def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
                 "design: it may run into them"
             )
     yield from unlimited_elements(task.system.model, experiment.limits)
+    yield from probable_degrees(experiment, task.system.source)

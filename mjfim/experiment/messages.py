@@ -93,7 +93,7 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
     # faults of the chosen kind are shown.
     only_types = fault["type"].endswith(WRONG_TYPE)
     shown_faults = [f for f in faults if only_types or f["type"] == fault["type"]]
-    first, *others = dict.fromkeys(_message(f) for f in shown_faults)
+    first, *others = dict.fromkeys(_message(f, table) for f in shown_faults)
     alternatives = [first, *(message.removeprefix("should be ") for message in others)]
 
     given = fault.get("input")
@@ -102,12 +102,15 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
     return " or ".join(alternatives) + shown
 
 
-def _message(fault: Mapping[str, Any]) -> str:
-    """Message of pydantic about one fault, in the words of the experiment file."""
+def _message(fault: Mapping[str, Any], table: type[BaseModel]) -> str:
+    """Message of pydantic about one fault, in the words of the experiment file.
+
+    table: the model that was validated.
+    """
     kind = fault["type"]
 
     if kind in ("dict_type", "model_type"):
-        return "should be a table"
+        return "should be a table" + _example_of(table, fault["loc"])
     if kind == "tuple_type":
         return "should be a list"
     if kind in ("bool_type", "bool_parsing"):
@@ -122,6 +125,18 @@ def _message(fault: Mapping[str, Any]) -> str:
         .replace("Input should be a valid ", "should be a ")
         .replace("Input should", "should")
     )
+
+
+def _example_of(table: type[BaseModel], location: Sequence[str | int]) -> str:
+    """Example of a key's value that ends a message; empty where its table has none."""
+    _, parent = _walk(table, location[:-1])
+    fields = getattr(parent, "model_fields", {})
+    field = fields.get(str(location[-1]))
+    if field is None or not field.examples:
+        return ""
+
+    entries = [f"{name} = {value}" for name, value in field.examples[0].items()]
+    return f" by name, for example {{ {', '.join(entries)} }}"
 
 
 def _walk(table: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], Any]:

@@ -52,7 +52,7 @@ def resolve_outputs(
     Raises:
         ExperimentError: A key of the tables is not valid for the model; the message names it.
     """
-    columns_of_key = _columns_of_keys(coordinates)
+    columns_of_key = columns_of_keys(coordinates)
     stated = dict(experiment.noise) or _noise_of_mjcf(
         coordinates, required=not experiment.correlated
     )
@@ -163,7 +163,7 @@ class _NoiseTable:
         self.measured.update(rows.tolist())
 
 
-def _columns_of_keys(coordinates: ModelCoordinates) -> dict[str, list[str]]:
+def columns_of_keys(coordinates: ModelCoordinates) -> dict[str, list[str]]:
     """Columns for which each key of the table `noise` is valid."""
     found: dict[str, list[str]] = {"state": [component.name for component in coordinates.state]}
     for component in coordinates.state:

@@ -16,7 +16,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.messages import explain, valid_keys
 from mjfim.experiment.system_tables import Correlated, Initial, NoiseSpec, Nuisance, ParameterSpec
 from mjfim.experiment.task_tables import Boundary, Cost, Descent, FitSpec, Limits, Robust
-from mjfim.recordings.spec import Positive, RecordingSpec, Section
+from mjfim.recordings.spec import Hertz, PositiveWithUnit, RecordingSpec, Seconds, Section
 
 ONLY_IN_PYTHON = ("function",)  # Keys of a parameter that a file cannot state.
 RESERVED = ("directory", "source")  # Attributes of an experiment that are no keys of the file.
@@ -32,24 +32,24 @@ class Experiment(Section):
     """
 
     model: str = Field(description="Path of the MJCF file, relative to the experiment file.")
-    rate: Positive = Field(
+    rate: Hertz = Field(
         description=(
             "Rate of the samples and of the control updates [Hz]. One sample is a whole number of "
             "engine time steps."
         )
     )
-    measure_rate: Positive | None = Field(
+    measure_rate: Hertz | None = Field(
         default=None,
         description="Rate of the measurements [Hz]; it divides `rate`. Default: `rate`.",
     )
-    playback_rate: Positive | None = Field(
+    playback_rate: Hertz | None = Field(
         default=None,
         description=(
             "Rate of the rows of design.csv, that of the robot's controller [Hz]; a multiple of "
             "`rate`. Default: `rate`."
         ),
     )
-    horizon: Positive | None = Field(
+    horizon: Seconds | None = Field(
         default=None,
         description=(
             "Duration of a designed experiment [s], a whole number of samples. Identification "
@@ -66,7 +66,7 @@ class Experiment(Section):
             "theta."
         ),
     )
-    noise: dict[str, Positive | NoiseSpec] = Field(
+    noise: dict[str, PositiveWithUnit | NoiseSpec] = Field(
         default_factory=dict,
         description=(
             "Measured outputs: standard deviation of the noise [output unit] or a table, by "

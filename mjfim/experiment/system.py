@@ -20,6 +20,7 @@ from mjfim.experiment.initial_state import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.parameters import MeasurementSizes, resolve_parameters
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.loading import ModelSource
@@ -97,6 +98,7 @@ class System:
         if source is None:
             source = ModelSource(experiment.directory / experiment.model)
         _require_supported(source)
+        require_units(experiment, source)
         model = source.model
 
         # What the experiment states, checked against the model. The time grid comes first, because

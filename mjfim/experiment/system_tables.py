@@ -11,14 +11,24 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SkipValidation, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from mjfim.recordings.spec import Boolean, Finite, Integer, Positive, Range, Section
+from mjfim.recordings.spec import (
+    Boolean,
+    Finite,
+    FiniteWithUnit,
+    Hertz,
+    Integer,
+    PositiveWithUnit,
+    RangeWithUnit,
+    Seconds,
+    Section,
+)
 
 Matrix = tuple[tuple[Finite, ...], ...]
 
 # Largest number of harmonics of a multisine.
 MAX_HARMONICS = 10_000
 
-PriorOrUnknown = Positive | Literal[True]
+PriorOrUnknown = PositiveWithUnit | Literal[True]
 
 
 class Signal(Section):
@@ -34,26 +44,26 @@ class Signal(Section):
             "with random phases."
         )
     )
-    amplitude: Finite | dict[str, Finite] = Field(
+    amplitude: FiniteWithUnit | dict[str, FiniteWithUnit] = Field(
         default=1.0,
         description=(
             "Amplitude [actuator unit], one number for all actuators or a table by actuator name."
         ),
     )
-    offset: Finite | dict[str, Finite] | None = Field(
+    offset: FiniteWithUnit | dict[str, FiniteWithUnit] | None = Field(
         default=None,
         description=(
             "Constant that is added [actuator unit], one number or a table by actuator name. "
             "Default: the control of the initial keyframe, 0 without a keyframe."
         ),
     )
-    frequency: Positive = Field(
+    frequency: Hertz = Field(
         default=0.5,
         description=(
             "Frequency of a sine, first frequency of a chirp, base frequency of a multisine [Hz]."
         ),
     )
-    frequency_end: Positive | None = Field(
+    frequency_end: Hertz | None = Field(
         default=None,
         description="Last frequency of a chirp [Hz]. Default: five times `frequency`.",
     )
@@ -75,14 +85,14 @@ class Initial(Section):
             "It excludes `qpos`, `qvel` and `act`."
         ),
     )
-    qpos: tuple[Finite, ...] | None = Field(
+    qpos: tuple[FiniteWithUnit, ...] | None = Field(
         default=None,
         description=(
             "Initial positions, nq numbers [m, rad, quaternions as w x y z]. Default: the model's "
             "reference positions."
         ),
     )
-    qvel: tuple[Finite, ...] | None = Field(
+    qvel: tuple[FiniteWithUnit, ...] | None = Field(
         default=None, description="Initial velocities, nv numbers [m/s or rad/s]. Default: 0."
     )
     act: tuple[Finite, ...] | None = Field(
@@ -116,7 +126,7 @@ class TargetSpec(Section):
     scale: Finite = Field(
         default=1.0, description="Factor by which the parameter is multiplied; it must not be 0."
     )
-    offset: Finite = Field(
+    offset: FiniteWithUnit = Field(
         default=0.0, description="Constant that is added [unit of the number inside the model]."
     )
 
@@ -166,21 +176,21 @@ class ParameterSpec(Section):
             "barycentric, in which the dynamics are linear. Default: `logcholesky`."
         ),
     )
-    guess: Finite | None = Field(
+    guess: FiniteWithUnit | None = Field(
         default=None,
         description=(
             "Value for which the design is made and from which the fit starts [parameter unit]. "
             "Default: the value in the model."
         ),
     )
-    true: Finite | None = Field(
+    true: FiniteWithUnit | None = Field(
         default=None,
         description=(
             "Value that `simulate` and `montecarlo` use as the true one [parameter unit]. Default: "
             "the guess."
         ),
     )
-    bounds: Range | None = Field(
+    bounds: RangeWithUnit | None = Field(
         default=None,
         description=(
             "Lower and upper bound of the estimate [parameter unit]. Default: what physics allows: "
@@ -188,7 +198,7 @@ class ParameterSpec(Section):
             "State a negative lower bound to allow negative values."
         ),
     )
-    scale: Positive | Literal["guess"] | None = Field(
+    scale: PositiveWithUnit | Literal["guess"] | None = Field(
         default=None,
         description=(
             "Unit in which the criterion measures the error: a number [parameter unit], or "
@@ -196,7 +206,7 @@ class ParameterSpec(Section):
             "Default: the guess or the natural size of the quantity, whichever is larger."
         ),
     )
-    prior: Positive | None = Field(
+    prior: PositiveWithUnit | None = Field(
         default=None,
         description=(
             "Standard deviation with which the guess is known before the experiment [parameter "
@@ -222,7 +232,7 @@ class ParameterSpec(Section):
             "Each recording has a separate value of this parameter. It needs `nuisance = true`."
         ),
     )
-    wanted: Positive | None = Field(
+    wanted: PositiveWithUnit | None = Field(
         default=None,
         description=(
             "Target for the standard deviation [parameter unit], which `check`, `design "
@@ -304,7 +314,7 @@ class ParameterSpec(Section):
 class NoiseSpec(Section):
     """Noise of one output, or of the components of one sensor."""
 
-    sigma: Positive | tuple[Positive, ...] | None = Field(
+    sigma: PositiveWithUnit | tuple[PositiveWithUnit, ...] | None = Field(
         default=None,
         description=(
             "Standard deviation [output unit], one number or one per component. It excludes "
@@ -318,7 +328,7 @@ class NoiseSpec(Section):
             "excludes `sigma`."
         ),
     )
-    rate: Positive | None = Field(
+    rate: Hertz | None = Field(
         default=None,
         description=(
             "Rate at which this output is measured [Hz]; it divides `rate`. Default: "
@@ -370,7 +380,7 @@ class Nuisance(Section):
             "output. Default: none."
         ),
     )
-    delay: PriorOrUnknown | None = Field(
+    delay: Seconds | Literal[True] | None = Field(
         default=None, description="Delay of all outputs [s]. Default: none."
     )
     per_recording: Boolean = Field(

@@ -12,10 +12,15 @@ from pydantic import Field, model_validator
 from mjfim.recordings.spec import (
     Boolean,
     Finite,
+    FiniteWithUnit,
+    Hertz,
     Integer,
+    Metres,
     NonNegative,
     Positive,
-    Range,
+    PositiveWithUnit,
+    RangeWithUnit,
+    Seconds,
     Section,
 )
 
@@ -64,7 +69,7 @@ class Cost(Section):
             "name. 0 is allowed where a hard limit bounds the control."
         ),
     )
-    control_about: Finite | dict[str, Finite] | None = Field(
+    control_about: FiniteWithUnit | dict[str, FiniteWithUnit] | None = Field(
         default=None,
         description=(
             "Control that costs nothing [actuator unit], one number or a table by actuator name. "
@@ -151,7 +156,7 @@ class Descent(Section):
         le=MAX_ITERATIONS,
         description="Largest number of iterations from one initial control.",
     )
-    seconds: Positive | None = Field(
+    seconds: Seconds | None = Field(
         default=None,
         description=(
             "Time after which the best design found is returned [s]. Default: 120 s for the "
@@ -180,7 +185,7 @@ class Descent(Section):
             "design is repeated."
         ),
     )
-    fourier: tuple[Positive, ...] = Field(
+    fourier: tuple[Hertz, ...] = Field(
         default=(),
         description=(
             "Base frequencies [Hz] of Fourier series that serve as further initial controls. The "
@@ -220,23 +225,27 @@ class Limits(Section):
     number. A number instead of a table holds for all names.
     """
 
-    position: dict[str, Range] = Field(
-        default_factory=dict, description="Range of a joint position by joint name [m or rad]."
+    position: dict[str, RangeWithUnit] = Field(
+        default_factory=dict,
+        description="Range of a joint position by joint name [m or rad].",
+        examples=[{"hinge": [-1.0, 1.0]}],
     )
-    velocity: Positive | dict[str, Positive | Range] = Field(
+    velocity: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
         default_factory=dict, description="Limit of the joint velocities [m/s or rad/s]."
     )
-    acceleration: Positive | dict[str, Positive | Range] = Field(
+    acceleration: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
         default_factory=dict,
         description=(
             "Limit of the joint accelerations [m/s² or rad/s²]: the change of the velocity over "
             "each engine step, divided by the timestep."
         ),
     )
-    control: dict[str, Range] = Field(
-        default_factory=dict, description="Range of a control by actuator name [actuator unit]."
+    control: dict[str, RangeWithUnit] = Field(
+        default_factory=dict,
+        description="Range of a control by actuator name [actuator unit].",
+        examples=[{"motor": [-5.0, 5.0]}],
     )
-    control_rate: Positive | dict[str, Positive | Range] = Field(
+    control_rate: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
         default_factory=dict,
         description=(
             "Limit of the change of the controls from one row of design.csv to the next, over the "
@@ -244,14 +253,14 @@ class Limits(Section):
             "of k times `rate` divides the allowed change from sample to sample by k."
         ),
     )
-    force: Positive | dict[str, Positive | Range] = Field(
+    force: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
         default_factory=dict,
         description=(
             "Limit of the actuator forces [N or N m], at the beginning and at the end of each "
             "engine step, as MuJoCo's force sensors read them."
         ),
     )
-    clearance: Positive | None = Field(
+    clearance: Metres | None = Field(
         default=None,
         description=(
             "Smallest allowed distance of the robot to itself and to its surroundings [m], "
@@ -261,7 +270,7 @@ class Limits(Section):
     ignored: tuple[tuple[str, str], ...] = Field(
         default=(), description="Pairs of bodies that may come closer than `clearance`."
     )
-    bandwidth: Positive | None = Field(
+    bandwidth: Hertz | None = Field(
         default=None,
         description=(
             "Bandwidth of the control [Hz]: it becomes a cubic spline with a knot every 1 / (2 "
@@ -311,10 +320,10 @@ class Boundary(Section):
             "state."
         ),
     )
-    position: Positive = Field(
+    position: PositiveWithUnit = Field(
         default=1e-2, description="Largest deviation of the final positions [m or rad]."
     )
-    velocity: Positive = Field(
+    velocity: PositiveWithUnit = Field(
         default=2e-2, description="Largest deviation of the final velocities [m/s or rad/s]."
     )
 
@@ -331,7 +340,7 @@ class Boundary(Section):
 class FitSpec(Section):
     """Segments, loss, noise and initial guesses with which parameters are fitted to recordings."""
 
-    segments: Positive | None = Field(
+    segments: Seconds | None = Field(
         default=None,
         description=(
             "Recordings are cut into segments of this length [s], each with an unknown initial "
@@ -381,7 +390,7 @@ class FitSpec(Section):
         le=MAX_ITERATIONS,
         description="Largest number of iterations from one initial guess.",
     )
-    blocks: Positive | None = Field(
+    blocks: Seconds | None = Field(
         default=None,
         description=(
             "Length of the blocks of the bootstrap and the sandwich covariance [s]; residuals "

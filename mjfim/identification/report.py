@@ -12,6 +12,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.errors import listed
+from mjfim.experiment.stated_units import probable_degrees
 from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
@@ -279,6 +280,7 @@ def _warnings(findings: _Findings) -> Iterator[str]:
     yield from _warnings_of_misfit(findings)
     yield from _warnings_of_recordings(findings)
     yield from _warnings_of_bounds(findings)
+    yield from probable_degrees(result.task.system.experiment, result.task.system.source)
 
     # Where the misfit is, and where it may come from.
     if findings.reasons and findings.quality.worst_residual is not None:

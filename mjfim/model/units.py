@@ -1,4 +1,4 @@
-"""Units of joints, sensors, controls and model fields: every unit table of the package.
+"""Units of joints, sensors, controls and model fields: every table of the units of a model.
 
 The units of the ten inertial parameters of a body are defined in `mjfim.model.inertia`.
 """
@@ -117,6 +117,21 @@ def sensor_unit(model: Any, sensor: int) -> str:
         return per_second(joint_unit(model, int(model.sensor_objid[sensor])))
 
     return SENSOR_UNITS.get(kind, "")
+
+
+def force_unit(model: Any, actuator: int) -> str:
+    """Unit of the force of an actuator.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        actuator: Number of the actuator.
+
+    Returns:
+        The unit; empty where the actuator does not act on a joint.
+    """
+    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+        return ""
+    return FORCE_UNITS[joint_unit(model, int(model.actuator_trnid[actuator, 0]))]
 
 
 def control_unit(model: Any, actuator: int) -> str:

@@ -10,7 +10,7 @@ are removed from the values.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import mujoco
 import numpy as np
@@ -20,22 +20,18 @@ from mjfim.errors import ExperimentError, RecordingError, unknown
 from mjfim.model.coordinates import sensor_columns, state_components
 from mjfim.model.elements import identifier, names_of
 from mjfim.model.units import sensor_unit
+from mjfim.quantities import TURN, Unit, units_like
 from mjfim.recordings.formats.table import Table
-from mjfim.recordings.spec import ColumnSpec
-
-# One turn [rad].
-TURN = 2.0 * np.pi
-
-# Factors that convert the units of a log to the model's unit, by the model's unit.
-FACTORS = {
-    "rad": {"rad": 1.0, "deg": TURN / 360.0, "rev": TURN},
-    "rad/s": {"rad/s": 1.0, "deg/s": TURN / 360.0, "rev/s": TURN, "rpm": TURN / 60.0},
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    "m/s": {"m/s": 1.0, "mm/s": 1e-3},
-}
+from mjfim.recordings.spec import ColumnSpec, LogUnit
 
 # Factor that converts each unit of a log to the model's unit.
-UNIT_FACTORS = {unit: factor for table in FACTORS.values() for unit, factor in table.items()}
+UNIT_FACTORS = {unit: Unit.parse(unit).factor for unit in get_args(LogUnit)}
+
+# Units of a log that fit to each unit of the model.
+VALID_UNITS = {
+    unit: [name for name in UNIT_FACTORS if name in units_like(unit)]
+    for unit in ("rad", "rad/s", "m", "m/s")
+}
 
 # Sensors that measure an angle or a length, depending on the actuator; any unit is accepted.
 SENSORS_OF_ANY_UNIT = (
@@ -82,7 +78,7 @@ def check_unit(where: str, spec: ColumnSpec, unit: str) -> None:
     Raises:
         ExperimentError: The unit does not fit, or a quantity that is not an angle is unwrapped.
     """
-    valid = list(UNIT_FACTORS) if unit == "any" else list(FACTORS.get(unit, {}))
+    valid = list(UNIT_FACTORS) if unit == "any" else VALID_UNITS.get(unit, [])
     if spec.unit is not None and spec.unit not in valid:
         raise ExperimentError(
             f"{where}.unit: {unknown('unit', spec.unit, valid)}; use scale for any other unit"

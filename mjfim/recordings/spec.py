@@ -7,6 +7,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from mjfim.quantities import WithUnit
+
 # Sizes between which the squares and quotients of numbers neither vanish nor overflow. No physical
 # quantity in any unit is outside.
 SMALLEST_SIZE = 1e-100
@@ -36,6 +38,23 @@ Integer = Annotated[int, Field(strict=True)]
 Boolean = Annotated[bool, Field(strict=True)]
 Range = tuple[Bound, Bound]
 
+# Numbers that may be stated with a unit, which `System` compares with that of the model.
+PositiveWithUnit = Annotated[Positive, WithUnit()]
+FiniteWithUnit = Annotated[Finite, WithUnit()]
+RangeWithUnit = tuple[Annotated[Bound, WithUnit()], Annotated[Bound, WithUnit()]]
+
+# Numbers whose unit is always the same.
+Seconds = Annotated[Positive, WithUnit("s")]
+Hertz = Annotated[Positive, WithUnit("Hz")]
+Metres = Annotated[Positive, WithUnit("m")]
+Period = tuple[Annotated[Bound, WithUnit("s")], Annotated[Bound, WithUnit("s")]]
+
+
+# Units that a column of a log may have; their factors are in `mjfim.quantities`.
+LogUnit = Literal[
+    "rad", "deg", "rev", "rad/s", "deg/s", "rev/s", "rpm", "m", "cm", "mm", "m/s", "mm/s"
+]
+
 
 class Section(BaseModel):
     """A table of the experiment file; it is immutable and refuses unknown keys.
@@ -58,12 +77,9 @@ class ColumnSpec(Section):
     renamed_keys = {"times": "multiply_by"}
 
     column: str = Field(description="Name of the column in the log.")
-    unit: (
-        Literal[
-            "rad", "deg", "rev", "rad/s", "deg/s", "rev/s", "rpm", "m", "cm", "mm", "m/s", "mm/s"
-        ]
-        | None
-    ) = Field(default=None, description="Unit of the column in the log. Default: the model's unit.")
+    unit: LogUnit | None = Field(
+        default=None, description="Unit of the column in the log. Default: the model's unit."
+    )
     scale: Finite = Field(
         default=1.0, description="Factor by which the raw numbers are multiplied."
     )
@@ -116,13 +132,13 @@ class RecordingSpec(Section):
             "Topics of the joint states of a ROS bag. Default: the only such topic in the bag."
         ),
     )
-    window: Range | None = Field(
+    window: Period | None = Field(
         default=None,
         description=(
             "First and last time that are used, counted from the first row [s]. Default: all rows."
         ),
     )
-    gap: Positive = Field(
+    gap: Seconds = Field(
         default=0.1,
         description="Longest accepted gap in the time stamps or in a column [s].",
     )

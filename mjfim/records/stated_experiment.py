@@ -73,6 +73,7 @@ class StatedExperiment:
         controls: Names of the controls.
         limits: The limits of a design, the ranges of the MJCF among them.
         missing: Keys that `check` and `design` need and that the file does not state.
+        warnings: Numbers that are possible but probably not meant, in words.
     """
 
     source: str
@@ -84,6 +85,7 @@ class StatedExperiment:
     controls: tuple[str, ...]
     limits: tuple[StatedLimit, ...]
     missing: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of `mjfim validate --json`."""

@@ -17,6 +17,7 @@ from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
 from mjfim.identification.fit_memory import require_memory_for_recordings
 from mjfim.identification.residuals import FitProblem
@@ -303,7 +304,7 @@ class _Assessment:
             not_separable=found.groups_along_all,
             not_excited=not_excited,
             self_test=self.tested,
-            verdict=tuple(verdict.sentences()),
+            verdict=(*verdict.sentences(), *_probable_degrees(task)),
             combined=combined,
             missing=self.missing,
         )
@@ -392,6 +393,11 @@ class _Assessment:
             else:
                 low = middle
         return high
+
+
+def _probable_degrees(task: DesignTask) -> tuple[str, ...]:
+    """Warnings about angles of the experiment that look like degrees."""
+    return probable_degrees(task.experiment, task.system.source)
 
 
 def _confounded_pairs(names: Sequence[str], correlation: Array) -> tuple[ConfoundedPair, ...]:

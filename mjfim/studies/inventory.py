@@ -15,7 +15,7 @@ from mjfim.model.coordinates import actuator_names
 from mjfim.model.elements import identifier, names_of, unique_names, unnamed_count
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import INERTIAL_FIELDS, MODEL_ARRAYS, fields_of, resolve, unit_of
-from mjfim.model.units import FORCE_UNITS, control_unit, joint_unit, sensor_unit
+from mjfim.model.units import FORCE_UNITS, control_unit, force_unit, sensor_unit
 from mjfim.records.inventory import (
     Inventory,
     ListedActuator,
@@ -198,10 +198,7 @@ def _limit_unit(source: ModelSource, limit: Limit) -> str:
         return control_unit(model, _actuator_of_control(model)[limit.index])
 
     if limit.kind == "force":
-        actuator = actuator_names(model).index(limit.name)
-        if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-            return ""
-        return FORCE_UNITS[joint_unit(model, int(model.actuator_trnid[actuator, 0]))]
+        return force_unit(model, actuator_names(model).index(limit.name))
 
     unit = next(
         joint.unit for joint in source.coordinates.scalar_joints if joint.name == limit.name

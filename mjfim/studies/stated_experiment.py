@@ -5,6 +5,7 @@ from __future__ import annotations
 from mjfim.excitation.limits import limits_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
 from mjfim.records.stated_experiment import (
     StatedExperiment,
@@ -67,4 +68,5 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
             for limit in limits
         ),
         missing=tuple(missing),
+        warnings=probable_degrees(experiment, system.source),
     )

@@ -24,6 +24,7 @@ def describe_experiment(stated: StatedExperiment) -> Summary:
     parts: list[Part] = [_parameters(stated), _outputs(stated)]
     if stated.limits:
         parts.append(_limits(stated))
+    parts += [Paragraph(text=f"Warning: {sentence}") for sentence in stated.warnings]
     parts.append(Paragraph(text=_verdict(stated)))
     return Summary(title=stated.source, outcome="", parts=tuple(parts))
 
