@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mjfim.experiment.simulate import simulate
     from mjfim.identification.cross_validation import predict
     from mjfim.identification.identify import identify
+    from mjfim.output.robot.export import export_design
     from mjfim.parallel import Pool
     from mjfim.records.campaign import Campaign
     from mjfim.records.check import Check
@@ -60,6 +61,7 @@ __all__ = [
     "design",
     "design_jointly",
     "evaluate",
+    "export_design",
     "identify",
     "monte_carlo",
     "predict",
@@ -83,6 +85,7 @@ MODULES = {
     "simulate": "mjfim.experiment.simulate",
     "predict": "mjfim.identification.cross_validation",
     "identify": "mjfim.identification.identify",
+    "export_design": "mjfim.output.robot.export",
     "Pool": "mjfim.parallel",
     "Campaign": "mjfim.records.campaign",
     "Check": "mjfim.records.check",

@@ -14,6 +14,7 @@ from mjfim.cli import (  # noqa: F401 - each registers its verbs
     check,
     compare,
     design,
+    export,
     export_sysid,
     identify,
     init,
@@ -38,6 +39,7 @@ ORDER = (
     "compare",
     "robustness",
     "campaign",
+    "export",
     "export-sysid",
     "replay",
 )

@@ -25,6 +25,10 @@ from mjfim.recordings.spec import RecordingSpec
 # Type of the messages that are read; all other messages are ignored.
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
+# Topic of the controls that were sent: joint states that have the names of the controls, and the
+# controls as efforts. mjfim writes it, and a program that plays a design may publish it.
+CONTROL_TOPIC = "/mjfim/control"
+
 # Fields of a joint state that become columns.
 QUANTITIES = ("position", "velocity", "effort")
 
@@ -48,10 +52,13 @@ class _Layout:
 
     def column_names(self, with_topic: bool) -> list[str]:
         """Names of the columns, in the order of a message's numbers."""
-        prefix = f"{self.topic}:" if with_topic else ""
-        return [
-            f"{prefix}{quantity}:{joint}" for quantity in self.quantities for joint in self.joints
-        ]
+        is_control = self.topic == CONTROL_TOPIC
+        prefix = f"{self.topic}:" if with_topic or is_control else ""
+        labels = {quantity: f"{prefix}{quantity}" for quantity in QUANTITIES}
+        if is_control:
+            labels["effort"] = "ctrl"
+
+        return [f"{labels[name]}:{joint}" for name in self.quantities for joint in self.joints]
 
 
 @dataclass(kw_only=True)
@@ -72,7 +79,8 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
 
     The columns are `t` [s after the first stamp] and `position:<joint>`, `velocity:<joint>`,
     `effort:<joint>`. If several topics are read, their names begin with the topic, as in
-    `<topic>:position:<joint>`, and the rows of all topics are merged by time.
+    `<topic>:position:<joint>`, and the rows of all topics are merged by time. The efforts of the
+    topic `CONTROL_TOPIC`, which is always read beside the only other one, are `ctrl:<name>`.
 
     Args:
         path: The folder of the bag, or its file.
@@ -90,8 +98,8 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
             f"{path}: recording.time_unit: the time of a bag is in seconds; leave this key out"
         )
 
-    rosbag2 = _library(path, "rosbags.rosbag2")
-    typesys = _library(path, "rosbags.typesys")
+    rosbag2 = rosbags_module(path, "rosbags.rosbag2")
+    typesys = rosbags_module(path, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
     try:
@@ -109,11 +117,20 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
     if not blocks:
         topics = listed([connection.topic for connection in connections])
         raise RecordingError(f"{path}: topic {topics} has no message")
-    return _merged(path, blocks, with_topic=len(spec.topics) > 1)
+    measured = {topic for topic in spec.topics if topic != CONTROL_TOPIC}
+    return _merged(path, blocks, with_topic=len(measured) > 1)
 
 
-def _library(path: Path, name: str) -> Any:
-    """Import a module of the optional library."""
+def rosbags_module(path: Path, name: str) -> Any:
+    """Import a module of the optional library.
+
+    Args:
+        path: The bag, for the message.
+        name: The module.
+
+    Raises:
+        RecordingError: The library is not installed.
+    """
     try:
         return import_module(name)
     except ImportError:
@@ -137,9 +154,10 @@ def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]
     for topic in topics:
         if topic not in available:
             raise RecordingError(f"{path}: recording.topics: {unknown('topic', topic, available)}")
-    if len(available) > 1 and not topics:
+    measured = [topic for topic in available if topic != CONTROL_TOPIC]
+    if len(measured) > 1 and not topics:
         raise RecordingError(
-            f"{path}: several topics of joint states: {listed(available)}; select one by "
+            f"{path}: several topics of joint states: {listed(measured)}; select one by "
             "recording.topics"
         )
 

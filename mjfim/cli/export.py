@@ -1,0 +1,76 @@
+"""`mjfim export`: a design for the programs that run robots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, get_args
+
+import typer
+
+import mjfim
+from mjfim.cli.common import Force, claim_file, claim_folder, errors, keep_result, progress, verb
+from mjfim.experiment.input_files import input_files
+from mjfim.experiment.system import System
+from mjfim.output.folders import find_experiment_file
+from mjfim.output.robot.export import (
+    ExportOptions,
+    Target,
+    exported_files,
+    is_folder,
+    target_of,
+    write_export,
+)
+from mjfim.output.robot.plan import RobotPlan
+
+
+@verb
+def export(
+    design_folder: Annotated[
+        Path,
+        typer.Argument(metavar="DESIGN", help="Folder of a design, or its design.npz."),
+    ],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to", metavar="TARGET", help=f"What is written: {', '.join(get_args(Target))}."
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="PATH", help="File to write, or folder of a bag."),
+    ],
+    experiment: Annotated[
+        Path | None,
+        typer.Option(help="Experiment of the design; default: the one that design.json names."),
+    ] = None,
+    positions: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND",
+            help="Positions of a joint trajectory: motion (as planned) or command (of position "
+            "servos); default: command where every driven joint has a position servo.",
+        ),
+    ] = None,
+    storage: Annotated[str, typer.Option(help="Format of a bag: mcap or sqlite3.")] = "mcap",
+    force: Force = False,
+) -> None:
+    """Write a design for ROS 2 and other programs that run robots."""
+    target = target_of(to)
+    file = design_folder / "design.npz" if design_folder.is_dir() else design_folder
+    stated = mjfim.Experiment.from_file(experiment or find_experiment_file(file))
+    inputs = input_files(stated, [design_folder])
+    if is_folder(target):
+        claim_folder(output, exported_files(target, output), inputs, force=force)
+    else:
+        claim_file(output, inputs, force=force)
+
+    with progress("exporting"):
+        design = mjfim.Design.load(file)
+        plan = RobotPlan.of(design, System.resolve(stated), file)
+        keep_result(output if is_folder(target) else output.parent)
+        options = ExportOptions(positions=positions, storage=storage)
+        remarks = write_export(plan, output, target, options)
+
+    for sentence in remarks:
+        errors.print(f"note: {sentence}", markup=False)
+    errors.print(f"wrote {output}{'/' if is_folder(target) else ''}", markup=False)

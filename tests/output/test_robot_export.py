@@ -1,0 +1,203 @@
+"""Designs for ROS 2: trajectories in YAML and in bags, which other libraries read."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.experiment import System
+from mjfim.output import archive
+from mjfim.output.robot.joint_trajectory import yaml_number
+from mjfim.recordings import read_recording
+from mjfim.recordings.formats.read import read_table
+from tests.support.cli import misused, names, run
+from tests.support.paths import MODELS
+
+pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
+
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
+
+# A short design; its accuracy does not matter.
+SHORT: dict[str, Any] = {"descent": {"max_iterations": 1}}
+
+
+def short_design(name: str, **tables: Any) -> tuple[mjfim.Experiment, mjfim.Design]:
+    """Experiment and design of an example, after one iteration."""
+    stated = mjfim.Experiment.from_file(MODELS / f"{name}.toml")
+    stated = stated.replace(**{**SHORT, **tables})
+    return stated, mjfim.design(stated)
+
+
+@pytest.fixture(scope="module")
+def cart() -> tuple[mjfim.Experiment, mjfim.Design]:
+    """A design with a motor on one of two joints."""
+    return short_design("cart_pendulum", horizon=1.0, measure_rate=100.0)
+
+
+@pytest.fixture(scope="module")
+def arm() -> tuple[mjfim.Experiment, mjfim.Design]:
+    """A design with a position servo on every joint."""
+    return short_design("servo_arm", horizon=0.5)
+
+
+@pytest.fixture(scope="module")
+def folder(
+    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Folder of the design of the cart."""
+    place = tmp_path_factory.mktemp("design")
+    archive.write_design(place, cart[1], System.resolve(cart[0]))
+    return place
+
+
+def load(text: str) -> Any:
+    """What a reader of YAML makes of a text."""
+    return YAML(typ="safe", pure=True).load(text)
+
+
+def stack(points: list[dict[str, Any]], field: str) -> np.ndarray:
+    """One field of all points."""
+    return np.array([point[field] for point in points])
+
+
+def test_a_trajectory_holds_the_rows_of_the_reference(
+    cart: tuple[mjfim.Experiment, mjfim.Design], folder: Path, tmp_path: Path
+) -> None:
+    """The joint with the motor, with the force of the control, at the times of the rows."""
+    remarks = mjfim.export_design(*cart, tmp_path / "trajectory.yaml", to="ros2")
+    text = (tmp_path / "trajectory.yaml").read_text(encoding="utf-8")
+    found, rows = load(text), read_table(folder / "reference.csv")
+
+    assert found["joint_names"] == ["slide"]
+    assert found["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    points = found["points"]
+    columns = {"positions": "qpos", "velocities": "qvel", "accelerations": "qacc"}
+    for field, column in {**columns, "effort": "force"}.items():
+        np.testing.assert_allclose(stack(points, field)[:, 0], rows[f"{column}:slide"], rtol=1e-11)
+    np.testing.assert_allclose(stack(points, "effort")[:-1], cart[1].trajectory.ctrl, rtol=1e-11)
+
+    times = [point["time_from_start"] for point in points]
+    assert [time["sec"] + 1e-9 * time["nanosec"] for time in times] == pytest.approx(rows["t"])
+    assert all(isinstance(n, int) and 0 <= n < 10**9 for t in times for n in t.values())
+    assert any("does not end at rest" in sentence for sentence in remarks)
+
+    # The shell puts the file into a goal of an action.
+    assert load(f"{{trajectory: {text.rstrip()}}}") == {"trajectory": found}
+
+
+def test_numbers_are_floats_in_old_and_new_yaml() -> None:
+    """In YAML 1.1 a float needs a decimal point, and its exponent a sign."""
+    old = re.compile(r"[-+]?[0-9]+\.[0-9]*(e[-+][0-9]+)?")
+    for value in (0.0, -1.0, 1e-05, -2.5e-300, 1e22, 123456789.0, 0.1):
+        assert old.fullmatch(yaml_number(value))
+        assert float(yaml_number(value)) == value
+
+
+def test_servos_get_their_commands(
+    arm: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+) -> None:
+    """Positions are the controls of the design; the planned motion is there on request."""
+    remarks = mjfim.export_design(*arm, tmp_path / "command.yaml", to="ros2")
+    found = load((tmp_path / "command.yaml").read_text(encoding="utf-8"))
+    ctrl = arm[1].trajectory.ctrl
+    held = np.concatenate([ctrl, ctrl[-1:]])
+    assert found["joint_names"] == ["yaw", "shoulder", "elbow", "wrist"]
+    np.testing.assert_allclose(stack(found["points"], "positions"), held, rtol=1e-11, atol=1e-15)
+    assert {key for point in found["points"] for key in point} == {"positions", "time_from_start"}
+    assert any("--positions motion" in sentence for sentence in remarks)
+
+    remarks = mjfim.export_design(*arm, tmp_path / "motion.yaml", to="ros2", positions="motion")
+    points = load((tmp_path / "motion.yaml").read_text(encoding="utf-8"))["points"]
+    np.testing.assert_allclose(
+        stack(points, "positions"), arm[1].trajectory.qpos, rtol=1e-11, atol=1e-15
+    )
+    assert "effort" not in points[0] and any("effort is left out" in s for s in remarks)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_is_read_by_rosbags_and_by_identify(
+    storage: str, cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+) -> None:
+    """The message is the trajectory; joint states and controls are a recording of the design."""
+    experiment, design = cart
+    bag = tmp_path / "bag"
+    mjfim.export_design(*cart, bag, to="ros2-bag", storage=storage)
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        wanted = [c for c in reader.connections if c.topic.endswith("/joint_trajectory")]
+        ((connection, _, raw),) = reader.messages(connections=wanted)
+        message: Any = reader.deserialize(raw, connection.msgtype)
+    assert connection.msgtype == "trajectory_msgs/msg/JointTrajectory"
+    assert message.joint_names == ["slide"] and len(message.points) == 101
+    positions = np.array([point.positions for point in message.points])
+    np.testing.assert_allclose(positions[:, 0], design.trajectory.qpos[:, 0], atol=1e-12)
+    assert message.points[-1].time_from_start.sec == 1
+
+    recording = read_recording(bag, System.resolve(experiment).channels)
+    np.testing.assert_array_equal(recording.ctrl, design.trajectory.ctrl)
+    columns = list(recording.outputs)
+    planned = {"qpos:slide": 0, "qpos:hinge": 1}
+    for name, i in planned.items():
+        np.testing.assert_array_equal(
+            recording.y[:, columns.index(name)], design.trajectory.qpos[:, i]
+        )
+    estimate = mjfim.identify(experiment, [recording])
+    np.testing.assert_allclose(list(estimate.theta), [2.0, 1.0, 1.0], rtol=1e-6)
+
+
+def test_the_verb_writes_and_replaces_its_own_files_only(folder: Path, tmp_path: Path) -> None:
+    """A bag replaces one of the other format; a file of the user remains without --force."""
+    bag = tmp_path / "bag"
+    experiment = MODELS / "cart_pendulum.toml"
+    words = ("export", folder, "--experiment", experiment, "-o")
+    for storage, ending in (("sqlite3", "db3"), ("mcap", "mcap")):
+        done = run(*words, bag, "--to", "ros2-bag", "--storage", storage)
+        assert done.exit_code == 0, done.stderr
+        assert names(bag) == {".mjfim.json", "metadata.yaml", f"bag.{ending}"}
+
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("mine", encoding="utf-8")
+    misused(run(*words, mine, "--to", "ros2"), "--force")
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert run(*words, mine, "--to", "ros2", "--force").exit_code == 0
+    assert load(mine.read_text(encoding="utf-8"))["joint_names"] == ["slide"]
+    misused(run(*words, folder / "design.csv", "--to", "ros2", "--force"), "is an input")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--to", "ros"], "--to: unknown target 'ros' (did you mean 'ros2'?)"),
+        (["--to", "ros2-bag", "--storage", "zip"], "--storage: unknown format 'zip'"),
+        (["--to", "ros2", "--positions", "speed"], "--positions: unknown kind 'speed'"),
+        (["--to", "ros2", "--positions", "command"], "not every driven joint has one position"),
+        (["--to", "ros2", "--experiment", "none.toml"], "none.toml"),
+    ],
+)
+def test_misuse_is_one_sentence(words: list[str], said: str, folder: Path, tmp_path: Path) -> None:
+    stated = [] if "--experiment" in words else ["--experiment", MODELS / "cart_pendulum.toml"]
+    misused(run("export", folder, "-o", tmp_path / "out", *words, *stated), said)
+    assert names(tmp_path) == set()
+
+
+def test_a_robot_without_driven_joints_has_no_joint_trajectory(tmp_path: Path) -> None:
+    experiment = mjfim.Experiment.from_file(MODELS / "quadrotor.toml")
+    experiment = experiment.replace(horizon=0.3, **SHORT)
+    with pytest.raises(ExperimentError, match="slides and hinges on which actuators act"):
+        mjfim.export_design(experiment, mjfim.design(experiment), tmp_path / "out.yaml", to="ros2")
+
+
+def test_a_design_of_another_model_is_refused(
+    cart: tuple[mjfim.Experiment, mjfim.Design],
+    arm: tuple[mjfim.Experiment, mjfim.Design],
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(RecordingError, match="the design: made for"):
+        mjfim.export_design(cart[0], arm[1], tmp_path / "out.yaml", to="ros2")
