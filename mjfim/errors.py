@@ -79,12 +79,25 @@ def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
         A sentence that proposes the most similar name and lists all valid ones.
     """
     names = sorted(str(v) for v in valid)
-
-    # A comparison with a very long name takes minutes, and such a name is no misspelling.
-    text = str(name)
-    near = get_close_matches(text, names, n=1) if len(text) <= REPEATED_TEXT else []
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    near = closest(str(name), names)
+    hint = f" (did you mean {near!r}?)" if near else ""
     return f"unknown {kind} {shortened(repr(name))}{hint}; valid: {listed(names)}"
+
+
+def closest(name: str, valid: Sequence[str]) -> str | None:
+    """Find the name that is most similar to a given one.
+
+    Args:
+        name: The given name.
+        valid: The names among which one is searched.
+
+    Returns:
+        The most similar name; None if none is similar.
+    """
+    # A comparison with a very long name takes minutes, and such a name is no misspelling.
+    if len(name) > REPEATED_TEXT:
+        return None
+    return next(iter(get_close_matches(name, valid, n=1)), None)
 
 
 def shortened(text: str) -> str:

@@ -14,6 +14,7 @@ from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
     Force,
+    OtherDesign,
     Threads,
     claim_folder,
     errors,
@@ -42,12 +43,7 @@ def check(
             metavar="RECORDING", help="Recordings to check instead of the initial control."
         ),
     ] = None,
-    design_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--design", metavar="DESIGN.npz", help="Design to check instead of the initial control."
-        ),
-    ] = None,
+    design_file: OtherDesign = None,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="Folder for check.json and check.png."),

@@ -65,8 +65,29 @@ LINE_SECONDS = 10.0
 ExperimentFile = Annotated[
     Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")
 ]
+
+
+def _file_of_design(path: Path | None) -> Path | None:
+    """The file design.npz where a folder is named."""
+    return path / "design.npz" if path is not None and path.is_dir() else path
+
+
 DesignFile = Annotated[
-    Path, typer.Argument(metavar="DESIGN.npz", help="File design.npz of `mjfim design`.")
+    Path,
+    typer.Argument(
+        metavar="DESIGN",
+        help="Folder of `mjfim design`, or its file design.npz.",
+        callback=_file_of_design,
+    ),
+]
+OtherDesign = Annotated[
+    Path | None,
+    typer.Option(
+        "--design",
+        metavar="DESIGN",
+        help="Design to check instead of the initial control: its folder, or its file design.npz.",
+        callback=_file_of_design,
+    ),
 ]
 ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (MJCF or URDF).")]
 Folder = Annotated[

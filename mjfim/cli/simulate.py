@@ -40,13 +40,20 @@ def simulate(
     experiment: ExperimentFile,
     design_file: DesignFile,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Recording to write.")
-    ],
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE.csv",
+            help="Recording to write; default: recording.csv beside the design.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     force: Force = False,
 ) -> None:
     """Simulate a recording of a design at the `true` parameter values, with noise."""
     system = System.resolve(mjfim.Experiment.from_file(experiment))
+    output = output or design_file.with_name("recording.csv")
     claim_file(output, input_files(system.experiment, [design_file]), force=force)
     trajectory = archive.read_design(design_file)["final"]
     archive.check_fits(design_file, trajectory, system)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, listed, unknown
+from mjfim.errors import ExperimentError, listed, shortened, unknown
 from mjfim.excitation.design_memory import require_memory_for_design
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.robust import ParameterSamples
@@ -42,8 +42,24 @@ def require_design_keys(experiment: Experiment, work: str = "design") -> None:
     if experiment.initial.control is None:
         raise ExperimentError(
             f"{experiment.source}: {work} needs `initial.control`, the control from which it "
-            'starts, for example control = { kind = "multisine", amplitude = 1.0 }'
+            f"starts, for example {_control_example(experiment)}; `mjfim init "
+            f"{experiment.model}` writes a whole file with amplitudes that suit the model"
         )
+
+
+def _control_example(experiment: Experiment) -> str:
+    """Initial control that a message proposes.
+
+    It varies about the control of the keyframe, which is the default offset, where one is stated.
+    """
+    text = 'control = { kind = "multisine", amplitude = 1.0 }'
+    stated = experiment.initial.keyframe
+    if stated is None:
+        return f"{text} in [initial]"
+    return (
+        f"{text} in [initial], about the control of the keyframe {shortened(repr(stated))}, or "
+        'control = { kind = "constant", amplitude = 0.0 }, which holds it'
+    )
 
 
 def sample_count(experiment: Experiment, stride: int) -> int:

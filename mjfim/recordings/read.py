@@ -6,14 +6,14 @@ which it is empty.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, RecordingError, listed, unknown
+from mjfim.errors import ExperimentError, RecordingError, closest, listed, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
 from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
@@ -84,6 +84,8 @@ def read_log(path: Path, channels: Channels) -> Log:
     spec = channels.spec
 
     table = read_columns(path, spec)
+    if "time" not in spec.model_fields_set:
+        _require_default(table, "time", spec.time, key="[recording] time")
     sources = _sources(table, channels)
     measured = tuple(name for name in sources if name not in channels.control_columns)
 
@@ -142,7 +144,9 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
         for name in channels.control_columns
     }
     # The look-up of a missing column raises the error that explains it.
-    for source in controls.values():
+    for name, source in controls.items():
+        if name not in stated:
+            _require_default(table, name, source.column, key=f'[recording.columns] "{name}"')
         table.column(source.column)
 
     measured = {name: source for name, source in stated.items() if name not in controls}
@@ -156,9 +160,34 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
         used = {channels.spec.time, *(source.column for source in controls.values())}
         found = measured or [name for name in table.names if name not in used]
         fault = unknown("column", listed([*found]), channels.outputs)
-        raise RecordingError(f"{table.source}: no measured column; {fault}")
+        advice = "" if measured else _advice(channels.outputs, list(found))
+        raise RecordingError(f"{table.source}: no measured column; {fault}{advice}")
 
     return {**controls, **measured}
+
+
+def _require_default(table: Table, name: str, column: str, *, key: str) -> None:
+    """Raise RecordingError if the log lacks a column that the experiment file does not state.
+
+    Args:
+        table: The log.
+        name: What the column holds.
+        column: Name that the column has in the files of mjfim.
+        key: Key of the experiment file that states another name.
+    """
+    if column in table.names:
+        return
+
+    # Names of other programs have no prefix such as `ctrl:`, and often other capitals.
+    plain = {own.lower(): own for own in table.names}
+    near = closest(name.lower(), list(plain)) or closest(
+        name.rpartition(":")[2].lower(), list(plain)
+    )
+    proposal = plain[near] if near else "<name of the column in the log>"
+    raise RecordingError(
+        f"{table.source}: column {column!r} is missing; found: {listed(table.names)}. If another "
+        f'column holds it, state its name in the experiment file: {key} = "{proposal}"'
+    )
 
 
 def _check_names(table: Table, channels: Channels) -> None:
@@ -171,6 +200,21 @@ def _check_names(table: Table, channels: Channels) -> None:
         if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
             fault = unknown_coordinate("column", name, ["t", *known])
             raise RecordingError(f"{table.source}: {fault}")
+
+
+def _advice(outputs: Sequence[str], found: Sequence[str]) -> str:
+    """End of a message about a log without a column of mjfim's names.
+
+    outputs: names of the measured outputs. found: names of the columns that the log has.
+    """
+    plain = {own.lower(): own for own in found}
+    pairs = ((name, closest(name.rpartition(":")[2].lower(), list(plain))) for name in outputs)
+    name, near = next(((name, plain[near]) for name, near in pairs if near), (outputs[0], ""))
+    column = near or "<name of the column in the log>"
+    return (
+        ". Columns with other names are stated in the experiment file, for example "
+        f'[recording.columns] "{name}" = "{column}"'
+    )
 
 
 def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -48,3 +49,31 @@ def test_recording_cannot_be_written(
     (tmp_path / "file").touch()
     misused(run("simulate", study, archived, "-o", tmp_path / place), "-o")
     assert names(tmp_path) == {"folder", "file"}
+
+
+def test_the_folder_of_a_design_stands_for_its_file(
+    study: Path, recorded: Path, archived: Path, tmp_path: Path
+) -> None:
+    """Without -o, the recording is written beside the design."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    shutil.copy(archived, folder)
+    for _ in range(2):
+        result = run("simulate", study, folder, "--seed", 1)
+        assert result.exit_code == 0
+        assert f"wrote {folder / 'recording.csv'}" in result.stderr
+    assert (folder / "recording.csv").read_bytes() == recorded.read_bytes()
+
+
+def test_a_folder_without_a_design(study: Path, tmp_path: Path) -> None:
+    misused(run("simulate", study, tmp_path), str(tmp_path / "design.npz"))
+    assert names(tmp_path) == set()
+
+
+def test_a_foreign_recording_beside_the_design_stays(
+    study: Path, archived: Path, tmp_path: Path
+) -> None:
+    shutil.copy(archived, tmp_path)
+    (tmp_path / "recording.csv").write_text("t\n", encoding="utf-8")
+    misused(run("simulate", study, tmp_path), "recording.csv", "--force")
+    assert (tmp_path / "recording.csv").read_text(encoding="utf-8") == "t\n"

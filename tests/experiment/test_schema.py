@@ -1149,3 +1149,22 @@ def test_faults_in_python_are_experiment_errors(values: dict[str, Any]) -> None:
     """Without a file the message names the experiment."""
     with pytest.raises(ExperimentError, match=r"^experiment: model: "):
         Experiment(**values)
+
+
+@pytest.mark.parametrize(
+    ("initial", "fragment"),
+    [
+        ({}, 'for example control = { kind = "multisine", amplitude = 1.0 } in [initial]; `mjfim'),
+        ({"keyframe": "hanging"}, "about the control of the keyframe 'hanging', or control = {"),
+    ],
+)
+def test_a_missing_control_is_proposed(
+    initial: dict[str, Any], fragment: str, folder: Path
+) -> None:
+    values = {"model": "cart_pendulum.xml", "rate": 100.0, "horizon": 1.0}
+    parameters = {"m": {"target": "body/bob:mass"}}
+    stated = Experiment(**values, initial=initial, parameters=parameters, directory=folder)
+    with pytest.raises(ExperimentError) as error:
+        DesignTask.resolve(stated)
+    assert fragment in str(error.value)
+    assert "`mjfim init cart_pendulum.xml`" in str(error.value)

@@ -744,3 +744,32 @@ def test_loads_of_a_servo(tmp_path: Path) -> None:
         columns={**ROBOTS["bam_xl330/raw/*.json"]["columns"], "ctrl:one": "load"},
     )
     assert read_recording(files[0], naive.system.channels).ctrl.max() > 65_000
+
+
+# ---- logs of other programs
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"Time": T}, r"column 't' is missing; found: Time\. .*: \[recording\] time = \"Time\""),
+        (
+            {"t": T, "Push": CTRL["ctrl:push"], "turn": CTRL["ctrl:turn"]},
+            r"'ctrl:push' is missing; found: t, Push, turn.*"
+            r"\[recording\.columns\] \"ctrl:push\" = \"Push\"",
+        ),
+        (
+            {"t": T, "x": CTRL["ctrl:push"]},
+            r"\[recording\.columns\] \"ctrl:push\" = \"<name of the column in the log>\"",
+        ),
+        (
+            {"t": T, **CTRL, "PIN": CTRL["ctrl:turn"]},
+            r"no measured column; .*\[recording\.columns\] \"qpos:pin\" = \"PIN\"",
+        ),
+    ],
+)
+def test_columns_of_other_programs_are_proposed(
+    columns: dict[str, Any], said: str, read: Read
+) -> None:
+    with pytest.raises(RecordingError, match=said):
+        read(columns, bare=True)
