@@ -21,10 +21,10 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.labels import labels_of_system
 from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design
-from mjfim.output.labels import Labels
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
@@ -212,7 +212,7 @@ def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCa
         design: Its design.
         study: Monte-Carlo study at 25 Hz.
     """
-    names = Labels.of_system(task.system)
+    names = labels_of_system(task.system)
     figures = {
         "figure_2": plots.trajectories(design, names),
         "figure_3": plots.sensitivity_phase(design, names),

@@ -13,10 +13,10 @@ import mjfim
 from mjfim.atomic_io import replacing
 from mjfim.cli.common import Force, claim_file, errors, verb
 from mjfim.errors import RecordingError
+from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import find_experiment_file, find_rerun_file
-from mjfim.output.labels import Labels
 
 
 @verb
@@ -51,7 +51,7 @@ def replay(
         for trajectory in named.values():
             archive.check_fits(source, trajectory, system)
         rerun_log.log_trajectories(
-            target, system.model_at(system.theta), named, Labels.of_system(system)
+            target, system.model_at(system.theta), named, labels_of_system(system)
         )
     else:
         found = find_rerun_file(source)

@@ -96,7 +96,7 @@ def montecarlo(
     if not study.sets:
         raise NoResultError
     with writing(output) as results:
-        results.write_study_folder(output, study, system)
+        results.write_study_folder(output, study)
     print_result(as_json, study.summary(), render(describe_study(study, system.units)))
     errors.print(f"wrote {output}/")
     done = {name: found.trials for name, found in study.sets.items()}

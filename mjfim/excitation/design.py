@@ -29,6 +29,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import Verification, require_feasible_start, verify
 from mjfim.excitation.violations import violations_of
+from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.schema import Experiment
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.information.marginal import shared
@@ -430,6 +431,7 @@ class _Report:
             combined=combined,
             prior=task.prior,
             data=data,
+            labels=labels_of_system(task.system),
         )
 
 

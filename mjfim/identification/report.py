@@ -13,6 +13,7 @@ from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.errors import listed
 from mjfim.experiment.stated_units import probable_degrees
+from mjfim.experiment.labels import labels_of_system
 from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
@@ -253,6 +254,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         robust_uncertainty=accuracy.robust,
         motion=problem.motion(solution.unknowns, 0),
         interrupted=findings.interrupted,
+        labels=labels_of_system(system),
     )
 
 

@@ -9,13 +9,14 @@ from pathlib import Path
 
 from mjfim.atomic_io import remove_earlier_result
 from mjfim.errors import ModelError, RecordingError
+from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.interruption import run_optional
 from mjfim.output import archive, plots
 from mjfim.output import rerun as rerun_log
-from mjfim.output.labels import Labels
 from mjfim.output.mjcf.write import write_identified
+from mjfim.output.plots.pictures import fit_names, histogram_name, pictures_of
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
@@ -23,6 +24,7 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json, write_json
+from mjfim.records.shown import ShownRecord
 
 # Files that a design consists of, without figures.
 DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
@@ -53,7 +55,7 @@ def estimate_files(recordings: int) -> tuple[str, ...]:
         recordings: Number of recordings that are fitted.
     """
     figures = ("parameters.png", "spectra.png", "predictions.png")
-    fits = tuple(_fit_name(i, recordings) for i in range(recordings))
+    fits = tuple(f"{name}.png" for name in fit_names(recordings))
     return ("estimate.json", "estimate.npz", "identified.xml", "estimate.rrd", *figures, *fits)
 
 
@@ -63,7 +65,7 @@ def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
     Args:
         parameters: Names of the parameters.
     """
-    histograms = tuple(_histogram_name(name) for name in parameters)
+    histograms = tuple(f"{histogram_name(name)}.png" for name in parameters)
     return ("montecarlo.json", "montecarlo.npz", "table_covariance.png", *histograms)
 
 
@@ -172,19 +174,8 @@ def write_design_folder(folder: Path, design: Design, system: System) -> None:
 
 def _write_design_pictures(folder: Path, design: Design, system: System) -> None:
     """Write the figures of a design and its Rerun file."""
-    labels = Labels.of_system(system)
-    figures = {
-        "trajectories": plots.trajectories(design, labels),
-        "sensitivity_phase": plots.sensitivity_phase(design, labels),
-        "convergence": plots.convergence(design),
-        "standard_deviations": plots.std_bars(design, labels),
-        "table_eigenvalues": plots.design_table(design, labels),
-    }
-    if design.usage:
-        figures["limits"] = plots.limits(design)
-    for name, figure in figures.items():
-        plots.save(figure, folder / f"{name}.png")
-
+    _write_figures(folder, design)
+    labels = labels_of_system(system)
     rerun_log.log_design(folder / "design.rrd", system.model_at(system.theta), design, labels)
 
 
@@ -196,7 +187,7 @@ def write_check_folder(folder: Path, check: Check) -> None:
         check: The check.
     """
     check.save(folder)
-    run_optional(lambda: plots.save(plots.check_figure(check), folder / "check.png"))
+    run_optional(lambda: _write_figures(folder, check))
 
 
 def write_robustness_folder(folder: Path, result: Robustness, seconds: float) -> None:
@@ -209,7 +200,7 @@ def write_robustness_folder(folder: Path, result: Robustness, seconds: float) ->
     """
     result.save_archive(folder)
     write_json(folder / "playback.json", {**result.summary(), "seconds": seconds})
-    run_optional(lambda: plots.save(plots.robustness_figure(result), folder / "playback.png"))
+    run_optional(lambda: _write_figures(folder, result))
 
 
 def write_comparison_folder(folder: Path, comparison: Comparison, system: System) -> None:
@@ -228,7 +219,7 @@ def write_comparison_folder(folder: Path, comparison: Comparison, system: System
     for row in comparison.rows:
         if row.control is not None:
             archive.write_control(folder / _control_name(row.method), row.control, system)
-    run_optional(lambda: plots.save(plots.compare_figure(comparison), folder / "compare.png"))
+    run_optional(lambda: _write_figures(folder, comparison))
 
 
 def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> list[str]:
@@ -259,8 +250,8 @@ def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> l
 
 def _write_estimate_pictures(folder: Path, estimate: Estimate, system: System) -> None:
     """Write the figures of an estimate and its Rerun file."""
-    labels = Labels.of_system(system)
-    _write_fit_figures(folder, estimate, labels)
+    _write_figures(folder, estimate)
+    labels = labels_of_system(system)
     if estimate.motion is not None:
         measured = measured_trajectory(system, estimate.recordings[0])
         model = system.model_at(estimate.theta)
@@ -268,50 +259,22 @@ def _write_estimate_pictures(folder: Path, estimate: Estimate, system: System) -
         rerun_log.log_estimate(target, model, estimate, measured, estimate.motion, labels)
 
 
-def _write_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None:
-    """Write figures of parameters, residuals and predictions, and of the fit of each recording."""
-    sigma = list(estimate.sigma.values())
-    count = len(estimate.recordings)
-    for i in range(count):
-        figure = plots.fit(estimate, i, labels, sigma)
-        plots.save(figure, folder / _fit_name(i, count))
-
-    plots.save(plots.parameter_intervals(estimate, labels), folder / "parameters.png")
-    plots.save(plots.residual_spectra(estimate, labels), folder / "spectra.png")
-    if estimate.predictions:
-        plots.save(plots.predictions(estimate, labels), folder / "predictions.png")
-
-
-def write_study_folder(folder: Path, study: MonteCarloStudy, system: System) -> None:
+def write_study_folder(folder: Path, study: MonteCarloStudy) -> None:
     """Write montecarlo.json, montecarlo.npz, a histogram per parameter, and the tables as a figure.
 
     Args:
         folder: Folder for the results.
         study: The Monte Carlo study.
-        system: The experiment that was studied.
     """
     study.save(folder)
 
-    run_optional(lambda: _write_study_figures(folder, study, system))
+    run_optional(lambda: _write_figures(folder, study))
 
 
-def _write_study_figures(folder: Path, study: MonteCarloStudy, system: System) -> None:
-    """Write a histogram per parameter, and the tables as a figure."""
-    labels = Labels.of_system(system)
-    for i, name in enumerate(study.parameters):
-        plots.save(plots.histogram(study, i, labels), folder / _histogram_name(name))
-    plots.save(plots.study_table(study, labels), folder / "table_covariance.png")
-
-
-def _fit_name(index: int, count: int) -> str:
-    """Name of the figure of the fit of one of `count` recordings."""
-    return "fit.png" if count == 1 else f"fit_{index + 1}.png"
-
-
-def _histogram_name(parameter: str) -> str:
-    """Name of the histogram of a parameter."""
-    safe_name = re.sub(r"[^\w.-]", "_", parameter)
-    return f"histogram_{safe_name}.png"
+def _write_figures(folder: Path, record: ShownRecord) -> None:
+    """Write all figures of a result."""
+    for name, draw in pictures_of(record).items():
+        plots.save(draw(), folder / f"{name}.png")
 
 
 def _control_name(method: str) -> str:

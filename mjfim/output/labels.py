@@ -1,106 +1,49 @@
-"""Labels of axes and panels with units, such as `slide [m]`, from a model and an experiment."""
+"""Labels with which the results of verbs are shown."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-
-import mujoco
-
-from mjfim.errors import MjfimError
-from mjfim.experiment.system import System
-from mjfim.model.coordinates import (
-    control_labels,
-    dof_names,
-    output_label,
-    state_components,
-    tangent_components,
-)
-from mjfim.model.units import per_second
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
+from mjfim.records.labels import Labels
+from mjfim.records.monte_carlo import MonteCarloStudy
 
 
-@dataclass(frozen=True, kw_only=True)
-class Labels:
-    """Labels of all columns that are shown, `<name> [<unit>]` unless stated otherwise.
+def complete_labels(record: Design | Estimate | MonteCarloStudy) -> Labels:
+    """Return the labels of a record; numbers in place of names where the record has no labels.
 
-    Attributes:
-        qpos: nq labels of the numbers of qpos.
-        positions: nv labels of the positions by degree of freedom; rotations of ball and free
-            joints are rotation vectors.
-        velocities: nv labels of the velocities by degree of freedom.
-        controls: nu labels of the controls.
-        parameters: p names of the parameters, without unit.
-        parameter_units: p units of the parameters; empty where a parameter has none.
-        outputs: Labels of the measured columns, by column; others are shown by the name of their
-            column.
+    Records of earlier versions have none.
+
+    Args:
+        record: The record.
     """
+    if record.labels is not None:
+        return record.labels
 
-    qpos: tuple[str, ...]
-    positions: tuple[str, ...]
-    velocities: tuple[str, ...]
-    controls: tuple[str, ...]
-    parameters: tuple[str, ...] = ()
-    parameter_units: tuple[str, ...] = ()
-    outputs: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Check that every parameter has a unit."""
-        names, units = len(self.parameters), len(self.parameter_units)
-        if names != units:
-            raise MjfimError(
-                f"labels name {names} parameters but {units} units; give one unit (or '') per "
-                "parameter"
-            )
-
-    @classmethod
-    def of_model(cls, model: mujoco.MjModel) -> Labels:
-        """Make labels of the joints and actuators of a model."""
-        state = state_components(model)[: model.nq]
-        tangent = tangent_components(model)[: model.nv]
-        names = dof_names(model)
-
-        return cls(
-            qpos=tuple(f"{c.name.removeprefix('qpos:')} [{c.unit or '1'}]" for c in state),
-            positions=tuple(f"{name} [{c.unit}]" for name, c in zip(names, tangent, strict=True)),
-            velocities=tuple(
-                f"{name} velocity [{per_second(c.unit)}]"
-                for name, c in zip(names, tangent, strict=True)
-            ),
-            controls=control_labels(model),
+    units = ("",) * len(record.parameters)
+    if isinstance(record, Estimate):
+        units = record.units
+    if not isinstance(record, Design):
+        return Labels(
+            qpos=(),
+            positions=(),
+            velocities=(),
+            controls=(),
+            parameters=record.parameters,
+            parameter_units=units,
         )
 
-    @classmethod
-    def of_system(cls, system: System) -> Labels:
-        """Make labels of a system's model, parameters and outputs."""
-        base = cls.of_model(system.model)
-        outputs = {name: output_label(system.model, name) for name in system.outputs.names}
-        return replace(
-            base,
-            parameters=system.parameters.names,
-            parameter_units=system.units,
-            outputs=outputs,
-        )
+    trajectory = record.trajectory
+    velocities = trajectory.qvel.shape[1]
+    return Labels(
+        qpos=_numbered("qpos", trajectory.qpos.shape[1]),
+        positions=_numbered("position", velocities),
+        velocities=_numbered("velocity", velocities),
+        controls=_numbered("control", trajectory.ctrl.shape[1]),
+        parameters=record.parameters,
+        parameter_units=units,
+    )
 
-    def parameter(self, j: int) -> str:
-        """Return the label of parameter j."""
-        return f"{self.parameters[j]} [{self.parameter_units[j] or 'model unit'}]"
 
-    def output(self, column: str) -> str:
-        """Return the label of a measured column."""
-        return self.outputs.get(column, f"{column} [model unit]")
-
-    def check(self, **sizes: int) -> None:
-        """Check the lengths of fields.
-
-        Args:
-            sizes: Length of the data by the name of the field.
-
-        Raises:
-            MjfimError: A field has another length.
-        """
-        for name, size in sizes.items():
-            have = len(getattr(self, name))
-            if have != size:
-                raise MjfimError(
-                    f"labels.{name} has {have} entries, the data has {size}; give exactly {size}"
-                )
+def _numbered(quantity: str, count: int) -> tuple[str, ...]:
+    """Return labels with a number in place of a name."""
+    return tuple(f"{quantity} {i} [model unit]" for i in range(count))

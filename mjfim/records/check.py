@@ -12,7 +12,7 @@ from mjfim.arrays import Array, freeze
 from mjfim.errors import first_ones
 from mjfim.records.combinations import ParameterGroup
 from mjfim.records.design import CombinationAccuracy
-from mjfim.records.serialization import SavedRecord
+from mjfim.records.shown import ShownRecord
 
 # Two parameters are confounded if the absolute correlation of their estimates exceeds this number.
 CONFOUNDED_CORRELATION = 0.95
@@ -174,7 +174,7 @@ class SelfTest:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Check(SavedRecord):
+class Check(ShownRecord):
     """Result of `mjfim.check`: which parameters can be identified, and how well.
 
     Attributes:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mjfim.arrays import Array, freeze
 from mjfim.errors import RenamedFields
-from mjfim.records.serialization import SavedRecord
+from mjfim.records.shown import ShownRecord
 
 # Key of mjfim's own design among the methods.
 DESIGN = "design"
@@ -111,7 +111,7 @@ class MethodResult(RenamedFields):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Comparison(SavedRecord):
+class Comparison(ShownRecord):
     """Result of `mjfim.compare`: methods in the order in which they ran, all with equal budgets.
 
     Attributes:

@@ -11,7 +11,9 @@ import numpy as np
 
 from mjfim.arrays import Array, freeze
 from mjfim.errors import RenamedFields
+from mjfim.records.labels import Labels
 from mjfim.records.serialization import SavedRecord
+from mjfim.records.shown import ShownRecord
 from mjfim.records.trajectory import Trajectory
 
 # Fields of a trajectory whose names are also names of arrays in design.npz.
@@ -268,7 +270,7 @@ def _npz_names() -> dict[str, str]:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Design(SavedRecord):
+class Design(ShownRecord):
     """Result of `mjfim.design`: the designed trajectory and the initial one.
 
     It is saved as design.json and design.npz, and `Design.load` reads design.npz. The arrays of the
@@ -298,6 +300,7 @@ class Design(SavedRecord):
             theta_j)].
         data: (p, p) information of this experiment alone, in which nuisance parameters that
             belong to a single experiment are marginalised.
+        labels: Names and units for figures and tables; None in records of earlier versions.
     """
 
     status: Status
@@ -320,6 +323,7 @@ class Design(SavedRecord):
     combined: tuple[CombinationAccuracy, ...] = ()
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     data: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    labels: Labels | None = None
 
     file_stem: ClassVar[str] = "design"
     made_by: ClassVar[str] = "`mjfim design EXPERIMENT -o DIR`"

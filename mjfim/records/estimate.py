@@ -9,8 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.records.labels import Labels
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import SavedRecord
+from mjfim.records.shown import ShownRecord
 from mjfim.records.trajectory import Trajectory
 
 # Half width of a 95 % interval of a normal distribution [standard deviations].
@@ -18,7 +20,7 @@ NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Estimate(SavedRecord):
+class Estimate(ShownRecord):
     """Result of `mjfim.identify`: parameters estimated from recordings.
 
     Attributes:
@@ -65,6 +67,7 @@ class Estimate(SavedRecord):
         steps: MuJoCo steps taken.
         units: Unit of each parameter.
         prior: (p, p) information of the parameters' priors.
+        labels: Names and units for figures and tables; None in records of earlier versions.
     """
 
     parameters: tuple[str, ...]
@@ -103,6 +106,7 @@ class Estimate(SavedRecord):
     steps: int = 0
     units: tuple[str, ...] = ()
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    labels: Labels | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from mjfim.arrays import Array, freeze
-from mjfim.records.serialization import SavedRecord
+from mjfim.records.labels import Labels
+from mjfim.records.shown import ShownRecord
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,7 +42,7 @@ class TrialStatistics:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class MonteCarloStudy(SavedRecord):
+class MonteCarloStudy(ShownRecord):
     """Result of `mjfim.monte_carlo`: statistics of estimates along one or more trajectories.
 
     Attributes:
@@ -50,6 +51,7 @@ class MonteCarloStudy(SavedRecord):
         measure_rate: Rate of the measurements [Hz].
         sets: Statistics by name of the trajectory (`initial`, `final`).
         information: (p, p) Fisher information of each trajectory, with the keys of `sets`.
+        labels: Names and units for figures and tables; None in records of earlier versions.
     """
 
     parameters: tuple[str, ...]
@@ -57,6 +59,7 @@ class MonteCarloStudy(SavedRecord):
     measure_rate: float
     sets: dict[str, TrialStatistics]
     information: dict[str, Array]
+    labels: Labels | None = None
 
     file_stem: ClassVar[str] = "montecarlo"
     made_by: ClassVar[str] = "`mjfim montecarlo EXPERIMENT DESIGN.npz -o DIR`"

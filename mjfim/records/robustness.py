@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mjfim.arrays import Array, freeze
-from mjfim.records.serialization import SavedRecord
+from mjfim.records.shown import ShownRecord
 
 # Probability with which the intervals and joint regions should hold the true values.
 CONFIDENCE = 0.95
@@ -116,7 +116,7 @@ class AssessedLimit:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Robustness(SavedRecord):
+class Robustness(ShownRecord):
     """Result of a robustness study with n robots, g of which could be identified.
 
     Attributes:

@@ -23,6 +23,7 @@ from scipy.stats import chi2 as chi2_distribution
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDivergedError, explain_renamed_arguments
+from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.identify import least_squares, newton_raphson
@@ -154,6 +155,7 @@ def monte_carlo_system(
         measure_rate=system.measure_rate,
         sets=sets,
         information=information,
+        labels=labels_of_system(system),
     )
 
 

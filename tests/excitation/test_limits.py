@@ -12,9 +12,9 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.constraint_kinds import ConstraintValues
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.limits import Limit, limits_of
+from mjfim.experiment.labels import labels_of_model
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names, scalar_joints
-from mjfim.output.labels import Labels
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.trajectory import Trajectory
 from tests.support.numerics import make_task
@@ -315,7 +315,7 @@ def test_every_control_has_its_label_also_where_an_actuator_has_several() -> Non
         <actuator><orientation name="o" joint="ball" kp="4"/><motor joint="h"/></actuator></mujoco>
         """
     )
-    labels = Labels.of_model(model)
+    labels = labels_of_model(model)
     assert len(labels.controls) == model.nu == model.nactuator + 2
     assert labels.controls == (
         "o[0] (control)",

@@ -22,7 +22,6 @@ from matplotlib.text import Text
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError
 from mjfim.output import plots
-from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     INITIAL_COLOUR,
     OPTIMIZED_COLOUR,
@@ -33,6 +32,7 @@ from mjfim.output.plots.style import (
 )
 from mjfim.records.design import Design, Evaluation, HistoryRow, Status
 from mjfim.records.estimate import Estimate
+from mjfim.records.labels import Labels
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory

@@ -19,8 +19,8 @@ from rerun.chunk import RrdReader
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError
+from mjfim.experiment.labels import labels_of_model
 from mjfim.model.coordinates import output_label
-from mjfim.output.labels import Labels
 from mjfim.output.rerun import log_design, log_estimate, log_trajectories, show
 from mjfim.output.rerun.camera import place_camera
 from mjfim.output.rerun.history import history_series
@@ -214,7 +214,7 @@ def design(cart: mujoco.MjModel) -> Design:
 def file(cart: mujoco.MjModel, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recording of the design, in a folder that does not exist yet."""
     path = tmp_path_factory.mktemp("rerun") / "new" / "design.rrd"
-    log_design(path, cart, design, Labels.of_model(cart), addition="| a caller's | table |")
+    log_design(path, cart, design, labels_of_model(cart), addition="| a caller's | table |")
     return path
 
 
@@ -347,7 +347,7 @@ class TestDesign:
 
         failing = replace(design, history=FailingHistory(design.history))
         with pytest.raises(RuntimeError, match="disk full"):
-            log_design(path, cart, failing, Labels.of_model(cart))
+            log_design(path, cart, failing, labels_of_model(cart))
         assert path.read_text() == "old"
         assert list(tmp_path.iterdir()) == [path]
 
@@ -356,7 +356,7 @@ class TestDesign:
     ) -> None:
         blind = replace(design.initial, std=np.array([np.inf, 0.1]), min_eigenvalue=np.zeros(41))
         path = tmp_path / "design.rrd"
-        log_design(path, cart, replace(design, initial=blind, history=()), Labels.of_model(cart))
+        log_design(path, cart, replace(design, initial=blind, history=()), labels_of_model(cart))
         assert entity_path(("information", "initial")) in entities(path)
 
 
@@ -367,7 +367,7 @@ class TestAnyModel:
     def test_design_of_any_model_is_logged(self, name: str, tmp_path: Path) -> None:
         model = load(name)
         path = tmp_path / "design.rrd"
-        log_design(path, model, designed(model), Labels.of_model(model))
+        log_design(path, model, designed(model), labels_of_model(model))
         logged = entities(path)
         assert not [entry for entry in logged if "__warnings" in entry]
         for key in ("initial", "optimized"):
@@ -376,7 +376,7 @@ class TestAnyModel:
 
     def test_labels_count_degrees_of_freedom(self, name: str, tmp_path: Path) -> None:
         model = load(name)
-        names = Labels.of_model(model)
+        names = labels_of_model(model)
         assert (len(names.positions), len(names.velocities), len(names.controls)) == (
             model.nv,
             model.nv,
@@ -401,7 +401,7 @@ def zoo_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Replay of the model with every type of geom."""
     model = load("zoo")
     path = tmp_path_factory.mktemp("zoo") / "zoo.rrd"
-    log_trajectories(path, model, {"initial": simulated(model, 0.0)}, Labels.of_model(model))
+    log_trajectories(path, model, {"initial": simulated(model, 0.0)}, labels_of_model(model))
     return path
 
 
@@ -464,7 +464,7 @@ class TestEstimate:
     ) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
         estimate = estimated(cart, trajectory)
-        log_estimate(path, cart, estimate, trajectory, trajectory, Labels.of_model(cart))
+        log_estimate(path, cart, estimate, trajectory, trajectory, labels_of_model(cart))
         at = ("recording 1", "qpos:slide [m]")
         times, values = column(path, ("outputs", *at, "measured"), "sim_time", "Scalars:scalars")
         kept = np.isfinite(estimate.recordings[0].y[:, 0])
@@ -479,7 +479,7 @@ class TestEstimate:
     def test_measured_robot_is_transparent(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
         log_estimate(
-            path, cart, estimated(cart, trajectory), trajectory, trajectory, Labels.of_model(cart)
+            path, cart, estimated(cart, trajectory), trajectory, trajectory, labels_of_model(cart)
         )
         alpha = {}
         for key in ("measured", "predicted"):
@@ -498,7 +498,7 @@ class TestEstimate:
             estimated(cart, trajectory),
             None,
             trajectory,
-            Labels.of_model(cart),
+            labels_of_model(cart),
             addition="see the report",
         )
         assert not [entry for entry in entities(path) if entry.startswith("/robots/measured")]
@@ -511,7 +511,7 @@ class TestLabels:
     """Labels with names and units, and the series of a history."""
 
     def test_units_follow_joints_and_plain_actuators(self, cart: mujoco.MjModel) -> None:
-        names = Labels.of_model(cart)
+        names = labels_of_model(cart)
         assert names.positions == ("slide [m]", "hinge [rad]")
         assert names.velocities == ("slide velocity [m/s]", "hinge velocity [rad/s]")
         assert names.controls == ("force [N]",)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import per_second
-from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     GRID_COLOUR,
     INITIAL_COLOUR,
@@ -34,6 +33,7 @@ from mjfim.output.plots.style import (
     write_message,
 )
 from mjfim.records.design import Design, Evaluation
+from mjfim.records.labels import Labels
 
 # Largest number of panels of the trajectories that stand in two columns; more stand in four.
 MAX_PANELS_IN_TWO_COLUMNS = 9

@@ -12,7 +12,6 @@ from scipy.stats import norm
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError
-from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     MUTED_COLOUR,
     NORMAL_FONT,
@@ -28,6 +27,7 @@ from mjfim.output.plots.style import (
     trajectory_style,
     write_message,
 )
+from mjfim.records.labels import Labels
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 
 # Distance from the quartiles beyond which estimates are outliers, as a multiple of the distance

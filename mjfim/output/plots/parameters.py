@@ -12,7 +12,6 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Transform
 
 from mjfim.arrays import Array
-from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     INITIAL_COLOUR,
     NORMAL_FONT,
@@ -32,6 +31,7 @@ from mjfim.output.plots.style import (
 from mjfim.output.summaries.accuracy import BEST_CASE
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.labels import Labels
 
 # Half width of the 95 % interval of a normal distribution, in standard deviations.
 QUANTILE_95 = 1.959964

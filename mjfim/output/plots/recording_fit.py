@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import MjfimError, listed
 from mjfim.model.coordinates import split_unit
-from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     GRID_COLOUR,
     MEASURED_COLOUR,
@@ -30,6 +29,7 @@ from mjfim.output.plots.style import (
     write_message,
 )
 from mjfim.records.estimate import Estimate
+from mjfim.records.labels import Labels
 from mjfim.records.recording import Recording
 
 # Largest number of outputs in a figure; of more, the worst ones are shown.

@@ -13,7 +13,6 @@ from scipy.stats import chi2
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
-from mjfim.output.labels import Labels
 from mjfim.output.plots.recording_fit import MAX_OUTPUTS, shown_outputs
 from mjfim.output.plots.style import (
     GRID_COLOUR,
@@ -33,6 +32,7 @@ from mjfim.output.plots.style import (
     write_message,
 )
 from mjfim.records.estimate import Estimate, Prediction
+from mjfim.records.labels import Labels
 
 # Largest number of residuals in one segment of an averaged periodogram (Welch's method).
 SEGMENT_LENGTH = 256

@@ -6,6 +6,7 @@ user, from a `matplotlibrc` or in Python, change no figure.
 
 from __future__ import annotations
 
+import io
 import os
 import textwrap
 import threading
@@ -63,6 +64,9 @@ NOTE_FONT = 7.5
 
 # Characters of a footnote that fit in one inch.
 NOTE_CHARACTERS_PER_INCH = 17
+
+# Resolution at which a notebook shows figures; their files in it are twice as fine [pixels/inch].
+NOTEBOOK_DPI = 80.0
 
 # Name and colour in figures of the two trajectories of a design or study, by their name in the
 # records.
@@ -253,6 +257,17 @@ def trajectory_style(trajectory: str) -> tuple[str, str]:
 # ---- figures and axes
 
 
+class NotebookFigure(Figure):
+    """Figure that a notebook shows, also where the user has not imported pyplot."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, float]]:
+        """Return the figure as PNG, and the width at which it is shown [pixels]."""
+        stream = io.BytesIO()
+        with STYLE_LOCK, matplotlib.style.context("default"):
+            self.savefig(stream, format="png", dpi=2.0 * NOTEBOOK_DPI)
+        return stream.getvalue(), {"width": NOTEBOOK_DPI * self.get_figwidth()}
+
+
 def new_figure(width: float, height: float) -> Figure:
     """Return a blank figure with an Agg canvas and constrained layout.
 
@@ -261,7 +276,7 @@ def new_figure(width: float, height: float) -> Figure:
         height: Height [inch].
     """
     layout = ConstrainedLayoutEngine(w_pad=0.09, h_pad=0.07)
-    figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
+    figure = NotebookFigure(figsize=(width, height), layout=layout, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 
-from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     LARGE_FONT,
     MUTED_COLOUR,
@@ -28,6 +27,7 @@ from mjfim.output.summaries.design import describe_design
 from mjfim.output.summaries.monte_carlo import MAX_MATRIX, describe_study
 from mjfim.output.summary_parts import Cell, Name, Quantity, SummaryTable
 from mjfim.records.design import Design
+from mjfim.records.labels import Labels
 from mjfim.records.monte_carlo import MonteCarloStudy
 
 # Height of a row of text [inch].

@@ -12,7 +12,6 @@ import rerun.blueprint as rrb
 
 from mjfim.arrays import evenly_spread_indices
 from mjfim.model.coordinates import output_label
-from mjfim.output.labels import Labels
 from mjfim.output.rerun.camera import place_camera
 from mjfim.output.rerun.history import history_bars, history_lines, log_history
 from mjfim.output.rerun.layout import (
@@ -40,6 +39,7 @@ from mjfim.output.rerun.shapes import RobotStyle
 from mjfim.output.rerun.text import design_text, estimate_text
 from mjfim.records.design import Design, Evaluation
 from mjfim.records.estimate import Estimate
+from mjfim.records.labels import Labels
 from mjfim.records.trajectory import Trajectory
 
 # Styles of the initial and the optimized trajectory, and of a predicted and a measured motion.
@@ -78,7 +78,7 @@ def log_design(
         path: The file.
         model: The model.
         design: The design.
-        labels: Labels of the model's columns, usually `Labels.of_model(model)`.
+        labels: Labels of the model's columns, usually `labels_of_model(model)`.
         addition: Markdown to append to the summary.
     """
     evaluations = {"initial": design.initial, "optimized": design.final}

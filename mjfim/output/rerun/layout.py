@@ -15,7 +15,6 @@ import rerun.blueprint as rrb
 
 from mjfim.atomic_io import replacing
 from mjfim.model.coordinates import output_label
-from mjfim.output.labels import Labels
 from mjfim.output.rerun.camera import Camera
 from mjfim.output.rerun.panels import (
     LayoutPart,
@@ -25,6 +24,7 @@ from mjfim.output.rerun.panels import (
     stack_parts,
 )
 from mjfim.output.rerun.scene import EntityParts, entity_path, has_floor
+from mjfim.records.labels import Labels
 from mjfim.records.recording import Recording
 
 # Colour of the background of the 3D views (0..255).

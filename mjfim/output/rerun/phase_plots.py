@@ -13,10 +13,10 @@ import rerun.blueprint as rrb
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
-from mjfim.output.labels import Labels
 from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
 from mjfim.output.rerun.shapes import RobotStyle
 from mjfim.records.design import Design
+from mjfim.records.labels import Labels
 
 # Largest number of phase plots.
 MAX_PHASE_PLOTS = 9

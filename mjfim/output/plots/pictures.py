@@ -1,0 +1,138 @@
+"""The figures of every kind of result, by the names of their files without the ending."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial, singledispatch
+
+from matplotlib.figure import Figure
+
+from mjfim.errors import MjfimError, unknown
+from mjfim.output import plots
+from mjfim.output.labels import complete_labels
+from mjfim.records.check import Check
+from mjfim.records.comparison import Comparison
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
+from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.robustness import Robustness
+from mjfim.records.shown import ShownRecord
+
+# Functions that draw the figures of a record, by the name of the figure.
+Pictures = dict[str, Callable[[], Figure]]
+
+
+def picture_names(record: ShownRecord) -> tuple[str, ...]:
+    """Return the names of the figures of a record, the usual one first.
+
+    Args:
+        record: The record.
+    """
+    return tuple(pictures_of(record))
+
+
+def draw(record: ShownRecord, picture: str | None = None) -> Figure:
+    """Draw a figure of a record.
+
+    Args:
+        record: The record.
+        picture: Name of the figure; default: the first one.
+
+    Raises:
+        MjfimError: The record has no such figure.
+    """
+    pictures = pictures_of(record)
+    name = next(iter(pictures)) if picture is None else picture
+    if name not in pictures:
+        raise MjfimError(unknown(f"picture of a {type(record).__name__}", name, pictures))
+    return pictures[name]()
+
+
+@singledispatch
+def pictures_of(record: ShownRecord) -> Pictures:
+    """Return the figures of a record, the usual one first.
+
+    Args:
+        record: The record.
+
+    Raises:
+        MjfimError: This kind of record has no figures.
+    """
+    raise MjfimError(f"a {type(record).__name__} has no figures")
+
+
+@pictures_of.register
+def _(design: Design) -> Pictures:
+    """The figures of a design."""
+    labels = complete_labels(design)
+    pictures: Pictures = {
+        "trajectories": partial(plots.trajectories, design, labels),
+        "sensitivity_phase": partial(plots.sensitivity_phase, design, labels),
+        "convergence": partial(plots.convergence, design),
+        "standard_deviations": partial(plots.std_bars, design, labels),
+        "table_eigenvalues": partial(plots.design_table, design, labels),
+    }
+    if design.usage:
+        pictures["limits"] = partial(plots.limits, design)
+    return pictures
+
+
+@pictures_of.register
+def _(estimate: Estimate) -> Pictures:
+    """The figures of an estimate."""
+    labels = complete_labels(estimate)
+    pictures: Pictures = {
+        "parameters": partial(plots.parameter_intervals, estimate, labels),
+        "spectra": partial(plots.residual_spectra, estimate, labels),
+    }
+    if estimate.predictions:
+        pictures["predictions"] = partial(plots.predictions, estimate, labels)
+
+    sigma = list(estimate.sigma.values())
+    for i, name in enumerate(fit_names(len(estimate.recordings))):
+        pictures[name] = partial(plots.fit, estimate, i, labels, sigma)
+    return pictures
+
+
+@pictures_of.register
+def _(study: MonteCarloStudy) -> Pictures:
+    """The figures of a Monte Carlo study."""
+    labels = complete_labels(study)
+    pictures: Pictures = {
+        histogram_name(name): partial(plots.histogram, study, i, labels)
+        for i, name in enumerate(study.parameters)
+    }
+    pictures["table_covariance"] = partial(plots.study_table, study, labels)
+    return pictures
+
+
+@pictures_of.register
+def _(check: Check) -> Pictures:
+    """The figure of a check."""
+    return {"check": partial(plots.check_figure, check)}
+
+
+@pictures_of.register
+def _(comparison: Comparison) -> Pictures:
+    """The figure of a comparison."""
+    return {"compare": partial(plots.compare_figure, comparison)}
+
+
+@pictures_of.register
+def _(result: Robustness) -> Pictures:
+    """The figure of a robustness study."""
+    return {"playback": partial(plots.robustness_figure, result)}
+
+
+def fit_names(count: int) -> tuple[str, ...]:
+    """Return the names of the figures of the fits of `count` recordings."""
+    if count == 1:
+        return ("fit",)
+    return tuple(f"fit_{i + 1}" for i in range(count))
+
+
+def histogram_name(parameter: str) -> str:
+    """Return the name of the histogram of a parameter."""
+    safe_name = re.sub(r"[^\w.-]", "_", parameter)
+    return f"histogram_{safe_name}"

@@ -1,0 +1,201 @@
+"""Results as a notebook shows them: HTML, figures, and the names of figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import mjfim
+from mjfim.errors import MjfimError
+from mjfim.output.folders import DESIGN_FILES, estimate_files, study_files
+from mjfim.output.html import render
+from mjfim.output.presentation import describe
+from mjfim.output.summary_parts import (
+    Emphasis,
+    Listing,
+    Paragraph,
+    Row,
+    Summary,
+    SummaryTable,
+    columns,
+)
+from mjfim.records.design import Design
+from mjfim.records.robustness import RobotConditions, Robustness
+from mjfim.records.shown import ShownRecord
+from tests.support.paths import MODELS
+
+# A name that would change a page, if it were not escaped.
+HOSTILE = "<script>alert('θ')</script> & \"m\""
+
+
+@pytest.fixture(scope="module")
+def experiment() -> mjfim.Experiment:
+    """The cart-pendulum for 0.4 s."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return experiment.replace(horizon=0.4, descent={"max_iterations": 1})
+
+
+@pytest.fixture(scope="module")
+def design(experiment: mjfim.Experiment) -> Design:
+    """A design after one iteration."""
+    return mjfim.design(experiment)
+
+
+@pytest.fixture(scope="module")
+def estimate(experiment: mjfim.Experiment, design: Design) -> mjfim.Estimate:
+    """An estimate from one recording."""
+    return mjfim.identify(experiment, [mjfim.simulate(experiment, design.trajectory, seed=0)])
+
+
+@pytest.fixture(scope="module")
+def study(experiment: mjfim.Experiment, design: Design) -> mjfim.MonteCarloStudy:
+    """Three trials."""
+    return mjfim.monte_carlo(experiment, {"final": design.trajectory}, trials=3)
+
+
+@pytest.fixture(scope="module")
+def check(experiment: mjfim.Experiment) -> mjfim.Check:
+    """A check of the initial control."""
+    return mjfim.check(experiment)
+
+
+@pytest.fixture(scope="module")
+def comparison(experiment: mjfim.Experiment) -> mjfim.Comparison:
+    """A multisine beside the design."""
+    return mjfim.compare(experiment, steps=20_000, methods=["multisine"])
+
+
+@pytest.fixture
+def robustness() -> Robustness:
+    """Four robots of a model with one parameter, without limits."""
+    return Robustness(
+        conditions=RobotConditions(),
+        names=("m",),
+        units=("kg",),
+        limits=(),
+        wrong=np.array([0.2]),
+        z=np.array([[0.5], [-1.0], [1.5], [0.1]]),
+        error=np.full((4, 1), 0.01),
+        std=np.full((4, 1), 0.01),
+        predicted=np.array([0.01]),
+        joint=(4, 4),
+        margins=np.zeros((4, 0)),
+        planned=np.zeros(0),
+        fit=1.0,
+        misfits=0,
+        restarted=0,
+        troubles={},
+    )
+
+
+@pytest.fixture(params=["check", "design", "estimate", "comparison", "study", "robustness"])
+def record(request: pytest.FixtureRequest) -> ShownRecord:
+    """Each kind of result in turn."""
+    found: ShownRecord = request.getfixturevalue(request.param)
+    return found
+
+
+def texts(html: str) -> list[str]:
+    """Return all texts of well-formed HTML."""
+    return list(ElementTree.fromstring(html).itertext())
+
+
+def numbers_of(summary: Summary) -> Iterator[str]:
+    """Yield all cells of the tables of a summary."""
+    for table in summary.tables:
+        for row in table.rows:
+            yield from (str(cell) for cell in row.cells)
+
+
+def test_the_html_is_well_formed_and_has_all_cells(record: ShownRecord) -> None:
+    html = record._repr_html_()
+    found = set(texts(html))
+    assert {cell for cell in numbers_of(describe(record)) if cell} <= found
+    assert "nan" not in html and "None" not in html
+
+
+def test_a_figure_is_drawn_and_shown_as_png(record: ShownRecord) -> None:
+    figure = record.plot()
+    assert isinstance(figure, Figure)
+    png, options = figure._repr_png_()  # type: ignore[attr-defined]
+    assert png.startswith(b"\x89PNG")
+    assert 300.0 < options["width"] < 1800.0
+
+
+def test_an_unknown_figure_is_an_error_that_lists_the_names(design: Design) -> None:
+    with pytest.raises(MjfimError, match=r"trajectorys.*did you mean 'trajectories'"):
+        design.plot("trajectorys")
+
+
+def test_figures_have_the_names_of_the_files_that_verbs_write(
+    design: Design, estimate: mjfim.Estimate, study: mjfim.MonteCarloStudy
+) -> None:
+    written = {*DESIGN_FILES, *estimate_files(1), *study_files(study.parameters)}
+    pictures = {f"{name}.png" for record in (design, estimate, study) for name in record.pictures}
+    assert pictures <= written
+    drawn = {name for name in written if name.endswith(".png")}
+    assert drawn - pictures == {"limits.png"}  # this experiment states no limits
+
+
+def test_labels_of_the_model_are_kept_in_the_file(design: Design, tmp_path: Path) -> None:
+    design.save(tmp_path)
+    loaded = mjfim.Design.load(tmp_path)
+    assert loaded.labels == design.labels
+    assert design.labels is not None
+    assert design.labels.qpos == ("slide [m]", "hinge [rad]")
+    assert loaded._repr_html_() == design._repr_html_()
+
+
+@pytest.mark.parametrize("name", ["design", "estimate", "study"])
+def test_records_of_earlier_versions_are_drawn_without_names(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    earlier: Any = replace(request.getfixturevalue(name), labels=None)
+    assert isinstance(earlier.plot(), Figure)
+    assert texts(earlier._repr_html_())
+
+
+def test_names_and_sentences_are_escaped(design: Design) -> None:
+    labels = design.labels
+    assert labels is not None
+    names = (HOSTILE, *design.parameters[1:])
+    odd = replace(
+        design,
+        parameters=names,
+        labels=replace(labels, parameters=names, parameter_units=("<b>", "", "")),
+        warnings=(HOSTILE,),
+        found_by=HOSTILE,
+    )
+    html = odd._repr_html_()
+    assert "<script" not in html and "<b>" not in html
+    assert f"{HOSTILE} (<b>)" in texts(html)
+
+
+def test_every_part_of_a_summary_is_escaped() -> None:
+    table = SummaryTable(
+        key="k",
+        title=HOSTILE,
+        columns=columns(HOSTILE),
+        rows=(Row(cells=(HOSTILE,), emphasis=Emphasis.WARNING),),
+        note=HOSTILE,
+    )
+    parts = (
+        table,
+        replace(table, detail=True),
+        Paragraph(text=HOSTILE, emphasis=Emphasis.STRONG),
+        Listing(title=HOSTILE, items=(f"• {HOSTILE}\nsecond line",)),
+    )
+    summary = Summary(title=HOSTILE, outcome=HOSTILE, parts=parts, warnings=(HOSTILE,))
+    html = render(summary)
+    found = texts(html)
+    assert "<script" not in html
+    assert found.count(HOSTILE) == 13
+    assert f"Warning: {HOSTILE}" in found
+    assert "second line" in found
