@@ -158,7 +158,9 @@ def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable
     def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         """Raise TypeError for an old name of an argument; otherwise call the function."""
         for old, (new, meaning) in RENAMED_ARGUMENTS.items():
-            if old in kwargs and old not in known and new in known:
+            # `progress` has a new meaning: it was a function before.
+            is_old = old in kwargs and (old not in known or callable(kwargs[old]))
+            if is_old and new in known:
                 raise TypeError(
                     f"{function.__name__}() has no argument {old!r} any more: use {new!r}, "
                     f"{meaning}"

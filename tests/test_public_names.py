@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pydoc
 from typing import Any
 
 import pytest
@@ -26,6 +27,21 @@ VERBS_WITH_CALLBACK = (
 def test_all_public_names_exist() -> None:
     for name in mjfim.__all__:
         assert getattr(mjfim, name) is not None
+
+
+def test_help_describes_the_public_names_only() -> None:
+    text = pydoc.render_doc(mjfim, renderer=pydoc.plaintext)
+    assert "optimal experiment design" in text
+    assert [name for name in mjfim.__all__ if name not in text] == []
+    assert [name for name in ("import_module", "RENAMED", "MODULES") if name in text] == []
+
+
+def test_progress_is_true_or_false_and_no_function_any_more() -> None:
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    with pytest.raises(TypeError, match=r"progress.*callback"):
+        mjfim.design(experiment, progress=print)  # type: ignore[arg-type]
+    short = experiment.replace(horizon=0.2, descent={"max_iterations": 0})
+    assert mjfim.design(short, progress=False).iterations == 0
 
 
 @pytest.mark.parametrize(("old", "new"), mjfim.RENAMED.items())

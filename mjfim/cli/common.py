@@ -27,6 +27,7 @@ from mjfim.interruption import (
     Interruption,
     current_interruption,
 )
+from mjfim.output.progress_text import design_text, fit_text, part_text
 from mjfim.parallel import LOST_SENTENCE, MAX_THREADS, Pool
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.serialization import as_json as records_as_json
@@ -365,20 +366,11 @@ class ProgressDisplay:
 
     def _show_design(self, event: DesignEvent) -> None:
         """Show an iterate of a design."""
-        row = event.row
-        text = (
-            f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  "
-            f"slope {row.slope:.1e}"
-        )
-        self._show_iterate(text, row.iteration, DESIGN_LINES)
+        self._show_iterate(design_text(event), event.row.iteration, DESIGN_LINES)
 
     def _show_fit(self, event: FitEvent) -> None:
         """Show an iterate of an estimation."""
-        text = (
-            f"{event.phase}: iteration {event.iteration}, half the sum of squares "
-            f"{event.cost:.6g}, step {event.step:.2g} σ"
-        )
-        self._show_iterate(text, event.iteration, FIT_LINES)
+        self._show_iterate(fit_text(event), event.iteration, FIT_LINES)
 
     def _show_iterate(self, text: str, iteration: int, period: int) -> None:
         """Show an iterate on the bar; without a terminal, print every `period`-th iterate."""
@@ -395,7 +387,7 @@ class ProgressDisplay:
             self._print(event.message)
             return
 
-        part = f"{event.index + 1}/{event.count} {event.part}"
+        part = part_text(event)
         self._latest = part
         self._bar.update(
             self._task,

@@ -40,6 +40,7 @@ from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import GROUPS_TEXT, ParameterGroup, groups_in_words
 from mjfim.records.design import Design, Evaluation, Status
 from mjfim.records.events import DesignCallback
+from mjfim.records.progress import shown_progress
 
 
 @explain_renamed_arguments
@@ -51,6 +52,7 @@ def design(
     threads: int | None = None,
     executor: Executor | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> Design:
     """Design the control that minimises the cost of the experiment within its limits.
 
@@ -66,6 +68,7 @@ def design(
         executor: Executor of `concurrent.futures` that runs several starts under hard limits side
             by side.
         stop: Token that ends the search early.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
     Returns:
         The design.
@@ -75,11 +78,14 @@ def design(
         UnidentifiableError: A parameter has no effect, or the initial control does not excite it.
         SimulationDivergedError: The simulation diverges along the initial control.
     """
-    with stop_on_interrupt(stop) as token:
+    with (
+        stop_on_interrupt(stop) as token,
+        shown_progress("designing", callback, progress) as show,
+    ):
         task = DesignTask.resolve(experiment, threads=threads)
         return design_task(
             task,
-            callback=callback,
+            callback=show,
             initial_control=initial_control,
             executor=executor,
             budget=design_budget(task, token),

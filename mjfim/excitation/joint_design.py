@@ -24,6 +24,7 @@ from mjfim.information.marginal import shared
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.events import DesignCallback
+from mjfim.records.progress import shown_progress
 
 
 @explain_renamed_arguments
@@ -36,6 +37,7 @@ def design_jointly(
     threads: int | None = None,
     executor: Executor | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> tuple[Design, ...]:
     """Design several experiments in turn, each given the information of the others.
 
@@ -51,6 +53,7 @@ def design_jointly(
         executor: Executor of `concurrent.futures` that runs several starts under hard limits side
             by side.
         stop: Token that ends the search with the best designs so far, as Ctrl-C does.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
     Returns:
         One design per experiment. `final.information` of each contains the information of all
@@ -61,7 +64,10 @@ def design_jointly(
         ExperimentError: There are fewer than two experiments, or their parameters differ. See also
             `design`.
     """
-    with stop_on_interrupt(stop) as token:
+    with (
+        stop_on_interrupt(stop) as token,
+        shown_progress("designing", callback, progress) as show,
+    ):
         tasks = [DesignTask.resolve(experiment, threads=threads) for experiment in experiments]
         _require_common_parameters(tasks)
 
@@ -82,7 +88,7 @@ def design_jointly(
                 added = sum(others, start=np.zeros_like(information[i]))
                 design = design_task(
                     task.restated(task.experiment, added_information=added),
-                    callback=callback,
+                    callback=show,
                     initial_control=None if earlier is None else earlier.trajectory.ctrl,
                     executor=executor,
                     budget=design_budget(task, token),

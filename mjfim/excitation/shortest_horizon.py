@@ -32,6 +32,7 @@ from mjfim.recordings.formats.read import read_table
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
 from mjfim.records.events import Callback, StudyEvent
+from mjfim.records.progress import shown_progress
 from mjfim.records.serialization import SavedRecord
 
 # Ratio of the longest horizon that is tried by default to the stated one.
@@ -161,6 +162,7 @@ def shortest_experiment(
     threads: int | None = None,
     executor: Executor | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> ShortestExperiment:
     """Find the shortest experiment whose design is predicted to reach all target accuracies.
 
@@ -179,6 +181,7 @@ def shortest_experiment(
         executor: Executor of `concurrent.futures` that runs several starts under hard limits side
             by side.
         stop: Token that ends the search with the shortest experiment so far, as Ctrl-C does.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
     Returns:
         The shortest experiment. If the search was stopped before any duration reached the targets,
@@ -192,9 +195,12 @@ def shortest_experiment(
     if tolerance is not None and not tolerance > 0.0:
         raise ExperimentError(f"shortest_experiment: tolerance {tolerance:g} s; it must be > 0")
 
-    with stop_on_interrupt(stop) as token:
+    with (
+        stop_on_interrupt(stop) as token,
+        shown_progress("designing", callback, progress) as show,
+    ):
         task = DesignTask.resolve(experiment, threads=threads)
-        search = _HorizonSearch(task, tolerance, callback, executor, token)
+        search = _HorizonSearch(task, tolerance, show, executor, token)
         return search.run(_default_longest(task) if longest is None else longest)
 
 

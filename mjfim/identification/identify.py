@@ -37,6 +37,7 @@ from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergen
 from mjfim.plant.noise import Noise
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
+from mjfim.records.progress import shown_progress
 from mjfim.records.recording import Recording
 
 # Settings of the paper's Newton-Raphson iteration.
@@ -94,6 +95,7 @@ def identify(
     callback: Callback | None = None,
     threads: int | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> Estimate:
     """Estimate parameters from recordings, with the settings of the table `[fit]`.
 
@@ -111,6 +113,7 @@ def identify(
         callback: Called with every iterate.
         threads: Threads for the engine; default: one per core.
         stop: Token that ends the search with the best result so far.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -120,10 +123,11 @@ def identify(
         RecordingError: A recording cannot be used.
         SimulationDivergedError: The model diverges at the start.
     """
-    task = FitTask.resolve(
-        experiment, recordings, method=method, start=start, held_out=held_out, threads=threads
-    )
-    return identify_task(task, callback=callback, stop=stop)
+    with shown_progress("identifying", callback, progress) as show:
+        task = FitTask.resolve(
+            experiment, recordings, method=method, start=start, held_out=held_out, threads=threads
+        )
+        return identify_task(task, callback=show, stop=stop)
 
 
 def identify_system(

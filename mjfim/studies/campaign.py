@@ -34,6 +34,7 @@ from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback, StudyEvent
+from mjfim.records.progress import shown_progress
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import CampaignHistory, redesign, restate_experiment
 
@@ -60,6 +61,7 @@ def run_campaign(
     done: Sequence[EarlierRound] = (),
     executor: Executor | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> Campaign:
     """Design, record and identify in rounds until every target standard deviation is reached.
 
@@ -79,6 +81,7 @@ def run_campaign(
         executor: Executor of `concurrent.futures`; under hard limits it runs several optimisations
             at once.
         stop: Ends the campaign early, as Ctrl-C does, after the last complete round.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
     Raises:
         ExperimentError: No parameter states a target, or the request is faulty.
@@ -95,8 +98,11 @@ def run_campaign(
         )
 
     task = DesignTask.resolve(experiment, threads=threads)
-    with stop_on_interrupt(stop) as token:
-        campaign = _CampaignRun(task, rounds, callback, executor, token)
+    with (
+        stop_on_interrupt(stop) as token,
+        shown_progress("campaign", callback, progress) as show,
+    ):
+        campaign = _CampaignRun(task, rounds, show, executor, token)
         status = campaign.run(measure, done)
         return campaign.record(status)
 

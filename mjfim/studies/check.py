@@ -36,6 +36,7 @@ from mjfim.records.check import (
 )
 from mjfim.records.combinations import ParameterGroup, groups_in_words, join_names
 from mjfim.records.design import CombinationAccuracy
+from mjfim.records.progress import shown_progress
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.derivative_test import self_test
@@ -57,6 +58,7 @@ def check(
     *,
     threads: int | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> Check:
     """Check which parameters can be identified, at the parameter values that a design uses.
 
@@ -68,6 +70,7 @@ def check(
         trajectory: Trajectory, of a design for example, whose control is checked instead.
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the check early, as Ctrl-C does; the record then says what is missing.
+        progress: False for no sign of progress in a notebook.
 
     Raises:
         RecordingError: Recordings are unusable, or given together with a trajectory.
@@ -76,11 +79,12 @@ def check(
     if recordings and trajectory is not None:
         raise RecordingError("check either recordings or a designed trajectory, not both")
 
-    if recordings:
-        return check_recordings(System.resolve(experiment, threads=threads), recordings, stop)
+    with shown_progress("checking", None, progress):
+        if recordings:
+            return check_recordings(System.resolve(experiment, threads=threads), recordings, stop)
 
-    require_design_keys(experiment, "check without recordings")
-    return check_task(DesignTask.resolve(experiment, threads=threads), trajectory, stop)
+        require_design_keys(experiment, "check without recordings")
+        return check_task(DesignTask.resolve(experiment, threads=threads), trajectory, stop)
 
 
 @one_blas_thread()

@@ -29,6 +29,7 @@ from mjfim.parallel import run_in_order, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
+from mjfim.records.progress import shown_progress
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.baselines.methods import METHODS, run_baseline
 
@@ -62,6 +63,7 @@ def compare(
     callback: Callback | None = None,
     threads: int | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> Comparison:
     """Run baselines and then the design, each until its time or its MuJoCo steps are used up.
 
@@ -80,22 +82,24 @@ def compare(
             the design.
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the comparison early, as Ctrl-C does; the methods that are finished are returned.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
     Raises:
         ExperimentError: A budget or a method is faulty.
         MjfimError: As `mjfim.design` raises it.
     """
     task = DesignTask.resolve(experiment, threads=threads)
-    return compare_task(
-        task,
-        seconds=seconds,
-        steps=steps,
-        seed=seed,
-        methods=methods,
-        executor=executor,
-        callback=callback,
-        stop=stop,
-    )
+    with shown_progress("comparing", callback, progress) as show:
+        return compare_task(
+            task,
+            seconds=seconds,
+            steps=steps,
+            seed=seed,
+            methods=methods,
+            executor=executor,
+            callback=show,
+            stop=stop,
+        )
 
 
 def compare_task(

@@ -33,6 +33,7 @@ from mjfim.memory import NUMBER_BYTES, require_memory
 from mjfim.parallel import one_blas_thread
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.progress import shown_progress
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
@@ -81,6 +82,7 @@ def monte_carlo(
     callback: Callback | None = None,
     threads: int | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> MonteCarloStudy:
     """Estimate the parameters from many noisy repetitions of one or several trajectories.
 
@@ -96,6 +98,7 @@ def monte_carlo(
         callback: Called with a `StudyEvent` whenever all trials have made a step.
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the study early, as Ctrl-C does; the trials that are finished are returned.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
     Raises:
         ExperimentError: Fewer than two trials, or more than fit into memory.
@@ -106,9 +109,10 @@ def monte_carlo(
         experiment = experiment.replace(measure_rate=measure_rate)
     system = System.resolve(experiment, threads=threads)
 
-    return monte_carlo_system(
-        system, trajectory, trials=trials, seed=seed, callback=callback, stop=stop
-    )
+    with shown_progress("repeating the experiment", callback, progress) as show:
+        return monte_carlo_system(
+            system, trajectory, trials=trials, seed=seed, callback=show, stop=stop
+        )
 
 
 @one_blas_thread()

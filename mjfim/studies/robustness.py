@@ -28,6 +28,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.parallel import pool_stop_token, run_in_order
 from mjfim.records.events import Callback, StudyEvent
+from mjfim.records.progress import shown_progress
 from mjfim.records.robustness import (
     CONFIDENCE,
     LATENCY,
@@ -49,6 +50,7 @@ def assess_robustness(
     callback: Callback | None = None,
     executor: Executor | None = None,
     stop: StopToken | None = None,
+    progress: bool = True,
 ) -> Robustness:
     """Play a design on simulated robots that differ from the model, and identify each of them.
 
@@ -67,6 +69,7 @@ def assess_robustness(
         executor: Executor of `concurrent.futures` that runs several robots at once, such as
             `mjfim.Pool`; None for one robot after another.
         stop: Ends the study early; the robots that are finished count.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
     Returns:
         Errors of the estimates and margins of the limits, over all finished robots.
@@ -83,12 +86,15 @@ def assess_robustness(
     bench = RobotBench(experiment, table, conditions)
 
     found: list[RobotRun] = []
-    with stop_on_interrupt(stop) as token:
+    with (
+        stop_on_interrupt(stop) as token,
+        shown_progress("playing the design", callback, progress) as show,
+    ):
         for run in _play_all(
             bench, _RobotStudy.of(experiment, table, conditions), runs, executor, token
         ):
             found.append(run)
-            if callback is None:
+            if show is None:
                 continue
 
             event = StudyEvent(
@@ -99,7 +105,7 @@ def assess_robustness(
                 share=1.0,
                 message=f"{len(found)} of {runs} robots",
             )
-            callback(event)
+            show(event)
 
     if not found:
         raise NoResultError("the study was stopped before any robot was finished")

@@ -1,0 +1,149 @@
+"""Progress of verbs in a notebook."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from types import ModuleType, SimpleNamespace
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+import mjfim
+from mjfim.output import notebook_progress
+from mjfim.output.notebook_progress import NotebookProgress
+from mjfim.records import progress
+from mjfim.records.events import Event, FitEvent, StudyEvent
+from tests.support.paths import MODELS
+
+
+class Shown(list[str]):
+    """What a notebook shows at one place, the latest last."""
+
+    def update(self, data: dict[str, str], *, raw: bool) -> None:
+        """Replace what is shown."""
+        assert raw and data["text/plain"]
+        self.append(data["text/html"])
+
+
+@pytest.fixture
+def places(monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
+    """The places at which something is shown, in a notebook without delay between updates."""
+    found: list[Shown] = []
+
+    def display(data: dict[str, str], *, raw: bool, display_id: bool) -> Shown:
+        """Show something at a new place."""
+        assert raw and display_id
+        found.append(Shown([data["text/html"]]))
+        return found[-1]
+
+    monkeypatch.setattr(progress, "in_notebook", lambda: True)
+    monkeypatch.setattr(notebook_progress, "display", display)
+    monkeypatch.setattr(notebook_progress, "UPDATE_SECONDS", 0.0)
+    return found
+
+
+@pytest.fixture(scope="module")
+def experiment() -> mjfim.Experiment:
+    """The cart-pendulum for 0.4 s."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return experiment.replace(horizon=0.4, descent={"max_iterations": 2})
+
+
+def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Yield short calls of verbs."""
+    yield "designing: iteration   1", mjfim.design
+    yield "checking", mjfim.check
+    yield "comparing", lambda e, **o: mjfim.compare(e, steps=20_000, methods=["multisine"], **o)
+
+    def repeat(e: mjfim.Experiment, **options: Any) -> object:
+        """Repeat the initial trajectory."""
+        curve = mjfim.design(e.replace(descent={"max_iterations": 0}), progress=False).trajectory
+        return mjfim.monte_carlo(e, curve, trials=3, **options)
+
+    yield "repeating the experiment", repeat
+
+    def identify(e: mjfim.Experiment, **options: Any) -> object:
+        """Identify from the initial trajectory."""
+        curve = mjfim.design(e.replace(descent={"max_iterations": 0}), progress=False).trajectory
+        return mjfim.identify(e, [mjfim.simulate(e, curve)], **options)
+
+    yield "identifying: all data", identify
+
+
+@pytest.mark.parametrize(("begin", "call"), list(verbs()), ids=lambda value: str(value)[:9])
+def test_a_notebook_shows_the_progress_of_each_verb_once(
+    begin: str, call: Callable[..., Any], experiment: mjfim.Experiment, places: list[Shown]
+) -> None:
+    call(experiment)
+    (shown,) = places
+    assert "<progress" in shown[0] and "<progress" not in shown[-1]
+    assert any(begin in html for html in shown)
+    for html in shown:
+        assert ElementTree.fromstring(html).tag == "div"
+
+    places.clear()
+    call(experiment, progress=False)
+    assert places == []
+
+
+def test_a_callback_replaces_the_bar(experiment: mjfim.Experiment, places: list[Shown]) -> None:
+    events: list[Event] = []
+    mjfim.design(experiment, callback=events.append)
+    assert places == [] and len(events) >= 2
+
+
+def test_a_program_that_is_no_notebook_shows_nothing(
+    experiment: mjfim.Experiment, places: list[Shown], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "in_notebook", lambda: False)
+    mjfim.design(experiment)
+    assert places == []
+
+
+def test_an_error_is_said_where_the_bar_was(places: list[Shown]) -> None:
+    with pytest.raises(ZeroDivisionError), notebook_progress.progress("dividing"):
+        _ = 1 / 0
+    assert "dividing (ended by an error after 0.0 s)" in places[0][-1]
+
+
+def test_the_share_of_a_study_is_drawn_and_text_is_escaped(places: list[Shown]) -> None:
+    show = NotebookProgress("comparing")
+    show(StudyEvent(study="compare", part="a<b", index=1, count=4, share=0.5, message="J & λ"))
+    bar = ElementTree.fromstring(places[0][-1]).find("progress")
+    assert bar is not None
+    assert float(bar.attrib["value"]) / float(bar.attrib["max"]) == 0.375
+    assert "a&lt;b  J &amp; λ" in places[0][-1]
+
+    show(StudyEvent(study="campaign", part="", index=0, count=None, share=1.0, message="round 1"))
+    assert "comparing: round 1" in places[0][-1]
+
+
+def test_updates_that_come_too_soon_are_left_out(
+    places: list[Shown], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(notebook_progress, "UPDATE_SECONDS", 1e6)
+    show = NotebookProgress("identifying")
+    for i in range(100):
+        show(FitEvent(phase="all data", iteration=i, cost=1.0, step=1.0))
+    show.end(failed=False)
+    (shown,) = places
+    assert len(shown) == 2
+    assert "iteration 99" in shown[-1]
+
+
+def test_a_notebook_is_known_by_its_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    def shell(**attributes: Any) -> ModuleType:
+        """Make a module IPython whose shell has these attributes."""
+        module = ModuleType("IPython")
+        module.get_ipython = lambda: SimpleNamespace(**attributes)  # type: ignore[attr-defined]
+        return module
+
+    monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
+    monkeypatch.setitem(sys.modules, "IPython", shell(kernel=object()))
+    assert progress.in_notebook()
+    monkeypatch.setitem(sys.modules, "IPython", shell())
+    assert not progress.in_notebook()
+    monkeypatch.delitem(sys.modules, "IPython")
+    assert not progress.in_notebook()
