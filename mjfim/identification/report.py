@@ -12,8 +12,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.errors import listed
-from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.labels import labels_of_system
+from mjfim.experiment.stated_units import probable_degrees
 from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
