@@ -22,6 +22,7 @@ from mjfim.model.coordinates import (
 )
 from mjfim.model.elements import identifier, names_of, unnamed_count
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
+from mjfim.model.servos import servo_kind
 from mjfim.model.targets import (
     InertiaField,
     InitialStateField,
@@ -355,8 +356,6 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
 
     kp sets gainprm[0] and biasprm[1]. kv sets biasprm[2], and gainprm[0] of a velocity servo.
     """
-    gain = float(model.actuator_gainprm[actuator, 0])
-    bias = model.actuator_biasprm[actuator]
     rows = (actuator,)
 
     # The gain of a PID actuator is its integral gain; kp and kv are entries of its bias.
@@ -364,18 +363,15 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
         column = {"kp": 1, "kv": 2}[path.field]
         return ModelField(array="actuator_biasprm", rows=rows, column=column, factor=-1.0)
 
-    affine_types = (int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_SO3))
-    affine = int(model.actuator_biastype[actuator]) in affine_types
-    position_servo = affine and bias[1] == -gain
-    velocity_servo = affine and gain != 0.0 and bias[1] == 0.0 and bias[2] == -gain
-
-    if path.field == "kp" and position_servo and gain != 0.0:
+    kind = servo_kind(model, actuator)
+    has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
+    if path.field == "kp" and kind == "position" and has_gain:
         follower = ("actuator_biasprm", actuator, 1, -1.0)
         return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
-    if path.field == "kv" and velocity_servo:
+    if path.field == "kv" and kind == "velocity":
         follower = ("actuator_biasprm", actuator, 2, -1.0)
         return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
-    if path.field == "kv" and position_servo:
+    if path.field == "kv" and kind == "position":
         return ModelField(array="actuator_biasprm", rows=rows, column=2, factor=-1.0)
 
     wanted = "position" if path.field == "kp" else "position or velocity"

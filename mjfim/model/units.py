@@ -9,6 +9,8 @@ from typing import Any
 
 import mujoco
 
+from mjfim.model.servos import actuator_gear, is_integrated, servo_kind
+
 # Unit of the coordinate of a slide joint and of every other translation.
 LENGTH = "m"
 
@@ -138,7 +140,8 @@ def control_unit(model: Any, actuator: int) -> str:
     """Unit of the control of an actuator; the units of several controls are not evident.
 
     It is evident for actuators that act on one joint with a gear of 1: a direct drive (gain 1, no
-    bias) takes a force, a position servo (`biasprm[1] = -gain`) takes the joint's coordinate.
+    bias) takes a force, a position servo the joint's coordinate, and a velocity servo its rate. The
+    control of an actuator that integrates it has the unit of the rate.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
@@ -147,16 +150,17 @@ def control_unit(model: Any, actuator: int) -> str:
     Returns:
         The unit; empty where it is not evident from the model.
     """
-    gear = model.actuator_gear[int(model.actuator_outadr[actuator]), 0]
+    gear = actuator_gear(model, actuator)
     at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
     if not at_joint or gear != 1 or int(model.actuator_ctrlnum[actuator]) != 1:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])
-    unit = joint_unit(model, joint)
+    coordinate = joint_unit(model, joint)
     gain = float(model.actuator_gainprm[actuator, 0])
-    bias = model.actuator_biasprm[actuator]
-
     if int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE):
-        return FORCE_UNITS[unit] if gain == 1.0 else ""
-    return unit if bias[1] == -gain else ""
+        unit = FORCE_UNITS[coordinate] if gain == 1.0 else ""
+    else:
+        units = {"position": coordinate, "velocity": per_second(coordinate)}
+        unit = units.get(servo_kind(model, actuator) or "", "")
+    return per_second(unit) if unit and is_integrated(model, actuator) else unit

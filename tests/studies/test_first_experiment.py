@@ -18,7 +18,7 @@ from mjfim.studies.first_experiment.document import experiment_text
 from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
 from mjfim.studies.first_experiment.selection import identifiable
 from mjfim.studies.first_experiment.start import choose_start
-from mjfim.studies.first_experiment.time_scale import reach, time_scale
+from mjfim.studies.first_experiment.time_scale import RATE_RANGE, _rate, reach, time_scale
 from tests.support.cli import MODELS
 
 URDF = """
@@ -218,3 +218,99 @@ def test_parameters_are_chosen_until_one_spoils_the_others() -> None:
 
     # Where nothing is known well, the best known parameter remains.
     assert identifiable(1e-6 * np.diag([1.0, 3.0, 2.0]), sizes) == [1]
+
+
+ARM = """
+<mujoco>
+  <option timestep="{timestep}"/>
+  <worldbody>
+    <body name="arm" gravcomp="{gravcomp}">
+      <joint name="hinge" axis="0 1 0" ref="20" springref="0"/>
+      <geom size="{radius}" mass="{mass}" pos="{length} 0 0"/>
+    </body>
+  </worldbody>
+  <actuator>{actuator}</actuator>
+</mujoco>
+"""
+
+
+def arm(actuator: str, *, size: float = 1.0, mass: float = 1.0, gravcomp: float = 0.0) -> object:
+    """A horizontal arm of some length [m] and mass [kg]."""
+    text = ARM.format(
+        timestep=0.002 * np.sqrt(size),
+        radius=0.1 * size,
+        mass=mass,
+        length=size,
+        gravcomp=gravcomp,
+        actuator=actuator,
+    )
+    return mujoco.MjModel.from_xml_string(text)
+
+
+@pytest.mark.parametrize(("size", "mass"), [(1e-3, 1e-6), (1.0, 1.0), (1e3, 1e6)])
+def test_a_motor_holds_arms_of_every_size(size: float, mass: float) -> None:
+    start = choose_start(arm('<motor joint="hinge"/>', size=size, mass=mass))
+    assert start.held
+    assert start.control == pytest.approx([-9.81 * mass * size], rel=1e-3)
+
+
+def test_a_servo_is_commanded_to_where_its_joint_is() -> None:
+    position = np.deg2rad(20.0)
+    start = choose_start(arm('<position joint="hinge" kp="9"/>', gravcomp=1.0))
+    assert start.control == pytest.approx([position])
+    start = choose_start(arm('<position joint="hinge" kp="9" gear="2"/>', gravcomp=1.0))
+    assert start.control == pytest.approx([2.0 * position])
+
+    # The control of an integrated servo is a velocity, and its activation is the position.
+    start = choose_start(arm('<intvelocity joint="hinge" kp="9" actrange="-9 9"/>', gravcomp=1.0))
+    assert start.control == pytest.approx([0.0])
+    assert start.act == pytest.approx([position])
+
+
+def test_controls_of_an_actuator_with_several_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "ball.xml"
+    path.write_text(
+        """
+    <mujoco>
+      <option gravity="0 0 0"/>
+      <worldbody><body name="b"><joint name="ball" type="ball" damping="0.1"/>
+        <geom size="0.1" mass="1" pos="0.3 0 0"/>
+        <body name="c" pos="0.5 0 0"><joint name="hinge" axis="0 1 0" damping="0.1"/>
+        <geom size="0.1" mass="1" pos="0.3 0 0"/></body></body></worldbody>
+      <actuator><orientation name="turn" joint="ball" kp="2" kv="1"/>
+        <position name="elbow" joint="hinge" kp="2" kv="1"/></actuator>
+    </mujoco>
+    """,
+        encoding="utf-8",
+    )
+    model = mujoco.MjModel.from_xml_path(str(path))
+    start = choose_start(model)
+    assert len(start.control) == model.nu == 4
+    proposal, _ = proposed(path, tmp_path)
+    assert list(proposal.amplitudes) == ["turn[0]", "turn[1]", "turn[2]", "elbow"]
+
+
+def test_a_robot_that_nothing_holds_begins_where_it_drifts_least() -> None:
+    # The body floats 1 m above the floor; it settles on it.
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <worldbody><geom type="plane" size="5 5 1"/>
+        <body name="b" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.1 0.1" mass="1"/>
+        <body pos="0 0 0.1"><joint name="j" axis="0 1 0"/>
+        <geom size="0.05" mass="0.1" pos="0 0 0.1"/></body></body></worldbody>
+      <actuator><motor joint="j" ctrlrange="-1 1"/></actuator>
+    </mujoco>
+    """)
+    assert choose_start(model).qpos[2] < 0.2
+
+
+def test_rates_are_near_the_wanted_ones_and_slow_drifts_do_not_take_hours() -> None:
+    for wanted, timestep in ((97.0, 0.002), (320.0, 0.002), (33.0, 0.005)):
+        model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><option timestep="{timestep}" gravity="0 0 0"/><worldbody><body>'
+            '<joint type="slide" damping="1e-6"/><geom size="0.1" mass="1"/></body></worldbody>'
+            "</mujoco>"
+        )
+        assert RATE_RANGE**-1 <= _rate(timestep, wanted) / wanted <= RATE_RANGE
+        times = time_scale(model, mujoco.MjData(model))
+        assert times.horizon <= 10.0 * 1000 * timestep

@@ -6,13 +6,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
 from mjfim.model.elements import element_name, identifier, names_of
 from mjfim.model.inertia import body_inertia
-from mjfim.studies.first_experiment.start import is_position_servo
+from mjfim.model.servos import servo_kind
 
 Group = Literal["payload", "friction", "inertia", "motors"]
 
@@ -247,10 +246,10 @@ def _motors(model: Any) -> Iterator[Candidate]:
     fields = (("armature", "dof_armature", "inertia of the drive"),)
     yield from _joint_fields(model, fields, "motors")
 
-    for i in range(model.nu):
+    for i in range(model.nactuator):
         name = element_name(model, "actuator", i)
-        affine = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
-        if name and affine and is_position_servo(model, i):
+        has_gain = float(model.actuator_gainprm[i, 0]) != 0.0
+        if name and has_gain and servo_kind(model, i) == "position":
             yield Candidate(
                 name=f"{name}_kp",
                 group="motors",

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.sizes import translations
-from mjfim.studies.first_experiment.start import Start, is_position_servo
+from mjfim.model.servos import actuator_gear, commanded_joint
+from mjfim.model.sizes import control_sizes, translations
+from mjfim.studies.first_experiment.start import Start
 
 # Share of the range of a control that the first trial uses to each side of the resting control.
 RANGE_SHARE = 0.5
@@ -44,17 +45,24 @@ def first_amplitudes(
     distance = np.where(translations(model), LENGTH_SHARE * length, ANGLE)
     wanted = distance * (2.0 * np.pi / period) ** 2
 
-    amplitudes = np.ones(model.nu)
+    # A control that moves nothing in the start gets its natural size.
+    amplitudes = control_sizes(model, period)
     for i in range(model.nu):
         if model.actuator_ctrllimited[i]:
             low, high = model.actuator_ctrlrange[i]
             room = min(start.control[i] - low, high - start.control[i])
             amplitudes[i] = RANGE_SHARE * max(room, 0.0)
-        elif is_position_servo(model, i):
-            amplitudes[i] = float(distance[int(model.jnt_dofadr[int(model.actuator_trnid[i, 0])])])
         elif np.any(influence[:, i]):
             moved = np.abs(influence[:, i]) > 0.0
             amplitudes[i] = float((wanted[moved] / np.abs(influence[moved, i])).min())
+
+    # The joint follows the control of a position servo.
+    for actuator in range(model.nactuator):
+        control = int(model.actuator_ctrladr[actuator])
+        joint = commanded_joint(model, actuator)
+        if joint is not None and not model.actuator_ctrllimited[control]:
+            gear = abs(actuator_gear(model, actuator))
+            amplitudes[control] = gear * float(distance[int(model.jnt_dofadr[joint])])
 
     return rounded(amplitudes)
 

@@ -12,7 +12,8 @@ from scipy.optimize import lsq_linear
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs
-from mjfim.model.sizes import translations
+from mjfim.model.servos import actuator_gear, commanded_joint, is_integrated
+from mjfim.model.sizes import control_sizes, translations
 from mjfim.studies.first_experiment.time_scale import free_time, pendulum_time, reach
 
 # A state is held where the robot needs this many characteristic periods, sqrt(length / gravity), to
@@ -47,7 +48,8 @@ class Start:
         qpos: (nq,) positions.
         act: (na,) activations.
         control: (nu,) control that holds the state, or that comes near to it.
-        held: Whether the control holds the state.
+        drift: Largest acceleration under the control, relative to that of a state that counts as
+            held.
         reason: Sentence that says where the state comes from.
     """
 
@@ -55,15 +57,21 @@ class Start:
     qpos: Array
     act: Array
     control: Array
-    held: bool
+    drift: float
     reason: str
+
+    @property
+    def held(self) -> bool:
+        """Whether the control holds the state."""
+        return self.drift <= 1.0
 
 
 def choose_start(model: Any) -> Start:
     """Choose a state at rest in which an experiment can begin.
 
     Named keyframes that a control holds come first, then the reference positions, then the state in
-    which the model settles by itself. Where nothing holds, the first of these is taken.
+    which the model settles by itself. Where nothing holds, the one that drifts least is
+    taken: a robot with legs begins on its feet.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
@@ -73,7 +81,7 @@ def choose_start(model: Any) -> Start:
         if start.held:
             return start
         candidates.append(start)
-    return candidates[0]
+    return min(candidates, key=lambda start: start.drift)
 
 
 def _candidates(model: Any) -> Iterator[Start]:
@@ -106,28 +114,27 @@ def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reaso
     """A start with the control that holds it best."""
     data = mujoco.MjData(model)
     control = _holding_control(model, data, qpos, guess)
-    acceleration = _acceleration(model, data, qpos, control)
-    held = bool(np.all(acceleration <= _tolerated_acceleration(model, data)))
+    drift = _drift(model, data, qpos, control)
 
     # The control of a keyframe is kept where it holds its state.
     if keyframe is not None:
-        by_guess = _acceleration(model, data, qpos, guess)
-        if np.all(by_guess <= _tolerated_acceleration(model, data)):
-            control, held = np.array(guess), True
+        by_guess = _drift(model, data, qpos, guess)
+        if by_guess <= 1.0:
+            control, drift = np.array(guess), by_guess
 
     return Start(
         keyframe=keyframe,
         qpos=np.array(qpos),
         act=_activations(model, data, control),
-        control=_readable(model, control) if keyframe is None else control,
-        held=held,
+        control=control if keyframe is not None else _readable(model, data, control),
+        drift=drift,
         reason=reason,
     )
 
 
-def _readable(model: Any, control: Array) -> Array:
+def _readable(model: Any, data: Any, control: Array) -> Array:
     """(nu,) controls with six significant digits; those that hardly differ from zero are zero."""
-    _, _, width = _ranges(model, control)
+    _, _, width = _ranges(model, data, control)
     values = np.array([float(f"{value:.6g}") for value in control])
     return np.asarray(np.where(np.abs(values) > READABLE_SHARE * width, values, 0.0))
 
@@ -153,40 +160,36 @@ def _resting_control(model: Any, qpos: Array) -> Array:
     control[limited] = np.clip(0.0, low[limited], high[limited])
 
     # A position servo is commanded to where its joint is.
-    for i in range(model.nu):
-        if is_position_servo(model, i):
-            control[i] = qpos[int(model.jnt_qposadr[int(model.actuator_trnid[i, 0])])]
+    for actuator in range(model.nactuator):
+        joint = commanded_joint(model, actuator)
+        if joint is not None:
+            position = qpos[int(model.jnt_qposadr[joint])]
+            control[int(model.actuator_ctrladr[actuator])] = (
+                actuator_gear(model, actuator) * position
+            )
     return control
-
-
-def is_position_servo(model: Any, actuator: int) -> bool:
-    """Whether the control of an actuator is the wanted position of a slide or hinge joint."""
-    gain = float(model.actuator_gainprm[actuator, 0])
-    bias = float(model.actuator_biasprm[actuator, 1])
-    at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
-    joint = int(model.actuator_trnid[actuator, 0])
-    return at_joint and gain != 0.0 and bias == -gain and joint_dofs(model, joint) == 1
 
 
 def influence_of_controls(model: Any, start: Start) -> Array:
     """(nv, nu) derivatives of the accelerations by the controls, in the initial state."""
     data = mujoco.MjData(model)
-    _, high, width = _ranges(model, start.control)
+    mujoco.mj_forward(model, data)
+    _, high, width = _ranges(model, data, start.control)
     return _influence(model, data, start.qpos, start.control, high, width)
 
 
 def _activations(model: Any, data: Any, control: Array) -> Array:
     """(na,) activations in which actuators with a state rest under a control."""
     act = np.zeros(model.na)
-    for i in range(model.nu):
+    for i in range(model.nactuator):
         first, count = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
         if count == 0:
             continue
-        dynamics = int(model.actuator_dyntype[i])
-        if dynamics == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):
-            act[first : first + count] = data.actuator_length[i]
-        else:
-            act[first : first + count] = control[i]
+        if is_integrated(model, i):
+            act[first : first + count] = data.actuator_length[int(model.actuator_outadr[i])]
+        elif int(model.actuator_ctrlnum[i]) in (1, count):
+            controls = int(model.actuator_ctrladr[i])
+            act[first : first + count] = control[controls : controls + count]
     return act
 
 
@@ -196,7 +199,8 @@ def _holding_control(model: Any, data: Any, qpos: Array, guess: Array) -> Array:
     if model.nu == 0:
         return control
 
-    low, high, width = _ranges(model, control)
+    _signed_acceleration(model, data, qpos, control)
+    low, high, width = _ranges(model, data, control)
     control = np.clip(control, low, high)
     for _ in range(NEWTON_STEPS):
         base = _signed_acceleration(model, data, qpos, control)
@@ -210,15 +214,18 @@ def _holding_control(model: Any, data: Any, qpos: Array, guess: Array) -> Array:
     return np.asarray(control)
 
 
-def _ranges(model: Any, control: Array) -> tuple[Array, Array, Array]:
-    """(nu,) lower and upper ends of the controls, and widths to which steps are relative."""
+def _ranges(model: Any, data: Any, control: Array) -> tuple[Array, Array, Array]:
+    """(nu,) lower and upper ends of the controls, and widths to which steps are relative.
+
+    The data are those of a simulation in the initial state.
+    """
     low = np.full(model.nu, -np.inf)
     high = np.full(model.nu, np.inf)
     limited = model.actuator_ctrllimited.astype(bool)
     low[limited], high[limited] = model.actuator_ctrlrange[limited].T
 
-    width = np.where(limited, high - low, np.maximum(np.abs(control), 1.0))
-    return low, high, np.where(np.isfinite(width), width, 1.0)
+    sizes = np.maximum(np.abs(control), control_sizes(model, _time(model, data)))
+    return low, high, np.where(limited & np.isfinite(high - low), high - low, sizes)
 
 
 def _influence(
@@ -249,9 +256,11 @@ def _signed_acceleration(model: Any, data: Any, qpos: Array, control: Array) -> 
     return np.array(data.qacc)
 
 
-def _acceleration(model: Any, data: Any, qpos: Array, control: Array) -> Array:
-    """(nv,) magnitude of the acceleration at rest."""
-    return np.abs(_signed_acceleration(model, data, qpos, control))
+def _drift(model: Any, data: Any, qpos: Array, control: Array) -> float:
+    """Largest acceleration at rest, relative to that of a state that counts as held."""
+    accelerations = np.abs(_signed_acceleration(model, data, qpos, control))
+    relative = accelerations / _tolerated_acceleration(model, data)
+    return float(np.nan_to_num(relative, nan=np.inf).max(initial=0.0))
 
 
 def _tolerated_acceleration(model: Any, data: Any) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 
 # Samples in one characteristic period of the motion.
-SAMPLES_PER_PERIOD = 200
+SAMPLES_PER_PERIOD = 100
 
 # Characteristic periods in the horizon.
 PERIODS = 3.0
@@ -30,10 +30,15 @@ SLOWEST_POLE = 1e-6
 # Largest exponent of the growth of a disturbance over the horizon.
 LARGEST_GROWTH = 4.0
 
+# Shortest horizon of an unstable state, in characteristic periods. Poles that are much faster than
+# this belong to contacts.
+SHORTEST = 0.2
+
 # Difference step of the linearisation.
 DIFFERENCE = 1e-6
 
-# Engine steps in the characteristic period of a model that has neither gravity nor poles.
+# Engine steps in the characteristic period of a model that has neither gravity nor poles, and most
+# steps in that of a slow pole: a body that drifts in a thin fluid would need hours.
 STEPS_OF_FREE_MODEL = 1000
 
 
@@ -75,7 +80,7 @@ def time_scale(model: Any, data: Any) -> TimeScale:
     longest = PERIODS * period
     unstable = growth * longest > LARGEST_GROWTH
     if unstable:
-        longest = LARGEST_GROWTH / growth
+        longest = max(LARGEST_GROWTH / growth, SHORTEST * period)
 
     # The horizon has two significant digits, and is a whole number of samples.
     wanted = float(f"{longest:.2g}")
@@ -151,7 +156,7 @@ def _period(model: Any, data: Any, eigenvalues: Array) -> float:
 
     speeds = _pole_speeds(eigenvalues, float(model.opt.timestep))
     if len(speeds):
-        return 2.0 * np.pi / float(speeds.min())
+        return min(2.0 * np.pi / float(speeds.min()), free_time(model))
     return free_time(model)
 
 
@@ -181,7 +186,7 @@ def _pole_speeds(eigenvalues: Array, timestep: float) -> Array:
 def _rate(timestep: float, wanted: float) -> float:
     """A rate [Hz] whose period is a whole number of timesteps [s], preferably a round number."""
     nearest = max(round(1.0 / (wanted * timestep)), 1)
-    first = max(int(nearest / RATE_RANGE), 1)
+    first = int(np.ceil(nearest / RATE_RANGE))
     steps = range(first, int(nearest * RATE_RANGE) + 1)
 
     def preference(k: int) -> tuple[int, float]:
