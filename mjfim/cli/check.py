@@ -70,7 +70,7 @@ def check(
     elif trajectory is not None:
         announce_check(system, trajectory.ctrl)
     else:
-        require_design_keys(stated, "check without recordings")
+        require_design_keys(system, "check without recordings")
         announce_check(system, _stated_control(system))
     with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)

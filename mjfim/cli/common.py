@@ -81,6 +81,15 @@ DesignFile = Annotated[
         callback=_file_of_design,
     ),
 ]
+InitialOrDesign = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="DESIGN",
+        help="Folder of `mjfim design`, or its file design.npz. Default: the initial control.",
+        callback=_file_of_design,
+        show_default=False,
+    ),
+]
 OtherDesign = Annotated[
     Path | None,
     typer.Option(

@@ -84,8 +84,8 @@ def design(
     stated = mjfim.Experiment.from_file(experiment)
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
-    require_design_keys(stated)
     system = System.resolve(stated, threads=threads)
+    require_design_keys(system)
 
     # A design that states no time ends all the same. The shortest horizon takes many designs.
     has_default = stated.descent.seconds is None and not shortest

@@ -15,6 +15,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
+    InitialOrDesign,
     claim_file,
     claim_folder,
     errors,
@@ -25,6 +26,8 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import NoResultError
+from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
@@ -38,25 +41,33 @@ from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_tri
 @verb
 def simulate(
     experiment: ExperimentFile,
-    design_file: DesignFile,
+    design_file: InitialOrDesign = None,
     output: Annotated[
         Path | None,
         typer.Option(
             "--output",
             "-o",
             metavar="FILE.csv",
-            help="Recording to write; default: recording.csv beside the design.",
+            help="Recording to write; default: recording.csv beside the design or the experiment.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     force: Force = False,
 ) -> None:
-    """Simulate a recording of a design at the `true` parameter values, with noise."""
+    """Simulate a recording of a design at the `true` parameter values, with noise.
+
+    Without a design it is a recording of the initial control, or of the motion of a model without
+    actuators from its initial state.
+    """
     system = System.resolve(mjfim.Experiment.from_file(experiment))
-    output = output or design_file.with_name("recording.csv")
+    output = output or (design_file or experiment).with_name("recording.csv")
     claim_file(output, input_files(system.experiment, [design_file]), force=force)
-    trajectory = archive.read_design(design_file)["final"]
-    archive.check_fits(design_file, trajectory, system)
+    if design_file is None:
+        require_design_keys(system, "simulate without a design")
+        trajectory = DesignTask.of(system).initial
+    else:
+        trajectory = archive.read_design(design_file)["final"]
+        archive.check_fits(design_file, trajectory, system)
     recording = simulate_system(system, trajectory, seed)
     keep_result(output.parent)
     archive.write_recording(output, recording, system)

@@ -128,6 +128,7 @@ def design_task(
         The design.
     """
     budget = design_budget(task) if budget is None else budget
+    _require_controls(task)
     require_feasible_start(task)
     steps_before = task.plant.engine_steps
 
@@ -151,6 +152,15 @@ def design_task(
     best, chosen = _choose(stage, first, results, interrupted)
     report = _Report(stage=stage, identifiability=identifiability, initial=first, final=chosen)
     return report.design(best, results, budget.seconds_used, steps, interrupted)
+
+
+def _require_controls(task: DesignTask) -> None:
+    """Raise ExperimentError where the model has no actuators, so that there is no control."""
+    if not task.controls:
+        raise ExperimentError(
+            f"{task.experiment.source}: the model has no actuators, so there is no control to "
+            "design; `check`, `simulate` and `identify` need none"
+        )
 
 
 def _checked_control(task: DesignTask, control: Array) -> Array:

@@ -108,7 +108,6 @@ class DesignTask:
                 key.
             ModelError: The model cannot be used.
         """
-        require_design_keys(experiment)
         system = System.resolve(experiment, threads=threads)
         task = cls.of(system, added_information=added_information)
         return task if variant is None else task.with_variant(variant)
@@ -127,7 +126,7 @@ class DesignTask:
                 key.
         """
         experiment = system.experiment
-        require_design_keys(experiment)
+        require_design_keys(system)
         try:
             return cls._made(system, stated_control(system), added_information)
         except ExperimentError as error:
@@ -254,7 +253,7 @@ class DesignTask:
             (N, nu) control [u-unit].
         """
         factor = self.system.variant.sample_factor
-        return np.asarray(control.reshape(self.samples, factor, -1).mean(axis=1))
+        return np.asarray(control.reshape(self.samples, factor, control.shape[1]).mean(axis=1))
 
     # Information and cost
 
@@ -523,7 +522,8 @@ class DesignTask:
         """This task on another plant, along a control: (n, nu) at the stated sample rate."""
         factor = variant.sample_factor
         samples = len(control) // factor
-        averaged = control[: samples * factor].reshape(samples, factor, -1).mean(axis=1)
+        averaged = control[: samples * factor].reshape(samples, factor, control.shape[1])
+        averaged = averaged.mean(axis=1)
 
         changed = self.system.with_variant(variant, self._relaxation())
         system, reference = _calibrated(changed, averaged)

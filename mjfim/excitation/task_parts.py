@@ -24,22 +24,23 @@ MAX_SAMPLES = 10_000_000
 SAMPLE_COUNT_TOLERANCE = 1e-6
 
 
-def require_design_keys(experiment: Experiment, work: str = "design") -> None:
+def require_design_keys(system: System, work: str = "design") -> None:
     """Check that the experiment states the keys that only a design needs.
 
     Args:
-        experiment: The experiment.
+        system: The system. A model without actuators needs no control.
         work: Name of the work that needs them, for the message.
 
     Raises:
         ExperimentError: `horizon` or `initial.control` is missing.
     """
+    experiment = system.experiment
     if experiment.horizon is None:
         raise ExperimentError(
             f"{experiment.source}: {work} needs `horizon`, the duration of the experiment [s], for "
             "example horizon = 4.0"
         )
-    if experiment.initial.control is None:
+    if experiment.initial.control is None and system.controls:
         raise ExperimentError(
             f"{experiment.source}: {work} needs `initial.control`, the control from which it "
             f"starts, for example {_control_example(experiment)}; `mjfim init "
@@ -100,7 +101,8 @@ def stated_control(system: System) -> Array:
         system: The system.
 
     Returns:
-        (N, nu) control over the stated horizon, at the stated sample rate [u-unit].
+        (N, nu) control over the stated horizon, at the stated sample rate [u-unit]; without
+        actuators it has no columns.
 
     Raises:
         ExperimentError: The horizon, the signal or the file cannot be used.
@@ -110,6 +112,15 @@ def stated_control(system: System) -> Array:
     count = sample_count(experiment, grid.stride)
     require_memory_for_design(system, count)
     t = np.arange(count, dtype=np.float64) * grid.dt
+
+    # A model without actuators moves by itself; its control has no columns.
+    if not system.controls:
+        if source is not None:
+            raise ExperimentError(
+                "initial.control: the model has no actuators; remove this key, and the motion "
+                "follows from the initial state alone"
+            )
+        return np.zeros((count, 0))
 
     if isinstance(source, Signal):
         return generate(source, t, system.controls, system.rest)

@@ -391,7 +391,7 @@ class System:
 def _require_supported(source: ModelSource) -> None:
     """Raise ModelError for a model that mjfim cannot use.
 
-    It has no actuators, a state that mjfim cannot read, or a timestep that is not positive.
+    It has a state that mjfim cannot read, or a timestep that is not positive.
     """
     model = source.model
     timestep = float(model.opt.timestep)
@@ -401,10 +401,6 @@ def _require_supported(source: ModelSource) -> None:
         raise ModelError(
             f"{source.path}: option.timestep is {timestep:g} s; it must be a positive number, for "
             "example 0.002"
-        )
-    if model.nu == 0:
-        raise ModelError(
-            f"{source.path}: the model has no actuator; an experiment needs at least one"
         )
     if model.nhistory or model.nplugin:
         feature = "delays or interval sensors" if model.nhistory else "engine plugins"

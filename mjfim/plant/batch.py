@@ -620,7 +620,7 @@ class BatchSimulator:
 
         # Values that are not finite belong to simulations that diverged.
         flat = np.nan_to_num(states.reshape(-1, start.shape[1]), posinf=0.0, neginf=0.0)
-        held = np.broadcast_to(ctrl[:, :, None], (m, N, rows, nu)).reshape(-1, nu)
+        held = np.broadcast_to(ctrl[:, :, None], (m, N, rows, nu)).reshape(m * N * rows, nu)
         forces = self._forces_at(observations, models, flat, held)
         return np.asarray(forces.reshape(m, N, rows, -1))
 

@@ -263,7 +263,7 @@ class StepDerivatives(DifferenceSteps):
         return MovedSamples(
             trajectory_states=states,
             states=moved_states.reshape(-1, states.shape[1]),
-            ctrl=moved_ctrl.reshape(-1, plant.nu),
+            ctrl=moved_ctrl.reshape(len(moves) * len(states), plant.nu),
             batch_shape=(len(moves), len(states)),
             widths=(2.0 if central else 1.0) * steps[:, None, None],
         )
@@ -285,8 +285,8 @@ def all_samples(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def tiled(curve: Array, count: int) -> Array:
-    """(count*n, k) copies of a curve: (n, k), one after the other."""
-    return np.broadcast_to(curve, (count, *curve.shape)).reshape(-1, curve.shape[1])
+    """(count*n, k) copies of a curve: (n, k), one after the other; k may be 0."""
+    return np.tile(curve, (count, 1))
 
 
 def _require_finite(derivative: Array) -> Array:

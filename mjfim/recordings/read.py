@@ -101,7 +101,9 @@ def read_log(path: Path, channels: Channels) -> Log:
     check_angles(str(path), channels.model, t, columns, stated)
 
     # The control of the last row is left out, because it would act after the end of the recording.
-    ctrl = np.column_stack([columns[name][:-1] for name in channels.control_columns])
+    # A model without actuators has none.
+    controls = [columns[name][:-1] for name in channels.control_columns]
+    ctrl = np.column_stack(controls) if controls else np.zeros((len(t) - 1, 0))
     y = np.column_stack([columns[name] for name in measured])
     column_names = {name: source.column for name, source in sources.items()}
 

@@ -80,11 +80,12 @@ def check(
         raise RecordingError("check either recordings or a designed trajectory, not both")
 
     with shown_progress("checking", None, progress):
+        system = System.resolve(experiment, threads=threads)
         if recordings:
-            return check_recordings(System.resolve(experiment, threads=threads), recordings, stop)
+            return check_recordings(system, recordings, stop)
 
-        require_design_keys(experiment, "check without recordings")
-        return check_task(DesignTask.resolve(experiment, threads=threads), trajectory, stop)
+        require_design_keys(system, "check without recordings")
+        return check_task(DesignTask.of(system), trajectory, stop)
 
 
 @one_blas_thread()
@@ -95,7 +96,7 @@ def check_task(
 
     See `check`.
     """
-    curve, source = task.initial, "the initial control"
+    curve, source = task.initial, "the initial control" if task.controls else "the initial state"
     if trajectory is not None:
         curve, source = task.plant.simulate(task.theta, trajectory.ctrl), "the given trajectory"
 

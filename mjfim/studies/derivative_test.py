@@ -134,9 +134,12 @@ def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) ->
 
     Returns:
         Relative error; NaN where the cost is infinite, infinite where a moved trajectory diverges.
+        It is 0 for a model without actuators, whose cost has no slope along a control.
     """
     if not np.isfinite(point.cost) or point.trajectory is None:
         return float("nan")
+    if not task.controls:
+        return 0.0
 
     expansion = problem.expand(point)
     K = regulator_for(task).gain(expansion)

@@ -31,7 +31,7 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
     missing = []
     if experiment.horizon is None:
         missing.append("horizon")
-    if experiment.initial.control is None:
+    if experiment.initial.control is None and system.controls:
         missing.append("initial.control")
 
     # A file for recordings alone needs no task of a design.

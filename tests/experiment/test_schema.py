@@ -99,7 +99,6 @@ BAD_MODELS = {
     "still.xml": f'<mujoco><option timestep="0"/><worldbody>{BAR}</worldbody></mujoco>',
     "nan.xml": f'<mujoco><option timestep="nan"/><worldbody>{BAR}</worldbody></mujoco>',
     "backward.xml": f'<mujoco><option timestep="-1"/><worldbody>{BAR}</worldbody></mujoco>',
-    "passive.xml": f"<mujoco><worldbody>{BAR}</worldbody></mujoco>",
 }
 BAD_TABLES = {
     "columns.csv": b"t,forc\n0,1\n0.5,1\n1,1\n",
@@ -572,11 +571,6 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         edited("cart_pendulum.xml", "massless.xml"),
         M,
         ["massless.xml", "MuJoCo cannot compile", "mass and inertia", "thin"],
-    ),
-    "no actuator": (
-        edited("cart_pendulum.xml", "passive.xml"),
-        M,
-        ["passive.xml", "no actuator", "at least one"],
     ),
     "timestep zero": (
         edited("cart_pendulum.xml", "still.xml"),

@@ -436,7 +436,7 @@ izz="{inertia}"/></inertial>{visual}</link><joint name="{joint}" type="{kind}"><
 
 
 def urdf_model(rng: Rng, folder: Path) -> Call:
-    """A URDF as the model; it has no actuator, so that it must be refused."""
+    """A URDF as the model; it lacks what the experiment names, so that it must be refused."""
     values = {
         "mass": "1",
         "inertia": "0.01",

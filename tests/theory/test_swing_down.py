@@ -1,0 +1,115 @@
+"""A model without actuators: what its motion from a release tells, compared with theory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.excitation.task import DesignTask
+from mjfim.studies.monte_carlo import monte_carlo_system
+from tests.support.cli import run
+from tests.support.swing_down import (
+    CENTRE,
+    DAMPING,
+    small_swing,
+    small_swing_information,
+    swing_down,
+)
+
+SMALL = 0.02
+
+
+def test_a_small_swing_has_the_information_of_the_closed_form(tmp_path: Path) -> None:
+    task = DesignTask.resolve(swing_down(tmp_path, SMALL))
+    assert task.controls == ()
+    assert task.initial.ctrl.shape == (150, 0)
+
+    t = task.initial.t
+    expected = small_swing(t, SMALL, DAMPING, -CENTRE)
+    assert np.abs(task.initial.qpos[:, 0] - expected).max() < 1e-3 * SMALL
+
+    found = task.problem.point(task.initial).information
+    theory = small_swing_information(t[1:], SMALL)
+    size = np.sqrt(np.outer(np.diag(theory), np.diag(theory)))
+    np.testing.assert_allclose(found / size, theory / size, atol=1e-3)
+
+
+def test_a_check_predicts_the_standard_deviations_of_the_closed_form(tmp_path: Path) -> None:
+    found = mjfim.check(swing_down(tmp_path, SMALL))
+    t = np.arange(1, 151) / 50.0
+    covariance = np.linalg.inv(small_swing_information(t, SMALL))
+    predicted = [row.std for row in found.rows]
+    np.testing.assert_allclose(predicted, np.sqrt(np.diag(covariance)), rtol=2e-3)
+    assert found.self_test.passed
+    assert found.source == "the initial state"
+
+
+@pytest.mark.slow
+def test_estimates_reach_the_cramer_rao_bound(tmp_path: Path) -> None:
+    task = DesignTask.resolve(swing_down(tmp_path, 0.1))
+    study = monte_carlo_system(task.system, {"initial": task.initial}, trials=120, seed=1)
+    found = study.sets["initial"]
+    assert found.failed == 0
+    assert (found.efficiency_interval[:, 0] < 1.0).all()
+    assert (found.efficiency_interval[:, 1] > 1.0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["stated", "measured"])
+def test_a_simulated_recording_gives_the_true_parameters(start: str, tmp_path: Path) -> None:
+    true = {"damping": {"true": 0.008}, "centre": {"true": -0.28}}
+    experiment = swing_down(tmp_path, fit={"start": start, "bootstrap": 0}).replace(parameters=true)
+    trajectory = DesignTask.resolve(experiment).initial
+    recording = mjfim.simulate(experiment, trajectory, seed=2)
+    assert recording.ctrl.shape == (150, 0)
+
+    estimate = mjfim.identify(experiment, [recording])
+    error = np.abs(estimate.theta[:2] - [0.008, -0.28])
+    assert (error < 4.0 * estimate.std[:2]).all()
+    assert not estimate.misfit
+    assert mjfim.check(experiment, [recording]).rows[0].std == pytest.approx(
+        estimate.std[0], rel=0.3
+    )
+
+
+FILE = """
+model = "swing_down.xml"
+rate = 50.0
+horizon = 3.0
+initial.qpos = [0.5]
+parameters.damping = { target = "joint/hinge:damping", guess = 0.02, true = 0.01 }
+parameters.centre = { target = "body/rod:ipos[2]", guess = -0.25, true = -0.3 }
+noise = { "qpos:hinge" = 0.002 }
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
+def test_every_verb_works_without_columns_of_controls(tmp_path: Path) -> None:
+    swing_down(tmp_path)
+    file, log, out = tmp_path / "swing.toml", tmp_path / "log.csv", tmp_path / "out"
+    file.write_text(FILE, encoding="utf-8")
+    for arguments in (
+        ("list", tmp_path / "swing_down.xml"),
+        ("validate", file),
+        ("check", file, "-o", tmp_path / "check"),
+        ("simulate", file, "-o", log),
+        ("check", file, log),
+        ("identify", file, log, "-o", out),
+    ):
+        result = run(*arguments)
+        assert result.exit_code == 0, result.output
+    assert log.read_text(encoding="utf-8").splitlines()[0] == '"t","qpos:hinge"'
+    assert (out / "identified.xml").exists()
+
+
+def test_a_control_for_no_actuators_is_an_error(tmp_path: Path) -> None:
+    experiment = swing_down(tmp_path, initial={"control": {"kind": "sine"}})
+    with pytest.raises(ExperimentError, match=r"initial\.control: the model has no actuators"):
+        DesignTask.resolve(experiment)
+    with pytest.raises(ExperimentError, match="no control to design"):
+        mjfim.design(swing_down(tmp_path))
