@@ -83,9 +83,7 @@ def small_swing(t: Array, angle: float, damping: float, centre: float) -> Array:
     stiffness = -MASS * GRAVITY * centre / inertia
     omega = np.sqrt(stiffness - decay**2)
     phase = omega * t
-    return np.asarray(
-        angle * np.exp(-decay * t) * (np.cos(phase) + decay / omega * np.sin(phase))
-    )
+    return np.asarray(angle * np.exp(-decay * t) * (np.cos(phase) + decay / omega * np.sin(phase)))
 
 
 def small_swing_information(t: Array, angle: float) -> Array:
