@@ -448,6 +448,7 @@ class _Report:
             prior=task.prior,
             data=data,
             labels=labels_of_system(task.system),
+            sizes=parameters.sizes(task.theta),
         )
 
 

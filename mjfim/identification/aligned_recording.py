@@ -6,7 +6,7 @@ because that would colour their noise. Predictions are interpolated instead.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -327,7 +327,7 @@ def _quaternion_outputs(system: System) -> list[list[int]]:
 def measured_trajectory(system: System, recording: Recording) -> Trajectory | None:
     """The recorded motion as a trajectory, for figures.
 
-    Missing values are interpolated linearly. Velocities are zero.
+    Missing positions are interpolated linearly. Velocities that were not measured are NaN.
 
     Args:
         system: System that was recorded.
@@ -360,7 +360,24 @@ def measured_trajectory(system: System, recording: Recording) -> Trajectory | No
     return Trajectory(
         t=recording.t,
         qpos=qpos,
-        qvel=np.zeros((n, model.nv)),
+        qvel=_measured_velocities(system, recording, measured),
         act=np.zeros((n, model.na)),
         ctrl=recording.ctrl,
     )
+
+
+def _measured_velocities(
+    system: System, recording: Recording, measured: Mapping[int, int]
+) -> Array:
+    """(M, nv) measured velocities [m/s or rad/s]; NaN where there is none.
+
+    The index of the output that measures a component of the state is `measured[address]`.
+    """
+    model = system.model
+    qvel = np.full((len(recording.t), model.nv), np.nan)
+    for dof in range(model.nv):
+        output = measured.get(model.nq + dof)
+        name = "" if output is None else system.outputs.names[output]
+        if name in recording.outputs:
+            qvel[:, dof] = recording.y[:, recording.outputs.index(name)]
+    return qvel

@@ -205,6 +205,23 @@ class ParameterSet:
         """(p,) magnitudes to which finite-difference steps are relative."""
         return self._values(lambda p: p.size or abs(p.guess) or p.scale)
 
+    def sizes(self, theta: Array) -> Array:
+        """(p,) sizes with which standard deviations are compared, all positive [theta-unit].
+
+        The size of a single number is its magnitude. An entry of a vector or tensor has the
+        magnitude of the whole, because the entry itself may be zero.
+
+        Args:
+            theta: (p,) values.
+        """
+        pairs = zip(self.parameters, theta, self.magnitude, strict=True)
+        return np.array(
+            [
+                abs(value) if p.size == abs(p.guess) and value != 0.0 else magnitude
+                for p, value, magnitude in pairs
+            ]
+        )
+
     @property
     def prior_information(self) -> Array:
         """(p, p) information of the stated priors [1/theta^2]."""

@@ -301,6 +301,9 @@ class Design(ShownRecord):
         data: (p, p) information of this experiment alone, in which nuisance parameters that
             belong to a single experiment are marginalised.
         labels: Names and units for figures and tables; None in records of earlier versions.
+        sizes: (p,) sizes of which standard deviations are a share: magnitudes of the values, or of
+            the whole vectors or tensors of which they are entries [theta-unit]. Default: the
+            magnitudes of the values.
     """
 
     status: Status
@@ -324,13 +327,16 @@ class Design(ShownRecord):
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     data: Array = field(default_factory=lambda: np.zeros((0, 0)))
     labels: Labels | None = None
+    sizes: Array = field(default_factory=lambda: np.zeros(0))
 
     file_stem: ClassVar[str] = "design"
     made_by: ClassVar[str] = "`mjfim design EXPERIMENT -o DIR`"
     array_names: ClassVar[Mapping[str, str]] = _npz_names()
 
     def __post_init__(self) -> None:
-        freeze(self, "theta", "prior", "data")
+        if not len(self.sizes):
+            object.__setattr__(self, "sizes", np.abs(self.theta))
+        freeze(self, "theta", "prior", "data", "sizes")
 
     @property
     def wanted(self) -> tuple[int, ...]:
@@ -379,6 +385,7 @@ class Design(ShownRecord):
             "steps": self.steps,
             "parameters": list(self.parameters),
             "theta": self.theta,
+            "sizes": self.sizes,
             "initial": self.initial.summary(),
             "final": self.final.summary(),
             "limits": {

@@ -332,13 +332,12 @@ class _Assessment:
     def _rows(self, information: FisherInformation, std: Array) -> tuple[ParameterCheck, ...]:
         """Predicted accuracy of every parameter; std: (p,) [theta-unit]."""
         p = self.task.parameters
+        sizes = p.sizes(self.task.theta)
         rows = []
         for j, parameter in enumerate(p.parameters):
             value = float(self.task.theta[j])
 
-            # An entry of a vector or tensor is compared with the magnitude of the whole.
-            is_scalar = parameter.size == abs(parameter.guess) and value != 0.0
-            size = abs(value) if is_scalar else float(p.magnitude[j])
+            size = float(sizes[j])
             wanted = parameter.wanted or DEFAULT_RELATIVE_STD * size
 
             repetitions = 0

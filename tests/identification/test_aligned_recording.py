@@ -237,6 +237,17 @@ def test_measured_trajectory_bridges_gaps(task: DesignTask, body: DesignTask) ->
     np.testing.assert_allclose(np.linalg.norm(turned.qpos[:, 3:7], axis=1), 1.0)
 
 
+def test_the_measured_trajectory_has_measured_velocities_or_none(tmp_path: Path) -> None:
+    """A velocity that was not measured is not zero."""
+    task = cart_task(tmp_path, noise={"qpos:slide": 0.01, "qpos:hinge": 0.01, "qvel:hinge": 0.1})
+    recorded = log(task)
+    shown = measured_trajectory(task.system, recorded)
+    assert shown is not None
+    column = recorded.outputs.index("qvel:hinge")
+    np.testing.assert_array_equal(shown.qvel[:, 1], recorded.y[:, column])
+    assert np.isnan(shown.qvel[:, 0]).all()
+
+
 def test_interpolation_between_samples_is_exact_for_cubics() -> None:
     """Values and slopes are exact at any times, in any order, also several at one sample.
 

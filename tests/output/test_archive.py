@@ -105,7 +105,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         **{f"initial_{key}": shape for key, shape in known.items()},
         **{f"final.{key}": shape for key, shape in further.items()},
         **{f"initial.{key}": shape for key, shape in further.items()},
-        **{"theta": (P,), "prior": (P, P), "data": (P, P)},
+        **{"theta": (P,), "sizes": (P,), "prior": (P, P), "data": (P, P)},
         "record": (),
     }
     assert kinds == {np.dtype("float64")}

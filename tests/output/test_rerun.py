@@ -317,7 +317,7 @@ class TestDesign:
     def test_summary_holds_outcome_accuracy_warnings_and_starts(self, file: Path) -> None:
         text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
         assert "Stopped at its budget (max_iterations" in text
-        assert "| mass | 2 | 0.5 | 25 % | 0.0312 | 1.6 % | 16.0 × |" in text
+        assert "| mass | 2 | 0.5 | 25 % | 0.0312 | 1.6 % | ÷ 16.0 |" in text
         assert "Limits are violated: position" in text
         assert "nearly confounded" in text
         assert "Best of 2 starts: multisine 2" in text
@@ -475,6 +475,23 @@ class TestEstimate:
         assert entity_path(
             ("outputs", "recording 2", "hinge_angle [rad]", "predicted")
         ) in entities(path)
+
+    def test_a_velocity_that_was_not_measured_has_no_series(
+        self, cart: mujoco.MjModel, tmp_path: Path
+    ) -> None:
+        path, predicted = tmp_path / "estimate.rrd", simulated(cart, 2.0)
+        qvel = np.array(predicted.qvel)
+        qvel[:, 0] = np.nan
+        measured = replace(predicted, qvel=qvel)
+        estimate = estimated(cart, predicted)
+        labels = labels_of_model(cart)
+        log_estimate(path, cart, estimate, measured, predicted, labels)
+
+        slide, hinge = (("velocities", label) for label in labels.velocities)
+        assert entity_path((*slide, "measured")) not in entities(path)
+        assert entity_path((*slide, "predicted")) in entities(path)
+        _, values = column(path, (*hinge, "measured"), "sim_time", "Scalars:scalars")
+        np.testing.assert_array_equal(values[:, 0], qvel[:, 1])
 
     def test_measured_robot_is_transparent(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)

@@ -245,11 +245,6 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
     return figure
 
 
-def _parameter_sizes(design: Design) -> Array:
-    """Return the (p,) sizes of the parameters [theta-unit]; 1 for a parameter of 0."""
-    return np.where(design.theta == 0.0, 1.0, np.abs(design.theta))
-
-
 def _least_known_parameters(design: Design) -> NDArray[np.intp]:
     """Return the wanted parameters with the largest predicted relative standard deviations.
 
@@ -259,7 +254,8 @@ def _least_known_parameters(design: Design) -> NDArray[np.intp]:
 
     # A parameter that the design does not determine has nothing to show.
     std = design.final.std
-    relative_std = np.where(np.isfinite(std), std, 0.0) / _parameter_sizes(design)
+    sizes = np.where(design.sizes > 0.0, design.sizes, np.inf)
+    relative_std = np.where(np.isfinite(std), std, 0.0) / sizes
 
     descending = np.argsort(-relative_std[wanted], kind="stable")
     return np.sort(wanted[descending][:MAX_PHASE_PARAMETERS])
@@ -271,7 +267,7 @@ def _most_sensitive_dofs(design: Design, nv: int) -> NDArray[np.intp]:
     Their numbers are in ascending order.
     """
     psi = design.final.sensitivity[:, :nv]
-    relative_psi = np.abs(psi * _parameter_sizes(design))
+    relative_psi = np.abs(psi * design.sizes)
 
     largest = relative_psi.max(axis=(0, 2))
     descending = np.argsort(-largest, kind="stable")

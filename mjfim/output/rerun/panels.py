@@ -133,13 +133,14 @@ def _log_series(
     t: Array,
     values: Array,
 ) -> None:
-    """Log the appearance of a series, and its finite values. t, values: (n,)."""
-    rec.log(entity_path(parts), appearance, static=True, strict=True)
-
+    """Log the appearance of a series and its finite values, if there are any. t, values: (n,)."""
     finite = np.isfinite(values)
-    if finite.any():
-        columns = rr.Scalars.columns(scalars=values[finite])
-        rec.send_columns(entity_path(parts), [time_column(t[finite])], columns, strict=True)
+    if not finite.any():
+        return
+
+    columns = rr.Scalars.columns(scalars=values[finite])
+    rec.log(entity_path(parts), appearance, static=True, strict=True)
+    rec.send_columns(entity_path(parts), [time_column(t[finite])], columns, strict=True)
 
 
 def series_view(parts: EntityParts, title: str, *, legend: bool = True) -> rrb.TimeSeriesView:

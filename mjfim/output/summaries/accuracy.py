@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mjfim.arrays import Array
 from mjfim.output.summary_parts import Cell, Emphasis, Name, Quantity, Row, SummaryTable, columns
 from mjfim.records.design import Design
 
@@ -27,15 +28,21 @@ def accuracy_table(design: Design, units: Sequence[str]) -> SummaryTable:
     """
     rows = []
     for j in design.wanted:
-        name = Name(name=design.parameters[j], unit=units[j])
-        std_initial, std_final = float(design.initial.std[j]), float(design.final.std[j])
-        rows.append(Row(cells=_accuracy_cells(name, design.theta[j], std_initial, std_final)))
+        cells = _accuracy_cells(
+            Name(name=design.parameters[j], unit=units[j]),
+            value=float(design.theta[j]),
+            size=float(design.sizes[j]),
+            std_initial=float(design.initial.std[j]),
+            std_final=float(design.final.std[j]),
+        )
+        rows.append(Row(cells=cells))
     for combination in design.combined:
         cells = _accuracy_cells(
             combination.expression,
-            combination.value,
-            combination.std_initial,
-            combination.std_final,
+            value=combination.value,
+            size=abs(combination.value),
+            std_initial=combination.std_initial,
+            std_final=combination.std_final,
         )
         rows.append(Row(cells=cells, emphasis=Emphasis.DERIVED))
 
@@ -43,36 +50,56 @@ def accuracy_table(design: Design, units: Sequence[str]) -> SummaryTable:
         key="accuracy",
         title="Predicted standard deviation σ of each parameter after one experiment",
         columns=columns(
-            "parameter", "value", "σ initial", "relative", "σ optimized", "relative", "smaller by"
+            "parameter", "value", "σ initial", "relative", "σ optimized", "relative", "change of σ"
         ),
         rows=tuple(rows),
     )
 
 
 def _accuracy_cells(
-    name: Cell, value: float, std_initial: float, std_final: float
+    name: Cell, *, value: float, size: float, std_initial: float, std_final: float
 ) -> tuple[Cell, ...]:
     """Return the cells of one parameter or combination."""
     return (
         name,
-        Quantity(value=float(value), digits=4),
+        Quantity(value=value, digits=4),
         Quantity(value=std_initial, infinite=NOT_ALONE),
-        _relative(std_initial, value),
+        relative(std_initial, size),
         Quantity(value=std_final, infinite=NOT_ALONE),
-        _relative(std_final, value),
+        relative(std_final, size),
         improvement(std_initial, std_final),
     )
 
 
-def _relative(std: float, value: float) -> Quantity:
-    """Return a standard deviation in percent of a value; NaN where there is none."""
-    if not value or not np.isfinite(std):
+def relative(std: float, size: float) -> Quantity:
+    """Return a standard deviation in percent of a size; NaN where there is none.
+
+    Args:
+        std: The standard deviation.
+        size: Magnitude of the value, or of the whole vector or tensor of which it is an entry.
+    """
+    if not size or not np.isfinite(std):
         return Quantity(value=float("nan"))
-    return Quantity(value=float(100.0 * std / abs(value)), digits=2, suffix=" %")
+    return Quantity(value=100.0 * std / size, digits=2, suffix=" %")
+
+
+def size_sentence(values: Sequence[float] | Array, sizes: Sequence[float] | Array) -> str:
+    """Say of what a relative standard deviation is a share; empty where it is of the value.
+
+    Args:
+        values: Values of the parameters.
+        sizes: Their sizes.
+    """
+    if np.array_equal(np.abs(values), sizes):
+        return ""
+    return (
+        "A relative σ is a share of the value; for an entry of a vector or tensor, and for a value "
+        "of zero, it is a share of the magnitude of the whole."
+    )
 
 
 def improvement(before: float, after: float) -> str:
-    """Return the factor by which a standard deviation became smaller, in words.
+    """Return how a standard deviation changed: divided by a number, or times a number.
 
     Args:
         before: Standard deviation before.
@@ -81,5 +108,5 @@ def improvement(before: float, after: float) -> str:
     if not (np.isfinite(before) and np.isfinite(after) and after > 0 and before > 0):
         return "-"
     if before >= after:
-        return f"{before / after:.1f} ×"
-    return f"{after / before:.1f} × larger"
+        return f"÷ {before / after:.1f}"
+    return f"× {after / before:.1f}"

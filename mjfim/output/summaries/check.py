@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.output.summaries.accuracy import BEST_CASE, NOT_ALONE
+from mjfim.output.summaries.accuracy import BEST_CASE, NOT_ALONE, relative, size_sentence
 from mjfim.output.summary_parts import (
     Emphasis,
     Listing,
@@ -45,6 +45,9 @@ def describe_check(check: Check) -> Summary:
             items = tuple(_group_lines(group, check) for group in groups)
             parts.append(Listing(title=f"{title}:", items=items))
 
+    of_size = size_sentence([row.value for row in check.rows], [row.size for row in check.rows])
+    if of_size:
+        parts.append(Paragraph(text=of_size, emphasis=Emphasis.WEAK))
     parts.append(Paragraph(text=_eigenvalue_sentence(check)))
     parts.append(Paragraph(text=_self_test_sentence(check)))
     emphasis = Emphasis.NORMAL if check.ok else Emphasis.WARNING
@@ -72,12 +75,11 @@ def _check_row(row: ParameterCheck) -> Row:
         return Row(cells=(name, value, "nuisance", "", "", "", ""), emphasis=Emphasis.WEAK)
 
     alone = bool(np.isfinite(row.std))
-    relative = 100.0 * row.relative if alone and np.isfinite(row.relative) else float("nan")
     cells = (
         name,
         value,
         Quantity(value=row.std, infinite=NOT_ALONE),
-        Quantity(value=relative, suffix=" %"),
+        relative(row.std, row.size),
         f"{row.wanted:.3g}{'' if row.stated else ' (5 %)'}",
         f"{row.repetitions:,}" if row.repetitions else "-",
         f"{row.seconds:,.0f} s" if row.repetitions else "-",

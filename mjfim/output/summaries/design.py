@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mjfim.errors import listed
-from mjfim.output.summaries.accuracy import BEST_CASE, accuracy_table
+from mjfim.output.summaries.accuracy import BEST_CASE, accuracy_table, size_sentence
 from mjfim.output.summary_parts import (
     Cell,
     Emphasis,
@@ -41,6 +41,10 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
         units: Unit of each of the p parameters.
     """
     parts: list[Part] = [accuracy_table(design, units)]
+
+    of_size = size_sentence(design.theta, design.sizes)
+    if of_size:
+        parts.append(Paragraph(text=of_size, emphasis=Emphasis.WEAK))
 
     before, after = float(design.initial.eigenvalues[0]), float(design.final.eigenvalues[0])
     parts.append(
