@@ -17,7 +17,7 @@ from mjfim.studies.check import check
 from mjfim.studies.first_experiment.document import experiment_text
 from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
 from mjfim.studies.first_experiment.selection import identifiable
-from mjfim.studies.first_experiment.start import choose_start
+from mjfim.studies.first_experiment.start import _candidates, choose_start
 from mjfim.studies.first_experiment.time_scale import RATE_RANGE, _rate, reach, time_scale
 from tests.support.cli import MODELS
 
@@ -314,3 +314,60 @@ def test_rates_are_near_the_wanted_ones_and_slow_drifts_do_not_take_hours() -> N
         assert RATE_RANGE**-1 <= _rate(timestep, wanted) / wanted <= RATE_RANGE
         times = time_scale(model, mujoco.MjData(model))
         assert times.horizon <= 10.0 * 1000 * timestep
+
+
+def test_a_start_that_rests_on_a_stop_is_moved_away_from_it() -> None:
+    # The weak motor cannot hold the arm, which falls on the end of its range.
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <worldbody><body name="arm"><joint name="j" axis="0 1 0" range="-60 60" limited="true"/>
+      <geom size="0.05" mass="1" pos="0.5 0 0"/></body></worldbody>
+      <actuator><motor joint="j" ctrlrange="-0.01 0.01"/></actuator>
+    </mujoco>
+    """)
+    assert np.abs(choose_start(model).qpos).max() < np.deg2rad(59.0)
+
+
+def test_the_driven_joints_of_a_robot_on_the_floor_may_stay_where_they_are() -> None:
+    # The strong motors hold the raised legs, on which the body comes to stand.
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <worldbody><geom type="plane" size="5 5 1"/>
+        <body name="b" pos="0 0 1"><freejoint/><geom type="box" size="0.2 0.2 0.05" mass="1"/>
+        <body pos="0.2 0 0"><joint name="l" axis="0 1 0" range="-90 90" limited="true"/>
+        <geom type="capsule" fromto="0 0 0 0.1 0 -0.2" size="0.05" mass="0.2"/></body>
+        <body pos="-0.2 0.1 0"><joint name="m" axis="0 1 0" range="-90 90" limited="true"/>
+        <geom type="capsule" fromto="0 0 0 -0.1 0 -0.2" size="0.05" mass="0.2"/></body>
+        <body pos="-0.2 -0.1 0"><joint name="n" axis="0 1 0" range="-90 90" limited="true"/>
+        <geom type="capsule" fromto="0 0 0 -0.1 0 -0.2" size="0.05" mass="0.2"/></body></body>
+      </worldbody>
+      <actuator><motor joint="l" ctrlrange="-9 9"/><motor joint="m" ctrlrange="-9 9"/>
+        <motor joint="n" ctrlrange="-9 9"/></actuator>
+    </mujoco>
+    """)
+    standing = next(start for start in _candidates(model) if "locked" in start.reason)
+    assert np.abs(standing.qpos[7:]).max() < 1e-9
+    assert 0.2 < standing.qpos[2] < 0.3
+    reference = next(_candidates(model))
+    assert choose_start(model).drift <= standing.drift < 0.1 * reference.drift
+
+
+def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path: Path) -> None:
+    # Seen from this small drone, a slight tilt soon leads far away.
+    path = tmp_path / "drone.xml"
+    path.write_text(
+        """
+    <mujoco>
+      <worldbody><body name="b" pos="0 0 1"><freejoint name="f"/>
+        <geom type="box" size="0.03 0.03 0.01" mass="0.1"/>
+        <body name="c" pos="0 0 -0.02"><joint name="j" axis="0 1 0" damping="1e-4"/>
+        <geom size="0.005" mass="0.01" pos="0 0 -0.3"/></body>
+        <site name="s"/></body></worldbody>
+      <actuator><motor name="up" site="s" gear="0 0 1 0 0 0" ctrlrange="0 3"/></actuator>
+    </mujoco>
+    """,
+        encoding="utf-8",
+    )
+    proposal, _ = proposed(path, tmp_path)
+    assert any("amplifies small disturbances" in remark for remark in proposal.remarks)
+    assert 0.4 * proposal.times.period < proposal.times.horizon < 2.9 * proposal.times.period

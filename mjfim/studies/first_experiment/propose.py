@@ -20,6 +20,7 @@ from mjfim.experiment.system import System
 from mjfim.model.elements import unnamed_count
 from mjfim.model.loading import ModelSource
 from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.model.sizes import position_sizes
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.studies.first_experiment.candidates import GROUPS, Candidate, Group, candidates
 from mjfim.studies.first_experiment.excitation import (
@@ -51,6 +52,12 @@ SECONDS = 30.0
 # exist. A control may rest at the end of its range.
 ROOM = 0.05
 WITHOUT_ROOM = ("control",)
+
+# Largest factor by which the first motion may amplify a small disturbance of its start, and the
+# shortest horizon to which this leads [characteristic periods]. Robots that fall or that make and
+# break contacts are predictable for a short time only.
+LARGEST_AMPLIFICATION = 100.0
+SHORTEST_MOTION = 0.5
 
 # Largest number of candidates whose information is computed.
 MOST_CANDIDATES = 48
@@ -284,6 +291,12 @@ class _Refinement:
 
         if draft.times.unstable:
             remarks.append("Note: the start is unstable, so the horizon is short.")
+        samples = self._predictable_samples(system, moved)
+        if samples < draft.times.samples:
+            moved = replace(moved, times=replace(draft.times, samples=samples))
+            remarks.append(
+                "Note: the motion amplifies small disturbances, so the horizon is short."
+            )
         remarks += _unnamed(self.source.model)
         chosen = self._identified(moved)
         return replace(
@@ -309,7 +322,9 @@ class _Refinement:
             return False
         try:
             task = self._task(system, draft, boundary={"start": "rest"})
-            return bool(np.isfinite(task.initial_hold).all())
+            # A design searches without the stops of joints, too.
+            holds = (task.initial_hold, task.relaxed().initial_hold)
+            return bool(np.isfinite(holds).all())
         except MjfimError:
             return False
 
@@ -330,6 +345,26 @@ class _Refinement:
 
         kinds = found.relative_margins.keys() - found.unenforced - set(WITHOUT_ROOM)
         return min((found.relative_margins[kind] for kind in kinds), default=np.inf)
+
+    def _predictable_samples(self, system: System, draft: Proposal) -> int:
+        """Samples of the first motion until a small disturbance of the start has grown too much."""
+        task = self._task(system, draft)
+        least = round(SHORTEST_MOTION * draft.times.period * draft.times.rate)
+        try:
+            A, _, _, _ = task.plant.derivatives.jacobians(task.theta, task.initial)
+        except SimulationDivergedError:
+            return draft.times.samples
+
+        # Deviations of positions, in their sizes. Those of velocities grow at first where a servo
+        # is stiff.
+        nv, grown = self.source.model.nv, np.eye(A.shape[1])
+        sizes = position_sizes(self.source.model)
+        for k, transition in enumerate(A):
+            grown = transition @ grown
+            positions = grown[:nv, :nv] * (sizes / sizes[:, None])
+            if not np.linalg.norm(positions, 2) <= LARGEST_AMPLIFICATION:
+                return min(max(k, least), draft.times.samples)
+        return draft.times.samples
 
     def _identified(self, draft: Proposal) -> Sequence[int]:
         """Indices of the candidates that the chirp identifies together."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs
-from mjfim.model.servos import actuator_gear, commanded_joint, is_integrated
+from mjfim.model.servos import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.model.sizes import control_sizes, translations
 from mjfim.studies.first_experiment.time_scale import free_time, pendulum_time, reach
 
@@ -70,8 +70,8 @@ def choose_start(model: Any) -> Start:
     """Choose a state at rest in which an experiment can begin.
 
     Named keyframes that a control holds come first, then the reference positions, then the state in
-    which the model settles by itself. Where nothing holds, the one that drifts least is
-    taken: a robot with legs begins on its feet.
+    which the model settles while its driven joints are locked, or by itself. Where nothing holds,
+    the one that drifts least is taken: a robot with legs begins on its feet.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
@@ -104,10 +104,18 @@ def _candidates(model: Any) -> Iterator[Start]:
     first = _start(model, inside, _resting_control(model, inside), keyframe=None, reason=reason)
     yield first
 
-    settled = _settled(model, first)
-    if settled is not None:
-        reason = "the state in which the model comes to rest by itself"
-        yield _start(model, settled, first.control, keyframe=None, reason=reason)
+    driven = _driven_dofs(model)
+    for locked, how in ((driven, "while its driven joints are locked"), ((), "by itself")):
+        settled = _settled(model, first, locked)
+        if settled is None:
+            continue
+
+        # A joint that rests on the end of its range has no room to move.
+        inside = _inside_ranges(model, settled)
+        reason = f"the state in which the model comes to rest {how}"
+        if not np.array_equal(inside, settled):
+            reason += MOVED_INSIDE
+        yield _start(model, inside, first.control, keyframe=None, reason=reason)
 
 
 def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reason: str) -> Start:
@@ -275,11 +283,25 @@ def _time(model: Any, data: Any) -> float:
     return pendulum_time(model, data) or free_time(model)
 
 
-def _settled(model: Any, start: Start) -> Array | None:
+def _driven_dofs(model: Any) -> list[int]:
+    """Degrees of freedom of the slides and hinges at which an actuator acts."""
+    joints = {
+        int(model.actuator_trnid[i, 0])
+        for i in range(model.nactuator)
+        if mujoco.mjtTrn(int(model.actuator_trntype[i])) in AT_JOINT
+    }
+    return [int(model.jnt_dofadr[j]) for j in sorted(joints) if joint_dofs(model, j) == 1]
+
+
+def _settled(model: Any, start: Start, locked: Sequence[int]) -> Array | None:
     """(nq,) positions in which the model comes to rest with a strong artificial damping.
 
-    None where the simulation diverges.
+    Slides and hinges whose degrees of freedom are locked keep their position. None where the
+    simulation diverges, and where all degrees of freedom are locked.
     """
+    if len(locked) == model.nv:
+        return None
+    kept = [int(model.jnt_qposadr[int(model.dof_jntid[v])]) for v in locked]
     data = mujoco.MjData(model)
     _signed_acceleration(model, data, start.qpos, start.control)
     time = _time(model, data)
@@ -289,6 +311,8 @@ def _settled(model: Any, start: Start) -> Array | None:
     for _ in range(int(SETTLING_PERIODS * time / step)):
         mujoco.mj_step(model, data)
         data.qvel *= decay
+        data.qvel[list(locked)] = 0.0
+        data.qpos[kept] = start.qpos[kept]
         if (
             not np.isfinite(data.qpos).all()
             or data.warning[int(mujoco.mjtWarning.mjWARN_BADQACC)].number
