@@ -54,7 +54,7 @@ def export(
     storage: Annotated[str, typer.Option(help="Format of a bag: mcap or sqlite3.")] = "mcap",
     force: Force = False,
 ) -> None:
-    """Write a design for ROS 2 and other programs that run robots."""
+    """Write a design for ROS 2, or as a stand-alone Python program that plays it."""
     target = target_of(to)
     file = design_folder / "design.npz" if design_folder.is_dir() else design_folder
     stated = mjfim.Experiment.from_file(experiment or find_experiment_file(file))

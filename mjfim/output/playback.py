@@ -21,6 +21,15 @@ from mjfim.plant.batch import BatchSimulator
 from mjfim.records.playback import Playback
 from mjfim.records.trajectory import Trajectory
 
+# When a controller should use the gains. It is the name of the last column of design.csv, so it has
+# neither commas nor quotation marks; the column holds zeros.
+GAIN_NOTE = (
+    "gains are for u = ctrl + gain (planned state - measured state). Use them where small errors "
+    "grow along the motion (torque control without servos; mjfim design warns about it) and the "
+    "state is measured with little noise and delay. Leave them out where position servos correct "
+    "errors already. Record the control that was really sent in both cases"
+)
+
 
 def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Playback:
     """Simulate a designed trajectory at `playback_rate`, at the parameters of the design.
@@ -53,6 +62,8 @@ def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Pl
 def design_columns(playback: Playback, system: System) -> dict[str, Array]:
     """Return the columns of `design.csv` by name, each (M+1,): time, state, controls and gains.
 
+    The name of the last column says when to use the gains; the column holds zeros.
+
     Controls and gains hold until the next row; the last row has none (NaN).
 
     Args:
@@ -71,6 +82,7 @@ def design_columns(playback: Playback, system: System) -> dict[str, Array]:
     columns |= dict(zip(state_names(system.model), playback.state.T, strict=True))
     columns |= {f"ctrl:{name}": ctrl[:, i] for i, name in enumerate(system.controls)}
     columns |= dict(zip(gain_names(system.model, system.controls), gain.T, strict=True))
+    columns[f"note: {GAIN_NOTE}"] = np.zeros(M + 1)
     return columns
 
 

@@ -191,7 +191,8 @@ def test_gain_columns_name_the_components_on_which_they_act(tmp_path: Path) -> N
     assert names[0] == "gain:push:qpos:float.x"
     assert names[-1] == "gain:twist:qvel:ball.rz"
     filtered = BUILD["filtered"](tmp_path)
-    header = list(table(written(filtered, tmp_path)[0]))
+    *header, note = table(written(filtered, tmp_path)[0])
+    assert note.startswith("note: gains are for")
     state = ["qpos:hinge", "qvel:hinge", "act:servo"]
     assert header == ["t", *state, "ctrl:servo", *(f"gain:servo:{name}" for name in state)]
 

@@ -15,11 +15,12 @@ from mjfim.output.robot.joint_trajectory import (
     write_trajectory_yaml,
 )
 from mjfim.output.robot.plan import RobotPlan
+from mjfim.output.robot.player_script import write_player
 from mjfim.output.robot.ros2_bag import bag_files, storage_of, write_bag
 from mjfim.records.design import Design
 
 # Programs for which a design can be exported.
-Target = Literal["ros2", "ros2-bag"]
+Target = Literal["ros2", "ros2-bag", "player"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,7 @@ def target_of(text: str) -> Target:
 
 def is_folder(target: Target) -> bool:
     """Whether an export to a target is a folder instead of a file."""
-    return target != "ros2"
+    return target == "ros2-bag"
 
 
 def exported_files(target: Target, path: Path) -> tuple[str, ...]:
@@ -77,8 +78,9 @@ def export_design(
 ) -> list[str]:
     """Write a design for a program that runs robots.
 
-    `to` is `ros2` for a YAML file with a `trajectory_msgs/JointTrajectory`, or `ros2-bag` for the
-    folder of a ROS 2 bag with this message, the planned joint states and the controls.
+    `to` is `ros2` for a YAML file with a `trajectory_msgs/JointTrajectory`, `ros2-bag` for the
+    folder of a ROS 2 bag with this message, the planned joint states and the controls, or `player`
+    for a stand-alone Python program that plays the controls, with or without feedback.
 
     Args:
         experiment: The experiment for which the design was made.
@@ -116,6 +118,10 @@ def write_export(plan: RobotPlan, path: Path, target: Target, options: ExportOpt
     Returns:
         Sentences that the user of the export needs.
     """
+    if target == "player":
+        write_player(path, plan)
+        return [f"`python {path}` says what the design needs, and how to play it"]
+
     storage = storage_of(options.storage)
     trajectory = joint_trajectory(plan, options.positions)
     if target == "ros2":

@@ -39,6 +39,7 @@ class Drive:
         joint: The slide or hinge joint on which its actuator acts; None where it acts on something
             else, or on several joints.
         gear: Ratio of the actuator's coordinate to that of the joint.
+        holds_position: Whether the actuator holds a position while the control stays.
         lower: Smallest control [unit of the actuator]; -inf without a limit.
         upper: Largest control [unit of the actuator]; inf without a limit.
     """
@@ -47,6 +48,7 @@ class Drive:
     kind: DriveKind
     joint: ScalarJoint | None
     gear: float
+    holds_position: bool
     lower: float
     upper: float
 
@@ -132,6 +134,7 @@ def drives_of(system: System) -> tuple[Drive, ...]:
                     kind=_kind(model, i) if count == 1 else DriveKind.OTHER,
                     joint=joint,
                     gear=float(model.actuator_gear[int(model.actuator_outadr[i]), 0]),
+                    holds_position=_holds_position(model, i),
                     lower=float(lower),
                     upper=float(upper),
                 )
@@ -146,14 +149,28 @@ def _joint_number(model: Any, actuator: int) -> int:
     return int(model.actuator_trnid[actuator, 0]) if at_joint else -1
 
 
+def _holds_position(model: Any, actuator: int) -> bool:
+    """Whether an actuator pulls its coordinate to a place that its control states."""
+    is_affine = int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    return (
+        is_affine
+        and float(model.actuator_biasprm[actuator, 1]) < 0.0
+        and not _integrates(model, actuator)
+    )
+
+
+def _integrates(model: Any, actuator: int) -> bool:
+    """Whether the control of an actuator is the rate of its activation."""
+    return int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+
+
 def _kind(model: Any, actuator: int) -> DriveKind:
     """What the control of an actuator with one control means."""
     gain = float(model.actuator_gainprm[actuator, 0])
     bias = model.actuator_biasprm[actuator]
     has_fixed_gain = int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     bias_type = mujoco.mjtBias(int(model.actuator_biastype[actuator]))
-    integrates = int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
-    if not has_fixed_gain or gain == 0.0 or integrates:
+    if not has_fixed_gain or gain == 0.0 or _integrates(model, actuator):
         return DriveKind.OTHER
 
     if bias_type == mujoco.mjtBias.mjBIAS_NONE:
