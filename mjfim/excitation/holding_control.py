@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import joint_names
+from mjfim.model.variants import Relaxation
+from mjfim.plant.batch import BatchSimulator
 
-# Number of Gauss-Newton steps; one is enough where forces are linear in the control.
+# Number of Gauss-Newton steps over one engine step, and then over one sample; one is enough where
+# the drift is linear in the control.
 NEWTON_STEPS = 4
 
 # Difference step of the control, relative to its size.
@@ -37,7 +43,8 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
     """
     control = least_drift_control(system, state, guess)
 
-    drift = _drift(system, state, control[None])[0]
+    stated = system.plant.model(system.theta)
+    drift = _Drift(system, system.plant.simulator, stated, state).under(control[None])[0]
     _require_held(system, state, drift, key, place)
     return control
 
@@ -45,7 +52,9 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
 def least_drift_control(system: System, state: Array, guess: Array) -> Array:
     """Find the control under which a state changes least over one sample.
 
-    It holds the state where any control does.
+    It holds the state where any control does. Clamps of controls and forces are lifted, because the
+    drift does not depend on a control whose force is clamped: that of a stiff servo far from the
+    state, for example.
 
     Args:
         system: The system; the plant is taken at its theta.
@@ -55,31 +64,70 @@ def least_drift_control(system: System, state: Array, guess: Array) -> Array:
     Returns:
         (nu,) control, which may violate limits.
     """
+    model = _without_clamps(system.plant.model(system.theta))
+    sample = system.plant.simulator
+
+    # Over one engine step, the drift is linear in most controls, however far the guess is from
+    # the control that is sought. Over a sample, it shows the effect of all of them.
+    control = guess
+    for simulator in (sample.with_substeps(1), sample):
+        control = _settled(_Drift(system, simulator, model, state), control)
+    return control
+
+
+def _settled(drift: _Drift, guess: Array) -> Array:
+    """Gauss-Newton steps towards the control, (nu,), under which a state changes least."""
+    natural = drift.system.plant.sizes
     control = np.array(guess)
-    sizes = np.maximum(np.abs(control), system.plant.sizes.control)
+    sizes = np.maximum(np.abs(control), natural.control)
     steps = RELATIVE_DIFFERENCE * sizes
-    state_sizes = system.plant.sizes.state
 
     for _ in range(NEWTON_STEPS):
         # The drift under the control, and under one control for each component that is moved.
-        rows = _drift(system, state, np.vstack([control, control + np.diag(steps)]))
-        B = (rows[1:] - rows[0]).T / RELATIVE_DIFFERENCE / state_sizes[:, None]
+        rows = drift.under(np.vstack([control, control + np.diag(steps)]))
+        B = (rows[1:] - rows[0]).T / RELATIVE_DIFFERENCE / natural.state[:, None]
         if not np.isfinite(B).all():
             break
 
         # The Gauss-Newton step makes the linearised drift as small as possible, relative to the
         # sizes of states and controls.
-        control = control - sizes * np.linalg.lstsq(B, rows[0] / state_sizes)[0]
+        control = control - sizes * np.linalg.lstsq(B, rows[0] / natural.state)[0]
 
     return control
 
 
-def _drift(system: System, state: Array, controls: Array) -> Array:
-    """(m, nx) change of a state over a sample under each of (m, nu) controls."""
-    plant = system.plant
-    states = np.broadcast_to(state, (len(controls), len(state)))
-    stepped = plant.simulator.step([plant.model(system.theta)], states, controls)
-    return np.asarray(system.space.minus(stepped.states, state))
+class _Drift(NamedTuple):
+    """Change of a state over one sample.
+
+    Attributes:
+        system: The system.
+        simulator: Simulates the sample.
+        model: The compiled model.
+        state: (ns,) state before the sample.
+    """
+
+    system: System
+    simulator: BatchSimulator
+    model: Any
+    state: Array
+
+    def under(self, controls: Array) -> Array:
+        """(m, nx) change of the state under each of (m, nu) controls."""
+        states = np.broadcast_to(self.state, (len(controls), len(self.state)))
+        stepped = self.simulator.step([self.model], states, controls)
+        return np.asarray(self.system.space.minus(stepped.states, self.state))
+
+
+def _without_clamps(model: Any) -> Any:
+    """A copy of a model whose controls and forces are not clamped."""
+    unclamped = copy.copy(model)
+    clamps = Relaxation(
+        joint_forces=tuple(range(model.njnt)),
+        actuators=tuple(range(model.nactuator)),
+        controls=True,
+    )
+    clamps.apply(unclamped)
+    return unclamped
 
 
 def _require_held(system: System, state: Array, drift: Array, key: str, place: str) -> None:
