@@ -1,0 +1,35 @@
+"""The control that holds a state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjfim.excitation.holding_control import holding_control, least_drift_control
+from tests.support.stiff_servos import START, stiff_arm_task
+
+# A servo that holds the arm is this far from the angle, because the arm is heavy [rad].
+LARGEST_SAG = 1.5e-3
+
+
+@pytest.mark.parametrize("rate", [10.0, 50.0, 250.0])
+def test_a_stiff_servo_is_found_that_holds_a_state_far_from_the_guess(
+    rate: float, tmp_path: Path
+) -> None:
+    """The force of the servos is clamped at the guess, where it does not depend on the control."""
+    task = stiff_arm_task(tmp_path, rate=rate, boundary={"start": "rest"})
+    start = task.plant.initial_state(task.theta)
+    hold = least_drift_control(task.system, start, np.zeros(2))
+    assert np.abs(hold - START).max() < LARGEST_SAG
+    assert np.array_equal(task.initial_hold, hold)
+
+    # The arm does not move under it, on the model with its clamps.
+    played = task.plant.simulate(task.theta, np.tile(hold, (task.samples, 1)))
+    assert np.abs(played.qpos - START).max() < 1e-6
+
+    found = holding_control(
+        task.system, start, np.array([3.0, 3.0]), key="boundary.start", place="the start"
+    )
+    assert np.allclose(found, hold, atol=1e-9)
