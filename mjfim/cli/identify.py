@@ -27,7 +27,7 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
-from mjfim.output.folders import estimate_files
+from mjfim.output.folders import estimate_files, parts_of_identified
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summaries.logs import describe_logs
 from mjfim.output.text import render
@@ -63,7 +63,8 @@ def identify(
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     inputs = input_files(system.experiment, [*recordings, *(held_out or [])])
-    claim_folder(output, estimate_files(len(recordings)), inputs, force=force)
+    names = (*estimate_files(len(recordings)), *parts_of_identified(output, system.model_path))
+    claim_folder(output, names, inputs, force=force)
 
     with progress("reading") as show:
         fitted = [read_log(path, system.channels) for path in recordings]

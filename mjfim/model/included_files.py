@@ -12,11 +12,28 @@ Context = TypeVar("Context")
 Reader = Callable[[Path, Context], Sequence[tuple[str, Context]]]
 
 
+def included_file(main: Path, including: Path, name: str) -> Path | None:
+    """Find the file that an `<include>` names.
+
+    As in MuJoCo, names are relative to the folder of the main file, or if there is no such file, to
+    that of the file that names it.
+
+    Args:
+        main: The main file.
+        including: The file that names another one.
+        name: Name of the other file.
+
+    Returns:
+        The other file; None if there is none.
+    """
+    places = (main.parent / name, including.parent / name)
+    return next((place for place in places if place.is_file()), None)
+
+
 def read_with_included_files(path: Path, context: Context, read: Reader[Context]) -> None:
     """Read an MJCF file and the files that it names, each of them once.
 
-    As in MuJoCo, names are relative to the folder of the main file. Files that do not exist are
-    left to MuJoCo, which describes the fault.
+    Files that do not exist are left to MuJoCo, which describes the fault.
 
     Args:
         path: The main file.
@@ -29,7 +46,7 @@ def read_with_included_files(path: Path, context: Context, read: Reader[Context]
     # The list grows while it is read.
     for file, stated in waiting:
         for name, other_context in read(file, stated):
-            other = path.parent / name
-            if other.is_file() and other.resolve() not in known:
+            other = included_file(path, file, name)
+            if other is not None and other.resolve() not in known:
                 known.add(other.resolve())
                 waiting.append((other, other_context))

@@ -20,7 +20,7 @@ from mjfim.interruption import run_optional
 from mjfim.output import plots
 from mjfim.output.archive import check_fits, write_design
 from mjfim.output.campaign_settings import SETTINGS_FILE
-from mjfim.output.folders import DESIGN_ARCHIVE
+from mjfim.output.folders import DESIGN_ARCHIVE, IDENTIFIED, parts_of_identified
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.plots.style import format_with_uncertainty
 from mjfim.recordings.read import read_recording
@@ -35,7 +35,7 @@ CAMPAIGN_FILES = (
     "campaign.json",
     "campaign.npz",
     "campaign.png",
-    "identified.xml",
+    IDENTIFIED,
 )
 
 # Files of the estimate after a round.
@@ -105,7 +105,7 @@ class CampaignFolder:
         Returns:
             Names relative to the folder.
         """
-        names = list(CAMPAIGN_FILES)
+        names = [*CAMPAIGN_FILES, *parts_of_identified(self.path, self.system.model_path)]
         designed, recorded = self.designed, self.recorded
         for number in self._numbers():
             # Designs and recordings are kept, and all estimates are made again.
@@ -245,7 +245,7 @@ class CampaignFolder:
 
         run_optional(lambda: self._write_figure(campaign, simulated=simulated))
         try:
-            write_identified(self.path / "identified.xml", self.system, campaign.estimate.theta)
+            write_identified(self.path / IDENTIFIED, self.system, campaign.estimate.theta)
         except ModelError as error:
             return str(error)
         return ""

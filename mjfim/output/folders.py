@@ -15,6 +15,7 @@ from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.interruption import run_optional
 from mjfim.output import archive, plots
 from mjfim.output import rerun as rerun_log
+from mjfim.output.mjcf.edited_files import copies_of_included_files
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.plots.pictures import fit_names, histogram_name, pictures_of
 from mjfim.records.check import Check
@@ -25,6 +26,9 @@ from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json, write_json
 from mjfim.records.shown import ShownRecord
+
+# The identified model.
+IDENTIFIED = "identified.xml"
 
 # Files that a design consists of, without figures.
 DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
@@ -48,15 +52,25 @@ ROBUSTNESS_FILES = ("playback.json", "playback.npz", "playback.png")
 SYSID_FILES = ("comparison.json", "sysid_report.html")
 
 
+def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:
+    """List the files that `identified.xml` may include beside it.
+
+    Args:
+        folder: Folder of `identified.xml`.
+        model: The user's MJCF.
+    """
+    return copies_of_included_files(folder / IDENTIFIED, model)
+
+
 def estimate_files(recordings: int) -> tuple[str, ...]:
-    """List the files that `mjfim identify` may write.
+    """List the files that `mjfim identify` may write for every model.
 
     Args:
         recordings: Number of recordings that are fitted.
     """
     figures = ("parameters.png", "spectra.png", "predictions.png")
     fits = tuple(f"{name}.png" for name in fit_names(recordings))
-    return ("estimate.json", "estimate.npz", "identified.xml", "estimate.rrd", *figures, *fits)
+    return ("estimate.json", "estimate.npz", IDENTIFIED, "estimate.rrd", *figures, *fits)
 
 
 def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
@@ -234,12 +248,12 @@ def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> l
     Returns:
         Sentences about results that could not be written completely.
     """
-    _clear(folder, r"fit(_\d+)?\.png|identified\.xml|predictions\.png")
+    _clear(folder, r"fit(_\d+)?\.png|identified(_.*)?\.xml|predictions\.png")
     estimate.save(folder)
 
     remarks = []
     try:
-        remark = write_identified(folder / "identified.xml", system, estimate.theta)
+        remark = write_identified(folder / IDENTIFIED, system, estimate.theta)
         remarks += [remark] if remark else []
     except ModelError as error:
         remarks.append(str(error))

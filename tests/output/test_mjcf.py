@@ -433,7 +433,7 @@ def test_functions_of_the_spec_are_printed_by_mujoco(tmp_path: Path) -> None:
 
 
 def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
-    """Elements of the file are changed in it; elements of an included file are not changed."""
+    """Elements of the file are changed in it; those of an included file in a copy beside it."""
     (tmp_path / "parts").mkdir()
     body = '<body name="d" pos="3 0 0"><joint name="dj"/><geom size=".1"/></body>'
     part = f"<mujocoinclude>{body}</mujocoinclude>"
@@ -452,7 +452,9 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
     assert_is_identified_model(new, task, [0.7])
     inside = task_of(source, tmp_path, "joint/dj:damping")
     said = write_identified(new, inside.system, np.array([0.7]))
-    assert said is not None and "joint 'dj' is not in the MJCF file itself" in said
+    assert said is None
+    assert '<include file="identified_d.xml"/></worldbody>' in lines(source, new)[1]
+    assert (tmp_path / "parts" / "d.xml").read_text(encoding="utf-8") == part
     assert mujoco.MjModel.from_xml_path(str(new)).joint("dj").damping[0] == 0.7
 
 

@@ -1,16 +1,23 @@
-"""Asset folders and included files of an MJCF that is written to another folder."""
+"""Asset folders and included files of an MJCF that is written to another folder.
+
+MuJoCo looks for an asset or an included file relative to the folder of the main file, and if there
+is none, relative to that of the file that names it.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mjfim.output.mjcf.document import MjcfDocument
+from mjfim.output.mjcf.document import MjcfDocument, SourceFile
 
 # Folders that <compiler> may state for one type of asset; `assetdir` is used for both.
 TYPED_FOLDERS = ("meshdir", "texturedir")
+
+# Elements that name files in these folders, by attributes whose names begin with `file`.
+ASSETS = ("mesh", "texture", "hfield", "skin", "flexcomp")
 
 
 def relocate_assets(document: MjcfDocument, spec: Any, source: Path, target: Path) -> None:
@@ -27,9 +34,12 @@ def relocate_assets(document: MjcfDocument, spec: Any, source: Path, target: Pat
     if source == target:
         return
 
+    beside = {file.include for file in document.files if file.is_beside}
     for i, tag in enumerate(document.tags):
-        if tag.name == "include" and "file" in tag.attributes:
+        if tag.name == "include" and "file" in tag.attributes and i not in beside:
             document.set(i, "file", _relocated(tag.attributes["file"], source, target))
+    for file in document.files[1:]:
+        _name_assets(document, file, spec, source)
 
     used = _used_folders(document, spec)
     compilers = document.top_level("compiler")
@@ -50,6 +60,60 @@ def relocate_assets(document: MjcfDocument, spec: Any, source: Path, target: Pat
         document.set(compilers[-1], "assetdir", folder)
     else:
         document.insert_child(0, "compiler", {"assetdir": folder})
+
+
+def point_to_copies(
+    document: MjcfDocument, names: Sequence[str], spec: Any, source: Path, target: Path
+) -> list[int]:
+    """Let a main file in one folder include the changed files, which are written beside it.
+
+    Args:
+        document: The texts.
+        names: Name of the copy of each file, in the order of the document.
+        spec: MjSpec of the text.
+        source: Folder of the user's main file.
+        target: Folder of the new main file.
+
+    Returns:
+        Indices of the changed files without the main file, the innermost first.
+    """
+    # A file that includes a changed one changes, too. Included files follow the including ones.
+    changed = []
+    for i in reversed(range(1, len(document.files))):
+        file = document.files[i]
+        if file.text.is_edited:
+            document.set(file.include, "file", names[i])
+            changed.append(i)
+
+    # What an original finds in its own folder, the copy has to find from another one.
+    for i in changed:
+        own = document.tags_of(document.files[i])
+        _name_assets(document, document.files[i], spec, source)
+        for other in document.files:
+            if other.include in own and other.is_beside and not other.text.is_edited:
+                name = Path(os.path.relpath(other.path, target)).as_posix()
+                document.set(other.include, "file", name)
+    return changed
+
+
+def _name_assets(document: MjcfDocument, file: SourceFile, spec: Any, source: Path) -> None:
+    """Name the assets that an included file finds in its own folder relative to the main file."""
+    own = file.path.parent
+    for i in document.tags_of(file):
+        tag = document.tags[i]
+        if tag.name not in ASSETS:
+            continue
+
+        folder = source / (spec.texturedir if tag.name == "texture" else spec.meshdir)
+        # The folder of the file is relative to the assets' where the main path was relative.
+        others = (folder / os.path.relpath(own, source), own)
+        for attribute, name in tag.attributes.items():
+            is_file = attribute.startswith("file") and not Path(name).is_absolute()
+            if not is_file or (folder / name).is_file():
+                continue
+            found = next((other / name for other in others if (other / name).is_file()), None)
+            if found is not None:
+                document.set(i, attribute, Path(os.path.relpath(found, folder)).as_posix())
 
 
 def _used_folders(document: MjcfDocument, spec: Any) -> list[str]:

@@ -1,13 +1,20 @@
-"""An MJCF text in which numbers of named elements are changed and written with all digits."""
+"""The MJCF texts of a model, in which numbers of named elements are written with all digits.
+
+The tags of the main file and of the files that it includes form one tree, as in MuJoCo: the content
+of an included file stands in the place of its `<include>`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError
+from mjfim.model.included_files import included_file
 from mjfim.output.mjcf.xml_edit import Tag, XmlText
 
 # Relative difference below which two numbers differ only by rounding.
@@ -41,23 +48,139 @@ ALTERNATIVES = {
 }
 
 
-class MjcfDocument(XmlText):
-    """MJCF text with pending edits of its numbers."""
+# Index of the main file among the files of a model.
+MAIN = 0
 
-    def __init__(self, text: bytes) -> None:
-        """Parse an MJCF.
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SourceFile:
+    """One file of a model.
+
+    Attributes:
+        path: The file.
+        text: Its text with pending edits.
+        include: Index of the `<include>` that names it; -1 for the main file.
+        is_beside: The name is relative to the folder of the including file, because it means no
+            file in that of the main file.
+    """
+
+    path: Path
+    text: XmlText
+    include: int = -1
+    is_beside: bool = False
+
+
+class MjcfDocument:
+    """Texts of a model with pending edits of their numbers.
+
+    Attributes:
+        files: The files of the model, the main file first, then in the order of the `<include>`s.
+        tags: All start tags in the order in which MuJoCo reads them. The root of the main file is
+            the first; elements of an included file have the parent of its `<include>`.
+    """
+
+    def __init__(self, text: bytes, path: Path | None = None) -> None:
+        """Parse an MJCF, and the files that it includes.
 
         Args:
             text: The MJCF in UTF-8.
+            path: Its file. Without it, the included files are not read.
 
         Raises:
-            ModelError: The text is no well-formed XML or no MJCF. The message is a clause, without
-                the name of the file.
+            ModelError: A text is no well-formed XML, or the main file is no MJCF. The message is a
+                clause, without the name of the file.
         """
-        super().__init__(text)
+        self.files: list[SourceFile] = []
+        self.tags: list[Tag] = []
+        self._places: list[tuple[XmlText, int]] = []
+        self._add(SourceFile(path=path or Path(), text=XmlText(text)), follows=path is not None)
+
         if self.tags[0].name != "mujoco":
             raise ModelError(f"the model is no MJCF but <{self.tags[0].name}>")
         self._elements = dict(_named_elements(self.tags))
+
+    def _add(self, file: SourceFile, *, follows: bool) -> None:
+        """Add the tags of a file, and where wanted those of the files that it includes."""
+        self.files.append(file)
+        places: dict[int, int] = {-1: -1}
+
+        for i, tag in enumerate(file.text.tags):
+            parent = places[tag.parent]
+            if tag.parent == 0 and file.include >= 0:
+                parent = self.tags[file.include].parent
+
+            places[i] = len(self.tags)
+            self.tags.append(replace(tag, parent=parent))
+            self._places.append((file.text, i))
+            if follows and tag.name == "include" and "file" in tag.attributes:
+                self._include(places[i], file.path)
+
+    def _include(self, include: int, including: Path) -> None:
+        """Add the file that an `<include>` of another file names."""
+        main, name = self.files[MAIN].path, self.tags[include].attributes["file"]
+        found = included_file(main, including, name)
+
+        # MuJoCo refuses a file that is included twice.
+        known = {file.path.resolve() for file in self.files}
+        if found is None or found.resolve() in known:
+            return
+        is_beside = not (main.parent / name).is_file()
+        text = XmlText(found.read_bytes())
+        file = SourceFile(path=found, text=text, include=include, is_beside=is_beside)
+        self._add(file, follows=True)
+
+    def tags_of(self, file: SourceFile) -> list[int]:
+        """Indices of the start tags of one file.
+
+        Args:
+            file: The file.
+        """
+        return [i for i, (text, _) in enumerate(self._places) if text is file.text]
+
+    def attribute(self, tag: int, name: str) -> str | None:
+        """Return the value of an attribute after the edits so far.
+
+        Args:
+            tag: Index of the tag.
+            name: Name of the attribute.
+
+        Returns:
+            The value, None if there is no such attribute.
+        """
+        text, own = self._places[tag]
+        return text.attribute(own, name)
+
+    def set(self, tag: int, name: str, value: str | None) -> None:
+        """Change, add or remove an attribute. See `XmlText.set`.
+
+        Args:
+            tag: Index of the tag.
+            name: Name of the attribute.
+            value: The new value; None removes the attribute.
+        """
+        text, own = self._places[tag]
+        text.set(own, name, value)
+
+    def rename_element(self, tag: int, name: str) -> None:
+        """Change the name of an element.
+
+        Args:
+            tag: Index of the tag.
+            name: The new name.
+        """
+        text, own = self._places[tag]
+        text.rename_element(own, name)
+
+    def insert_child(self, parent: int, name: str, attributes: dict[str, str]) -> None:
+        """Add an empty element as the first child of another one. See `XmlText.insert_child`.
+
+        Args:
+            parent: Index of the tag of the enclosing element.
+            name: Name of the new element.
+            attributes: Values by name of the attribute.
+        """
+        text, own = self._places[parent]
+        text.insert_child(own, name, attributes)
 
     def element(self, kind: str, name: str) -> int:
         """Find a named element.
@@ -70,12 +193,12 @@ class MjcfDocument(XmlText):
             Index of its start tag.
 
         Raises:
-            ModelError: The element is in another file, or MuJoCo generates it.
+            ModelError: MuJoCo generates the element, or copies it from another place.
         """
         if (kind, name) not in self._elements:
             raise ModelError(
-                f"{kind} {name!r} is not in the MJCF file itself (it comes from <include>, "
-                "<attach>, <replicate> or the like)"
+                f"{kind} {name!r} is not in the MJCF file itself or the files that it includes (it "
+                "comes from <attach>, <replicate> or the like)"
             )
         return self._elements[kind, name]
 
@@ -120,7 +243,8 @@ class MjcfDocument(XmlText):
 
         # A new attribute takes the place of the one that it replaces.
         if others and attribute not in self.tags[tag].attributes:
-            self.replace_attribute(tag, others[0], attribute, value)
+            text, own = self._places[tag]
+            text.replace_attribute(own, others[0], attribute, value)
         else:
             self.set(tag, attribute, value)
 

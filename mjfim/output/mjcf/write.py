@@ -6,6 +6,7 @@ A file is written only if it compiles to the identified model.
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from mjfim.model.spec_writer import state_derived_values, write_element
 from mjfim.model.variants import unconstrained
 from mjfim.output.mjcf.asset_paths import relocate_assets
 from mjfim.output.mjcf.document import MjcfDocument
+from mjfim.output.mjcf.edited_files import EditedFiles
 from mjfim.output.mjcf.edits import ParameterEdits
 
 # Prefixes of the arrays of MjModel that determine the motion.
@@ -69,7 +71,8 @@ REMARK_TEXT = 120
 def write_identified(path: Path, system: System, theta: Array) -> str | None:
     """Write the user's MJCF with parameter values.
 
-    In the user's text the numbers are replaced, with all their digits.
+    In the user's text the numbers are replaced, with all their digits. Included files whose text
+    changes are written beside the main file, under the names of `copies_of_included_files`.
 
     Where the text cannot express the values, MuJoCo prints the model (six significant digits).
 
@@ -120,37 +123,27 @@ def _write_edited(path: Path, system: System, theta: Array, wanted: Any) -> list
     values.
     """
     source = system.model_path.resolve()
-    document = MjcfDocument(source.read_bytes())
+    document = MjcfDocument(source.read_bytes(), source)
     relocate_assets(document, system.source.spec, source.parent, path.resolve().parent)
 
     edits = ParameterEdits(document, system.source.spec, system.model, wanted)
     edits.write_parameters(system.parameters, theta)
 
     stated: list[str] = []
-    with replacing(path) as temporary:
-        found = _compiled(temporary, document)
+    with ExitStack() as stack:
+        files = EditedFiles(document, system.source.spec, path, stack)
+        found = files.compiled()
         if not same_dynamics(found, wanted):
             stated = edits.write_derived(found)
-            found = _compiled(temporary, document)
+            found = files.compiled()
 
         different = _differences(found, wanted)
         if different:
             raise ModelError(
                 f"with the identified values the text compiles to a different {listed(different)}"
             )
+        files.finish()
     return stated
-
-
-def _compiled(path: Path, document: MjcfDocument) -> Any:
-    """Write the edited text to a file and compile it."""
-    path.write_bytes(document.edited())
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except (ValueError, mujoco.FatalError) as error:
-        reason = " ".join(str(error).split())
-        raise ModelError(
-            f"MuJoCo does not load the text with the identified values ({reason})"
-        ) from None
 
 
 def _write_printed(path: Path, system: System, theta: Array, wanted: Any) -> None:

@@ -105,6 +105,11 @@ class XmlText:
         except expat.ExpatError as error:
             raise ModelError(f"the MJCF is not well-formed XML in UTF-8 ({error})") from None
 
+    @property
+    def is_edited(self) -> bool:
+        """Whether the text has pending edits."""
+        return bool(self._values or self._names or self._children)
+
     def attribute(self, tag: int, name: str) -> str | None:
         """Return the value of an attribute after the edits so far.
 

@@ -1,0 +1,224 @@
+"""Identified models of several files: included files are copied where a number in them changes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjfim.output.folders import parts_of_identified
+from mjfim.output.mjcf.write import write_identified
+from tests.output.test_mjcf import assert_is_identified_model, lines, task_of
+
+# A robot of five files: settings with defaults, an arm in the tree, and inside it a hand, all in
+# folders of their own. The mesh of the arm lies in the folder of the compiler, that of the hand in
+# the folder of the file that names it.
+MAIN = """<mujoco model="robot">
+  <!-- settings of the laboratory -->
+  <include file="settings/common.xml"/>
+  <option integrator='implicitfast'   gravity="0 0 -9.8"/>
+  <worldbody>
+    <body name="base">
+      <joint name="base" axis="0 0 1" damping="0.5"/>
+      <geom name="base" type="sphere" size="0.1"/>
+      <include file="parts/arm.xml"/>
+    </body>
+  </worldbody>
+  <include file="parts/motors.xml"/>
+</mujoco>
+"""
+COMMON = """<mujocoinclude>
+  <compiler meshdir="meshes" autolimits="true"/>
+  <default>
+    <default class="light"> <!-- of the arm --> <joint damping="0.1"/> </default>
+  </default>
+  <asset><mesh name="block" file="block.obj"/></asset>
+</mujocoinclude>
+"""
+ARM = """<?xml version="1.0"?>
+<mujocoinclude>
+  <body name="arm" pos="0.2 0 0" childclass="light">
+    <joint   name="elbow" axis="0 1 0" armature='0.01'/> <!-- measured in May -->
+    <geom name="block" type="mesh" mesh="block"/>
+    <frame name="wrist" pos="0.1 0 0">
+      <include file="hand/hand.xml"/>
+    </frame>
+  </body>
+</mujocoinclude>
+"""
+HAND = """<mujocoinclude>
+  <body name="hand" pos="0.1 0 0">
+    <joint name="finger" axis="1 0 0" damping="0.02" range="-90 90"/>
+    <inertial pos="0 0 0.1" mass="0.3" diaginertia="1e-3 1e-3 1e-3"/>
+    <geom name="nail" type="mesh" mesh="nail" mass="0"/>
+  </body>
+</mujocoinclude>
+"""
+MOTORS = """<mujocoinclude>
+  <asset><mesh name="nail" file="nail.obj"/></asset>
+  <actuator>
+    <motor name="base" joint="base"/>
+    <position name="elbow" joint="elbow" kp="5"/>
+  </actuator>
+</mujocoinclude>
+"""
+
+
+def tetrahedron(size: float) -> str:
+    """A mesh."""
+    corners = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+    vertices = "".join(f"v {size * x} {size * y} {size * z}\n" for x, y, z in corners)
+    return vertices + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    """The main file of the robot in a folder of its own."""
+    files = {
+        "robot.xml": MAIN,
+        "settings/common.xml": COMMON,
+        "parts/arm.xml": ARM,
+        "parts/hand/hand.xml": HAND,
+        "parts/motors.xml": MOTORS,
+        "meshes/block.obj": tetrahedron(0.1),
+        "parts/nail.obj": tetrahedron(0.01),
+    }
+    home = tmp_path / "home"
+    for name, text in files.items():
+        (home / name).parent.mkdir(parents=True, exist_ok=True)
+        (home / name).write_text(text, encoding="utf-8")
+    return home / "robot.xml"
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Texts of all files of a folder, by their names in it."""
+    return {
+        file.relative_to(folder).as_posix(): file.read_text(encoding="utf-8")
+        for file in sorted(folder.rglob("*"))
+        if file.is_file()
+    }
+
+
+# Changed numbers by parameter path, and the copies that a change needs.
+CHANGES: dict[str, tuple[float, set[str]]] = {
+    "joint/base:damping": (0.7, set()),
+    "joint/elbow:armature": (0.02, {"identified_arm.xml"}),
+    "joint/elbow:damping": (0.3, {"identified_arm.xml"}),
+    "joint/finger:damping": (0.05, {"identified_arm.xml", "identified_hand.xml"}),
+    "body/hand:mass": (0.4, {"identified_arm.xml", "identified_hand.xml"}),
+    "actuator/elbow:gainprm": (6.0, {"identified_motors.xml"}),
+    "option:gravity[2]": (-9.81, set()),
+}
+
+
+@pytest.mark.parametrize("place", ["home", "home/parts", "out", "out/deep/folder"])
+@pytest.mark.parametrize("path", CHANGES)
+def test_the_file_that_holds_the_number_is_copied(
+    path: str, place: str, robot: Path, tmp_path: Path
+) -> None:
+    before = contents(robot.parent)
+    value, copies = CHANGES[path]
+    targets: list[Any] = [path]
+    if path.startswith("actuator"):
+        both = [{"path": path}, {"path": "actuator/elbow:biasprm[1]", "scale": -1.0}]
+        targets = [{"targets": both, "scale": 1.0}]
+
+    task = task_of(robot, tmp_path, *targets)
+    new = tmp_path / place / "identified.xml"
+    assert write_identified(new, task.system, np.array([value])) is None
+    assert_is_identified_model(new, task, [value])
+
+    # In another folder, every file that names others relative to the main file is copied, too.
+    written = {file.name for file in new.parent.glob("identified*")}
+    assert written >= {"identified.xml", *copies}
+    assert written <= {"identified.xml", *parts_of_identified(new.parent, robot)}
+    if place == "home":
+        assert written == {"identified.xml", *copies}
+    after = contents(robot.parent)
+    assert {name: after[name] for name in before} == before
+
+
+def test_the_text_stays_as_it_is(robot: Path, tmp_path: Path) -> None:
+    task = task_of(robot, tmp_path, "joint/elbow:armature", "joint/finger:damping")
+    new = tmp_path / "out" / "identified.xml"
+    assert write_identified(new, task.system, np.array([0.02, 0.05])) is None
+
+    home = robot.parent
+    gone, came = lines(home / "parts" / "arm.xml", new.parent / "identified_arm.xml")
+    assert [line.strip() for line in came] == [
+        '<joint   name="elbow" axis="0 1 0" armature=\'0.02\'/> <!-- measured in May -->',
+        '<include file="identified_hand.xml"/>',
+    ]
+    assert len(gone) == 2
+    gone, came = lines(home / "parts" / "hand" / "hand.xml", new.parent / "identified_hand.xml")
+    assert [line.strip() for line in came] == [
+        '<joint name="finger" axis="1 0 0" damping="0.05" range="-90 90"/>'
+    ]
+    gone, came = lines(robot, new)
+    assert '  <include file="identified_arm.xml"/>' in [line[4:] for line in came]
+    assert '  <include file="../home/parts/motors.xml"/>' not in gone
+    assert len(gone) == len(came) == 3
+
+
+def test_a_copy_can_be_identified_again(robot: Path, tmp_path: Path) -> None:
+    task = task_of(robot, tmp_path, "joint/finger:damping")
+    first = tmp_path / "first" / "identified.xml"
+    write_identified(first, task.system, np.array([0.05]))
+
+    again = task_of(first, tmp_path, "joint/finger:damping")
+    second = tmp_path / "second" / "identified.xml"
+    assert write_identified(second, again.system, np.array([0.06])) is None
+    assert_is_identified_model(second, again, [0.06])
+    assert (second.parent / "identified_hand.xml").is_file()
+
+    # In the folder of its own model, the copy takes another name.
+    beside = first.with_name("other.xml")
+    assert write_identified(beside, again.system, np.array([0.06])) is None
+    assert (first.parent / "other_identified_hand.xml").is_file()
+    assert mujoco.MjModel.from_xml_path(str(first)).joint("finger").damping[0] == 0.05
+
+
+def test_names_do_not_collide(tmp_path: Path) -> None:
+    """Two included files have one name, and a third has the name of a copy."""
+    for i, name in enumerate(("a/part.xml", "b/part.xml", "identified_part_2.xml")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(
+            f'<mujocoinclude><body name="b{i}"><joint name="j{i}" damping="1"/>'
+            '<geom size="0.1"/></body></mujocoinclude>',
+            encoding="utf-8",
+        )
+    xml = (
+        '<mujoco><worldbody><include file="a/part.xml"/><include file="b/part.xml"/>'
+        '<include file="identified_part_2.xml"/></worldbody>'
+        '<actuator><motor joint="j0"/></actuator></mujoco>'
+    )
+    (tmp_path / "model.xml").write_text(xml, encoding="utf-8")
+    paths = ["joint/j0:damping", "joint/j1:damping", "joint/j2:damping"]
+    task = task_of(tmp_path / "model.xml", tmp_path, *paths)
+
+    before = contents(tmp_path)
+    new = tmp_path / "identified.xml"
+    assert write_identified(new, task.system, np.array([2.0, 3.0, 4.0])) is None
+    assert_is_identified_model(new, task, [2.0, 3.0, 4.0])
+    after = contents(tmp_path)
+    assert {name: after[name] for name in before} == before
+    assert len(after) == len(before) + 4
+    copies = after.keys() - before.keys() - {"identified.xml"}
+    assert set(parts_of_identified(tmp_path, tmp_path / "model.xml")) == copies
+
+
+def test_nothing_is_left_where_the_text_cannot_express_the_value(
+    robot: Path, tmp_path: Path
+) -> None:
+    """The pose of a body in a frame is printed by MuJoCo; no copy stays."""
+    task = task_of(robot, tmp_path, "body/hand:pos[0]")
+    new = tmp_path / "out" / "identified.xml"
+    said = write_identified(new, task.system, np.array([0.25]))
+    assert said is not None
+    assert "printed by MuJoCo" in said
+    assert os.listdir(new.parent) == ["identified.xml"]
+    assert mujoco.MjModel.from_xml_path(str(new)).body("hand").pos[0] == 0.25
