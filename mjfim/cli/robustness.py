@@ -27,6 +27,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.input_files import input_files
+from mjfim.model.limited_elements import KINDS as LIMIT_KINDS
 from mjfim.output.archive import write_design
 from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
 from mjfim.output.summaries.robustness import describe_robustness
@@ -36,7 +37,7 @@ from mjfim.records.robustness import RobotConditions, Robustness
 from mjfim.studies.robustness import assess_robustness, default_latency
 
 # Kinds of limits from which a design can keep a reserve.
-KINDS = ("position", "velocity", "acceleration", "control", "control_rate", "force", "clearance")
+KINDS = (*LIMIT_KINDS, "clearance")
 
 # Largest number of robots; more would take days.
 MAX_RUNS = 100_000
@@ -199,7 +200,8 @@ def tightened(experiment: mjfim.Experiment, reserve: Mapping[str, float]) -> mjf
         if reserve.get(limit.kind):
             inner = reserve[limit.kind] * limit.scale
             table = tables.setdefault(limit.kind, {})
-            table[limit.name] = (limit.lower + inner, limit.upper - inner)
+            lower = 0.0 if limit.is_magnitude else limit.lower + inner
+            table[limit.name] = (lower, limit.upper - inner)
 
     clearance = experiment.limits.clearance
     if clearance is None:

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mjfim.arrays import Array
+from mjfim.excitation.magnitudes import Magnitude, VectorBarrier
 from mjfim.model.geom_distance import GeomDistances
-from mjfim.optimize.barrier import Bounds
+from mjfim.optimize.barrier import BarrierDerivatives, Bounds
 from mjfim.optimize.lq import Weights
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.state_space import StateSpace
@@ -126,37 +129,89 @@ class Constraint(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SubstepConstraint:
-    """Ranges of positions, velocities, accelerations and forces.
+    """Ranges of positions, velocities, accelerations, angles, speeds and forces.
 
     These quantities are observed at every engine step, so within the samples as well.
 
     Attributes:
-        observations: The w observed quantities.
-        bounds: Their ranges, (w,).
+        observations: The w observed numbers.
+        bounds: Ranges of the n quantities, (n,); a magnitude has the range from minus its bound to
+            its bound.
         kinds: Kind of each quantity.
-        names: Name of the joint or actuator of each quantity.
+        names: Name of the joint, actuator or tendon of each quantity.
+        columns: For each quantity the observed numbers that it consists of.
+        angles: For each quantity True where it is an angle without a sign.
     """
 
     observations: SubstepObservations
     bounds: Bounds
     kinds: tuple[str, ...]
     names: tuple[str, ...]
+    columns: tuple[tuple[int, ...], ...]
+    angles: tuple[bool, ...]
+
+    @cached_property
+    def numbers(self) -> NDArray[np.intp]:
+        """Places of the quantities that are single numbers with a sign."""
+        return np.array([i for i, each in enumerate(self.columns) if len(each) == 1], np.intp)
+
+    @cached_property
+    def number_columns(self) -> NDArray[np.intp]:
+        """Observed numbers that are these quantities."""
+        return np.array([self.columns[i][0] for i in self.numbers], np.intp)
+
+    @cached_property
+    def magnitudes(self) -> tuple[tuple[int, Magnitude], ...]:
+        """Places of the quantities that are norms of several numbers, with their definition."""
+        return tuple(
+            (i, Magnitude(columns=each, is_angle=self.angles[i]))
+            for i, each in enumerate(self.columns)
+            if len(each) > 1
+        )
+
+    @property
+    def column_scale(self) -> Array:
+        """(w,) scale of every observed number: that of its quantity [unit of the number]."""
+        scale = np.ones(sum(len(each) for each in self.columns))
+        scale[self.number_columns] = self.bounds.scale[self.numbers]
+        for i, magnitude in self.magnitudes:
+            scale[list(magnitude.columns)] = magnitude.norm_at(float(self.bounds.scale[i]))
+        return scale
 
     def tightened(self, fractions: Mapping[str, float]) -> SubstepConstraint:
         """Narrow the ranges by a fraction of their half-width, by kind."""
         each = np.array([fractions.get(kind, 0.0) for kind in self.kinds])
         return replace(self, bounds=self.bounds.tightened(each))
 
+    def quantities(self, observed: Array) -> Array:
+        """The limited quantities.
+
+        Args:
+            observed: (..., w) observed numbers.
+
+        Returns:
+            (..., n) quantities [unit of each kind].
+        """
+        found = np.empty((*observed.shape[:-1], len(self.columns)))
+        found[..., self.numbers] = observed[..., self.number_columns]
+        for i, magnitude in self.magnitudes:
+            found[..., i] = magnitude.value(observed)
+        return found
+
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """Margins at every engine step, one item per quantity. See `Constraint.margins`."""
-        margins = self.bounds.margin(values.observed)
+        margins = self.bounds.margin(self.quantities(values.observed))
         for i, kind in enumerate(self.kinds):
             yield KindMargins(kind, margins[..., i], float(self.bounds.scale[i]))
 
     def barrier(self, values: ConstraintValues, delta: float) -> float:
         """Mean over the rows with derivatives. See `Constraint.barrier`."""
         observed, weight = self._observed_with_weight(values)
-        return self.bounds.barrier(observed, delta, weight).value
+        total = self._number_barrier(observed, delta, weight).value
+        return total + sum(
+            self._vector_barrier(i, magnitude, observed, delta, weight).value
+            for i, magnitude in self.magnitudes
+        )
 
     def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
         """See `Constraint.add_expansion`; the Hessian is one matrix product per sample."""
@@ -164,25 +219,53 @@ class SubstepConstraint:
         if jacobian is None:
             raise ValueError("the observations have no derivatives")
 
+        # Slope of the barrier by every observed number, and its curvature times the Jacobian.
         observed, weight = self._observed_with_weight(values)
-        barrier = self.bounds.barrier(observed, delta, weight)
-        N, nx = len(observed), sums.a.shape[1]
+        slope = np.zeros(observed.shape)
+        bent = np.zeros(jacobian.shape)
+
+        barrier = self._number_barrier(observed, delta, weight)
+        slope[..., self.number_columns] = barrier.slope
+        bent[:, :, self.number_columns] = (
+            barrier.curvature[..., None] * jacobian[:, :, self.number_columns]
+        )
+        for i, magnitude in self.magnitudes:
+            columns = list(magnitude.columns)
+            vectors = self._vector_barrier(i, magnitude, observed, delta, weight)
+            slope[..., columns] = vectors.slope
+            bent[:, :, columns] = vectors.curvature @ jacobian[:, :, columns]
 
         # Gradient by the state and the control, (N, nx+nu).
-        gradient = np.einsum("kswi,ksw->ki", jacobian, barrier.slope)
+        N, nx = len(observed), sums.a.shape[1]
+        gradient = np.einsum("kswi,ksw->ki", jacobian, slope)
         sums.a[:-1] += gradient[:, :nx]
         sums.b[:] += gradient[:, nx:]
 
-        # Gauss-Newton Hessian J' diag(curvature) J of every sample, with all quantities in rows.
+        # Gauss-Newton Hessian J' (curvature) J of every sample, with all numbers in rows.
         flat = jacobian.reshape(N, -1, jacobian.shape[-1])
-        curvature = barrier.curvature.reshape(N, -1, 1)
-        hessian = np.swapaxes(flat * curvature, 1, 2) @ flat
+        hessian = np.swapaxes(bent.reshape(flat.shape), 1, 2) @ flat
         sums.weights.Q[:-1] += hessian[:, :nx, :nx]
         sums.weights.S[:] += hessian[:, nx:, :nx]
         sums.weights.R[:] += hessian[:, nx:, nx:]
 
+    def _number_barrier(self, observed: Array, delta: float, weight: float) -> BarrierDerivatives:
+        """Barrier of the quantities that are single numbers, with derivatives by them."""
+        bounds = Bounds(
+            lower=self.bounds.lower[self.numbers],
+            upper=self.bounds.upper[self.numbers],
+            scale=self.bounds.scale[self.numbers],
+        )
+        return bounds.barrier(observed[..., self.number_columns], delta, weight)
+
+    def _vector_barrier(
+        self, i: int, magnitude: Magnitude, observed: Array, delta: float, weight: float
+    ) -> VectorBarrier:
+        """Barrier of quantity i, a magnitude, with derivatives by its observed numbers."""
+        upper, scale = float(self.bounds.upper[i]), float(self.bounds.scale[i])
+        return magnitude.barrier(observed, upper, scale, delta=delta, weight=weight)
+
     def _observed_with_weight(self, values: ConstraintValues) -> tuple[Array, float]:
-        """Quantities at the S rows with derivatives, (N, S, w), and the weight of each."""
+        """Numbers at the S rows with derivatives, (N, S, w), and the weight of each."""
         rows = np.array(self.observations.derivative_rows)
         return values.observed[:, rows], values.weight / len(rows)
 

@@ -21,6 +21,7 @@ from mjfim.excitation.constraint_kinds import (
     SubstepConstraint,
 )
 from mjfim.excitation.limits import Limit, derivative_substeps_of, has_constant_forces
+from mjfim.excitation.observed_numbers import observed_numbers
 from mjfim.excitation.task import DesignTask
 from mjfim.model.geom_distance import GeomDistances
 from mjfim.model.geom_pairs import find_geom_pairs
@@ -33,8 +34,21 @@ from mjfim.records.trajectory import Trajectory
 # the model; it is at least the clearance itself.
 CLEARANCE_REACH = 0.1
 
-# Kinds of limits on quantities within samples, in the order of `SubstepObservations`.
-SUBSTEP_KINDS = ("position", "velocity", "acceleration", "force", "joint_force")
+# Kinds of limits on quantities within samples, in the order of the quantities.
+SUBSTEP_KINDS = (
+    "position",
+    "tilt",
+    "velocity",
+    "angular_velocity",
+    "acceleration",
+    "force",
+    "joint_force",
+    "tendon_force",
+    "tendon_length",
+)
+
+# Limits of forces that are computed at the beginning of an engine step and at its end.
+FORCE_KINDS = ("force", "joint_force", "tendon_force")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -179,7 +193,7 @@ class ConstraintSet:
             a=sums.a,
             b=sums.b,
             weights=sums.weights,
-            observations=observation_jacobian / self.substeps.bounds.scale[:, None],
+            observations=observation_jacobian / self.substeps.column_scale[:, None],
             control_scale=self.control.bounds.scale,
             control_step_scale=step_scale,
         )
@@ -248,43 +262,45 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
 
 def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepConstraint:
     """Ranges of the quantities within samples, ordered by kind."""
-    by_kind = {kind: [limit for limit in limits if limit.kind == kind] for kind in SUBSTEP_KINDS}
-    ordered = [limit for kind in SUBSTEP_KINDS for limit in by_kind[kind]]
-    addresses = {
-        kind: np.array([limit.index for limit in rows], dtype=np.intp)
-        for kind, rows in by_kind.items()
-    }
-
-    observations = SubstepObservations(
-        positions=addresses["position"],
-        velocities=addresses["velocity"],
-        accelerations=addresses["acceleration"],
-        actuator_forces=addresses["force"],
-        joint_forces=addresses["joint_force"],
+    ordered = tuple(limit for kind in SUBSTEP_KINDS for limit in limits if limit.kind == kind)
+    observed, columns = observed_numbers(task.system.model, ordered)
+    observations = replace(
+        observed,
         derivative_substeps=derivative_substeps_of(task.system.grid.substeps),
-        force_rows=_force_rows(task) if by_kind["force"] or by_kind["joint_force"] else (),
+        force_rows=_force_rows(task, {limit.kind for limit in ordered}),
         timestep=float(task.plant.simulator.model.opt.timestep),
     )
-    lower = np.array([limit.lower for limit in ordered])
+
+    # The norm of a magnitude is between minus its bound and its bound.
     upper = np.array([limit.upper for limit in ordered])
+    lower = np.array([-each.upper if each.is_magnitude else each.lower for each in ordered])
     sizes = np.array([limit.size for limit in ordered])
     return SubstepConstraint(
         observations=observations,
         bounds=Bounds.from_range(lower, upper, sizes),
         kinds=tuple(limit.kind for limit in ordered),
         names=tuple(limit.name for limit in ordered),
+        columns=columns,
+        angles=tuple(limit.is_angle for limit in ordered),
     )
 
 
-def _force_rows(task: DesignTask) -> tuple[int, ...]:
+def _force_rows(task: DesignTask, kinds: set[str]) -> tuple[int, ...]:
     """Engine steps of a sample whose forces have to be computed in addition to a rollout.
 
     MuJoCo keeps the forces at the beginning of each engine step, and with RK4 those of its last
     stage. The forces at the end of a sample under its control are those that the next sample
-    begins with where the control does not change.
+    begins with where the control does not change. Lengths of tendons are like forces that change.
+
+    Args:
+        task: The task.
+        kinds: Kinds of its limits.
     """
     model = task.system.model
-    if has_constant_forces(model):
+    changes = "tendon_length" in kinds
+    if not kinds.isdisjoint(FORCE_KINDS):
+        changes = changes or not has_constant_forces(model)
+    if not changes:
         return ()
 
     substeps = task.system.grid.substeps

@@ -100,6 +100,8 @@ def _observed(system: System) -> int:
     stated = system.experiment.limits
     if not stated.enforce:
         return 0
-    limits = limits_of(system.model, system.coordinates, system.controls, stated, system.grid.dt)
+    limits = limits_of(system.model, system.controls, stated, system.grid.dt)
     observed = [limit for limit in limits if limit.kind not in ("control", "control_rate")]
-    return len(observed) * len(derivative_substeps_of(system.grid.substeps))
+    return sum(limit.count for limit in observed) * len(
+        derivative_substeps_of(system.grid.substeps)
+    )

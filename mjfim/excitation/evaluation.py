@@ -9,7 +9,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, listed
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.limits import unlimited_elements, unsupported_ranges
+from mjfim.excitation.limits import unsupported_ranges
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
@@ -233,5 +233,4 @@ def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
                 f"the MJCF's ranges of {listed(unsupported)} are not among the limits of the "
                 "design: it may run into them"
             )
-    yield from unlimited_elements(task.system.model, experiment.limits)
     yield from probable_degrees(experiment, task.system.source)

@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, first_ones, listed, shortened, unknown
 from mjfim.experiment.task_tables import Limits
-from mjfim.model.coordinates import (
-    ScalarJoint,
-    actuator_names,
-    control_names,
-    joint_names,
-    scalar_joints,
-)
-from mjfim.model.sizes import (
-    LEAST_MOVE_PER_SAMPLE,
-    actuator_force_sizes,
-    control_sizes,
-    force_sizes,
-    position_sizes,
+from mjfim.model.coordinates import TRANSLATION, control_names
+from mjfim.model.limited_elements import (
+    KINDS,
+    OWNERS,
+    LimitedElement,
+    LimitedElements,
+    Range,
+    limited_elements,
 )
 
-Range = tuple[float, float]
-
-# Kinds of limits that are stated by joint; the others are stated by actuator.
-JOINT_KINDS = ("position", "velocity", "acceleration", "joint_force")
+# What the experiment file can state for one name: a number or a range; for a free joint also a
+# range for each of its three coordinates.
+Stated = float | Range
+Box = tuple[Range, Range, Range]
 
 # Largest number of engine steps of a sample at which the barrier is evaluated with derivatives.
 MAX_DERIVATIVE_SUBSTEPS = 5
@@ -38,17 +32,18 @@ MAX_DERIVATIVE_SUBSTEPS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """Range of one scalar.
+    """Range of one quantity.
 
     Attributes:
-        kind: "position", "velocity", "acceleration", "control", "control_rate", "force" or
-            "joint_force".
-        name: Name of the joint or the actuator.
-        index: Address in qpos, qvel, qacc, ctrl, ctrl, actuator_force or qfrc_actuator, for the
-            kinds in this order.
+        kind: One of `KINDS`, "position" for example.
+        name: Name of the joint, the actuator or the tendon; `<joint>.<part>` for one coordinate of
+            a ball or free joint, `<actuator>[<i>]` for one force of several.
+        index: Address of the quantity, see `LimitedElement`.
         lower: Lower bound, -inf without one [unit of the kind].
         upper: Upper bound, inf without one [unit of the kind].
         size: Natural size of the quantity, stated where there is a single bound [unit of the kind].
+        count: Number of numbers whose norm is the quantity; 1 for a number with a sign.
+        unit: Unit of the quantity; empty where the model does not determine it.
     """
 
     kind: str
@@ -57,6 +52,8 @@ class Limit:
     lower: float
     upper: float
     size: float = 1.0
+    count: int = 1
+    unit: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         if not self.lower < self.upper:
@@ -66,51 +63,37 @@ class Limit:
             )
 
     @property
+    def is_magnitude(self) -> bool:
+        """Whether the quantity is a speed, a norm of forces or an angle, which has no sign."""
+        return self.count > 1
+
+    @property
+    def is_angle(self) -> bool:
+        """Whether the quantity is an angle of rotation without a sign."""
+        return self.is_magnitude and self.kind in ("tilt", "position")
+
+    @property
     def scale(self) -> float:
         """Scale that makes margins relative [unit of the kind].
 
-        It is half of the range; with a single bound, the magnitude of the bound, at least the
-        natural size of the quantity.
+        It is half of the range, or the bound of a magnitude; with a single bound, the magnitude of
+        the bound, at least the natural size of the quantity.
         """
+        if self.is_magnitude:
+            return self.upper
         finite = [abs(bound) for bound in (self.lower, self.upper) if np.isfinite(bound)]
         if len(finite) == 2:
             return 0.5 * (self.upper - self.lower)
         return max(*finite, self.size)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _KindOfLimit:
-    """One kind of limit before names are resolved.
-
-    Attributes:
-        kind: Name of the kind.
-        stated: Numbers of the experiment file: one for all names, or a table by name.
-        addresses: Address of each joint or actuator that can have such a limit, by name.
-        model_ranges: Ranges of the MJCF, by name.
-        excluded: What the joints or actuators are that cannot have such a limit, by name.
-        sizes: (n,) natural sizes of the quantity, in the order of the addresses.
-    """
-
-    kind: str
-    stated: float | Mapping[str, float | Range]
-    addresses: Mapping[str, int]
-    model_ranges: Mapping[str, Range]
-    excluded: Mapping[str, str]
-    sizes: Array
-
-
 def limits_of(
-    model: Any,
-    coordinates: tuple[ScalarJoint, ...],
-    controls: tuple[str, ...],
-    stated: Limits,
-    period: float,
+    model: Any, controls: tuple[str, ...], stated: Limits, period: float
 ) -> tuple[Limit, ...]:
     """Collect all limits, ordered by kind.
 
     Args:
         model: MjModel.
-        coordinates: Its slide and hinge joints.
         controls: Names of its nu controls.
         stated: The `[limits]` table of the experiment file.
         period: Sample period, from which the natural sizes of rates follow [s].
@@ -120,80 +103,12 @@ def limits_of(
 
     Raises:
         ExperimentError: A name is unknown, a range is inverted, a stated range excludes that of the
-            MJCF, or a stated limit applies to nothing.
+            MJCF, a joint cannot have a stated limit, or a stated limit applies to nothing.
     """
-    joints = {c.name: c for c in coordinates}
-    scalar_actuators = {
-        name: i
-        for i, name in enumerate(actuator_names(model))
-        if int(model.actuator_outnum[i]) == 1
-    }
-    dofs = {name: c.v for name, c in joints.items()}
-    inputs = {name: i for i, name in enumerate(controls)}
-
-    outputs = {n: int(model.actuator_outadr[i]) for n, i in scalar_actuators.items()}
-    sizes = _natural_sizes(model, list(dofs.values()), list(outputs.values()), period)
-
-    turning, several = _joints_without_limits(model), _actuators_without_limits(model)
-    kinds = (
-        _KindOfLimit(
-            kind="position",
-            stated=stated.position,
-            addresses={name: c.q for name, c in joints.items()},
-            model_ranges=_position_ranges(model, coordinates),
-            excluded=turning,
-            sizes=sizes["position"],
-        ),
-        _KindOfLimit(
-            kind="velocity",
-            stated=stated.velocity,
-            addresses=dofs,
-            model_ranges={},
-            excluded=turning,
-            sizes=sizes["velocity"],
-        ),
-        _KindOfLimit(
-            kind="acceleration",
-            stated=stated.acceleration,
-            addresses=dofs,
-            model_ranges={},
-            excluded=turning,
-            sizes=sizes["acceleration"],
-        ),
-        _KindOfLimit(
-            kind="control",
-            stated=stated.control,
-            addresses=inputs,
-            model_ranges=_control_ranges(model, controls),
-            excluded={},
-            sizes=sizes["control"],
-        ),
-        _KindOfLimit(
-            kind="control_rate",
-            stated=stated.control_rate,
-            addresses=inputs,
-            model_ranges={},
-            excluded={},
-            sizes=sizes["control_rate"],
-        ),
-        _KindOfLimit(
-            kind="force",
-            stated=stated.force,
-            addresses=outputs,
-            model_ranges=_force_ranges(model, scalar_actuators),
-            excluded=several,
-            sizes=sizes["force"],
-        ),
-        _KindOfLimit(
-            kind="joint_force",
-            stated={},
-            addresses=dofs,
-            model_ranges=_joint_force_ranges(model, joints),
-            excluded=turning,
-            sizes=sizes["joint_force"],
-        ),
+    found = limited_elements(model, controls, period)
+    return tuple(
+        limit for kind in KINDS for limit in _limits_of_kind(kind, getattr(stated, kind), found)
     )
-    return tuple(limit for kind in kinds for limit in _limits_of_kind(kind))
 
 
 def limits_of_model(model: Any) -> tuple[Limit, ...]:
@@ -203,63 +118,63 @@ def limits_of_model(model: Any) -> tuple[Limit, ...]:
         model: MjModel.
     """
     timestep = float(model.opt.timestep)
-    return limits_of(model, scalar_joints(model), control_names(model), Limits(), timestep)
+    return limits_of(model, control_names(model), Limits(), timestep)
 
 
-def _natural_sizes(
-    model: Any, dofs: Sequence[int], outputs: Sequence[int], period: float
-) -> dict[str, Array]:
-    """Natural sizes of the limited quantities by kind, in the order of their addresses.
+def _limits_of_kind(
+    kind: str, stated: float | Mapping[str, Stated | Box], found: LimitedElements
+) -> list[Limit]:
+    """All limits of one kind, in the order of the elements.
 
     Args:
-        model: MjModel.
-        dofs: Degrees of freedom of the joints that can have limits.
-        outputs: Addresses of the forces of the actuators that can have limits.
-        period: Sample period, from which the natural sizes of rates follow [s].
+        kind: The kind.
+        stated: Numbers of the experiment file: one for all names, or a table by name.
+        found: The elements of the model.
     """
-    time = period / LEAST_MOVE_PER_SAMPLE
-    position = position_sizes(model)[dofs]
-    control = control_sizes(model, time)
-    return {
-        "position": position,
-        "velocity": position / time,
-        "acceleration": position / time**2,
-        "control": control,
-        "control_rate": control / time,
-        "force": actuator_force_sizes(model, time)[outputs],
-        "joint_force": force_sizes(model, time)[dofs],
-    }
-
-
-def _limits_of_kind(kind: _KindOfLimit) -> list[Limit]:
-    """All limits of one kind, in the order of the addresses."""
-    stated = _stated_ranges(kind)
+    by_name = _stated_ranges(kind, stated, found)
     limits = []
 
-    for name, index in kind.addresses.items():
+    for name, element in found.by_kind[kind].items():
         # A stated range has to be valid by itself, before the MJCF's range narrows it.
-        if name in stated:
-            lower, upper = stated[name]
-            Limit(kind=kind.kind, name=name, index=index, lower=float(lower), upper=float(upper))
+        if name in by_name:
+            lower, upper = by_name[name]
+            Limit(kind=kind, name=name, index=element.index, lower=float(lower), upper=float(upper))
 
-        ranges = [table[name] for table in (stated, kind.model_ranges) if name in table]
+        ranges = [each for each in (by_name.get(name), element.stated) if each is not None]
         if not ranges:
             continue
 
-        lower, upper = _intersection(f"limits.{kind.kind}.{name}", ranges)
+        lower, upper = _intersection(f"limits.{kind}.{name}", ranges)
         if np.isfinite(lower) or np.isfinite(upper):
-            limits.append(_limit(kind, name, lower, upper))
+            limits.append(_limit(kind, name, element, (lower, upper)))
 
     return limits
 
 
-def _limit(kind: _KindOfLimit, name: str, lower: float, upper: float) -> Limit:
-    """Limit of one name; its natural size is stated where there is a single bound."""
-    index = kind.addresses[name]
-    limit = Limit(kind=kind.kind, name=name, index=index, lower=lower, upper=upper)
+def _limit(kind: str, name: str, element: LimitedElement, bounds: Range) -> Limit:
+    """Limit of one name; its natural size is stated where there is a single bound.
+
+    Raises:
+        ExperimentError: An angle without a sign may be half a turn, which limits nothing.
+    """
+    lower, upper = bounds
+    limit = Limit(
+        kind=kind,
+        name=name,
+        index=element.index,
+        lower=lower,
+        upper=upper,
+        count=element.count,
+        unit=element.unit,
+    )
+    if limit.is_angle and not upper < np.pi:
+        raise ExperimentError(
+            f"limits.{kind}.{name}: {upper:g} rad limits nothing: this angle is in radians, "
+            "between 0 and pi"
+        )
     if np.isfinite(lower) and np.isfinite(upper):
         return limit
-    return replace(limit, size=float(kind.sizes[list(kind.addresses).index(name)]))
+    return replace(limit, size=element.size)
 
 
 def _intersection(key: str, ranges: Sequence[Range]) -> Range:
@@ -279,117 +194,120 @@ def _intersection(key: str, ranges: Sequence[Range]) -> Range:
     return lower, upper
 
 
-def _stated_ranges(kind: _KindOfLimit) -> dict[str, Range]:
+def _stated_ranges(
+    kind: str, stated: float | Mapping[str, Stated | Box], found: LimitedElements
+) -> dict[str, Range]:
     """Ranges that the experiment file states, by name.
 
-    A single number r is the range [-r, r]; without a table it holds for all names.
+    A single number r is the range [-r, r], or [0, r] of a magnitude. Without a table it holds for
+    all names, but not for single coordinates of a joint.
 
     Raises:
         ExperimentError: A name is unknown or cannot have such a limit, or no name can have it.
     """
-    names, stated = list(kind.addresses), kind.stated
-    if not names and not isinstance(stated, Mapping):
-        reasons = [f"{shortened(repr(name))} is {what}" for name, what in kind.excluded.items()]
-        listing = first_ones(reasons, "; ")
-        raise ExperimentError(
-            f"limits.{kind.kind} applies to nothing in this model: {listing}. It limits "
-            f"{_applies_to(kind.kind)} only; remove the key"
-        )
-    table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
+    elements = found.by_kind[kind]
+    if isinstance(stated, Mapping):
+        table = _with_coordinates(kind, stated, found)
+    else:
+        table = {name: stated for name, each in elements.items() if not each.is_part}
+        if not table:
+            raise ExperimentError(_applies_to_nothing(kind, found))
 
     for name in table:
-        if name in kind.excluded:
-            raise ExperimentError(
-                f"limits.{kind.kind}: {name!r} is {kind.excluded[name]}; this key limits "
-                f"{_applies_to(kind.kind)} only; valid: {listed(sorted(names))}"
-            )
-        if name not in names:
-            element = "joint" if kind.kind in JOINT_KINDS else "actuator"
-            raise ExperimentError(f"limits.{kind.kind}: {unknown(element, name, names)}")
-    return {
-        name: value if isinstance(value, tuple) else (-value, value)
-        for name, value in table.items()
-    }
+        if name not in elements:
+            raise ExperimentError(f"limits.{kind}: {_not_limited(kind, name, found)}")
+    return {name: _range_of(kind, name, table[name], elements[name]) for name in table}
 
 
-def _applies_to(kind: str) -> str:
-    """Elements to which a kind of limit applies, in words."""
-    return "slides and hinges" if kind in JOINT_KINDS else "actuators with a single force"
+def _with_coordinates(
+    kind: str, stated: Mapping[str, Stated | Box], found: LimitedElements
+) -> dict[str, Stated]:
+    """A table in which the three ranges of a free joint are those of its coordinates.
 
-
-def _joints_without_limits(model: Any) -> dict[str, str]:
-    """Kinds of the ball and free joints, in words by name."""
-    words = {
-        int(mujoco.mjtJoint.mjJNT_BALL): "a ball joint",
-        int(mujoco.mjtJoint.mjJNT_FREE): "a free joint",
-    }
-    kinds = zip(joint_names(model), model.jnt_type.tolist(), strict=True)
-    return {name: words[kind] for name, kind in kinds if kind in words}
-
-
-def _actuators_without_limits(model: Any) -> dict[str, str]:
-    """Numbers of forces of the actuators that have several, in words by name."""
-    counts = zip(actuator_names(model), model.actuator_outnum.tolist(), strict=True)
-    return {name: f"an actuator with {count} forces" for name, count in counts if count != 1}
-
-
-def unlimited_elements(model: Any, stated: Limits) -> tuple[str, ...]:
-    """Find the limits that are stated for all names, but do not apply to some of them.
-
-    Args:
-        model: MjModel.
-        stated: The `[limits]` table of the experiment file.
-
-    Returns:
-        Sentences that name the key and what it does not limit.
+    Raises:
+        ExperimentError: A joint has another number of ranges than it needs.
     """
-    joints, actuators = _joints_without_limits(model), _actuators_without_limits(model)
-    sentences = []
-    for kind, excluded in (
-        ("velocity", joints),
-        ("acceleration", joints),
-        ("force", actuators),
-    ):
-        if excluded and not isinstance(getattr(stated, kind), Mapping):
-            named = listed([f"{what[2:]} {name}" for name, what in excluded.items()])
-            sentences.append(
-                f"limits.{kind} does not apply to the {named}: it limits {_applies_to(kind)} only"
-            )
-    return tuple(sentences)
+    table: dict[str, Stated] = {}
+    for name, value in stated.items():
+        for coordinate, each in _by_coordinate(kind, name, value, found).items():
+            # A coordinate may be stated in the box and by itself; both hold.
+            earlier = table.get(coordinate)
+            if isinstance(earlier, tuple) and isinstance(each, tuple):
+                each = max(earlier[0], each[0]), min(earlier[1], each[1])
+            table[coordinate] = each
+    return table
 
 
-def _position_ranges(model: Any, coordinates: tuple[ScalarJoint, ...]) -> dict[str, Range]:
-    """Ranges of the joints in the MJCF, by name."""
-    joints = {c.name: c.joint for c in coordinates}
-    return _model_ranges(joints, model.jnt_limited, model.jnt_range)
+def _by_coordinate(
+    kind: str, name: str, value: Stated | Box, found: LimitedElements
+) -> dict[str, Stated]:
+    """One entry of a table; that of a free joint by the names of its coordinates.
 
-
-def _control_ranges(model: Any, controls: tuple[str, ...]) -> dict[str, Range]:
-    """Ranges of the controls in the MJCF, by name."""
-    actuators = {name: i for i, name in enumerate(controls)}
-    return _model_ranges(actuators, model.actuator_ctrllimited, model.actuator_ctrlrange)
-
-
-def _force_ranges(model: Any, actuators: Mapping[str, int]) -> dict[str, Range]:
-    """Ranges of the actuator forces in the MJCF, by name."""
-    return _model_ranges(actuators, model.actuator_forcelimited, model.actuator_forcerange)
-
-
-def _joint_force_ranges(model: Any, joints: Mapping[str, ScalarJoint]) -> dict[str, Range]:
-    """Ranges of the summed actuator forces on joints in the MJCF, by name."""
-    indices = {name: c.joint for name, c in joints.items()}
-    return _model_ranges(indices, model.jnt_actfrclimited, model.jnt_actfrcrange)
-
-
-def _model_ranges(indices: Mapping[str, int], limited: Any, ranges: Any) -> dict[str, Range]:
-    """Ranges by name of the elements that the model limits.
-
-    Args:
-        indices: Index of each element, by name.
-        limited: (n,) nonzero where the model limits an element.
-        ranges: (n, 2) ranges of all elements.
+    Raises:
+        ExperimentError: A joint has another number of ranges than it needs.
     """
-    return {name: tuple(ranges[i]) for name, i in indices.items() if limited[i]}
+    elements = found.by_kind[kind]
+    parts = [f"{name}.{part}" for part in TRANSLATION]
+    needs_three = name not in elements and parts[0] in elements
+
+    if isinstance(value, tuple) and len(value) == 3:
+        if needs_three:
+            return dict(zip(parts, value, strict=True))
+        raise ExperimentError(
+            f"limits.{kind}.{name}: three ranges are for free joints; it needs one range, "
+            "[lower, upper]"
+        )
+    if needs_three:
+        raise ExperimentError(
+            f"limits.{kind}: {name!r} is {found.joints[name]}: it needs three ranges, "
+            "[[lower, upper], [lower, upper], [lower, upper]] of x, y and z; or limit single "
+            f"coordinates: {listed(parts)}"
+        )
+    return {name: value}
+
+
+def _range_of(kind: str, name: str, value: Stated, element: LimitedElement) -> Range:
+    """The range that a stated number or range means.
+
+    Raises:
+        ExperimentError: A magnitude has a lower bound.
+    """
+    is_magnitude = element.count > 1
+    if not isinstance(value, tuple):
+        return (0.0, value) if is_magnitude else (-value, value)
+
+    lower, upper = value
+    if is_magnitude and lower != 0.0:
+        raise ExperimentError(
+            f"limits.{kind}.{name}: [{lower:g}, {upper:g}] should be one number: this quantity is "
+            "a magnitude, which has an upper bound only"
+        )
+    return lower, upper
+
+
+def _applies_to_nothing(kind: str, found: LimitedElements) -> str:
+    """Say that no element of the model can have a limit."""
+    owner, words = OWNERS[kind]
+    listing = ""
+    if owner == "joint":
+        reasons = [f"{shortened(repr(name))} is {what}" for name, what in found.joints.items()]
+        listing = f": {first_ones(reasons, '; ')}" if reasons else ""
+    return (
+        f"limits.{kind} applies to nothing in this model{listing}. It limits {words} only; "
+        "remove the key"
+    )
+
+
+def _not_limited(kind: str, name: str, found: LimitedElements) -> str:
+    """Say why a name cannot have a limit, which limits it can have, and which names can."""
+    owner, words = OWNERS[kind]
+    names = list(found.by_kind[kind])
+    if owner == "joint" and name in found.joints:
+        return (
+            f"{name!r} is {found.joints[name]}, which can have {listed(found.kinds_of(name))}; "
+            f"this key limits {words} only; valid: {listed(sorted(names))}"
+        )
+    return unknown(owner, name, names)
 
 
 def has_constant_forces(model: Any) -> bool:
@@ -423,22 +341,10 @@ def unsupported_ranges(model: Any) -> tuple[str, ...]:
         model: MjModel.
 
     Returns:
-        Descriptions of limited ball joints, tendons, actuator forces on tendons and activations,
-        with their names.
+        Descriptions of limited activations, with their names.
     """
-    kinds = mujoco.mjtObj
-    is_ball = model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)
-    balls = _names(model, kinds.mjOBJ_JOINT, is_ball & (model.jnt_limited != 0))
-    tendons = _names(model, kinds.mjOBJ_TENDON, model.tendon_limited)
-    pulled = _names(model, kinds.mjOBJ_TENDON, model.tendon_actfrclimited)
-    actuators = _names(model, kinds.mjOBJ_ACTUATOR, model.actuator_actlimited)
-
-    return (
-        *(f"ball joint {name}" for name in balls),
-        *(f"tendon {name}" for name in tendons),
-        *(f"the actuator force on tendon {name}" for name in pulled),
-        *(f"the activation of {name}" for name in actuators),
-    )
+    actuators = _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.actuator_actlimited)
+    return tuple(f"the activation of {name}" for name in actuators)
 
 
 def _names(model: Any, kind: Any, chosen: Any) -> list[str]:

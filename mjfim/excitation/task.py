@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,6 +29,8 @@ from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import IdentifiabilityTest
+from mjfim.model.coordinates import actuator_names, joint_names
+from mjfim.model.elements import unique_names
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.smooth_friction import has_dry_friction, smoothing_speeds_of
 from mjfim.model.variants import ModelVariant, Relaxation
@@ -151,9 +154,7 @@ class DesignTask:
     ) -> DesignTask:
         """Put a task together; `weighted`: weights or limits have to bound every control."""
         experiment, names = system.experiment, system.controls
-        limits = limits_of(
-            system.model, system.coordinates, names, experiment.limits, system.grid.dt
-        )
+        limits = limits_of(system.model, names, experiment.limits, system.grid.dt)
 
         weight = by_name("cost.control", experiment.cost.control, names, "actuator")
         if weighted:
@@ -565,7 +566,7 @@ class DesignTask:
         fastest = np.abs(self.initial.qvel).max(axis=0)
         for limit in self.limits:
             if limit.kind == "velocity":
-                fastest[limit.index] = limit.scale
+                fastest[limit.index : limit.index + limit.count] = limit.scale
         return smoothing_speeds_of(model, fastest)
 
     def _relaxation(self) -> Relaxation | None:
@@ -574,19 +575,22 @@ class DesignTask:
         if not stated.enforce:
             return None
 
-        named: dict[str, set[str]] = {"position": set(), "joint_force": set()}
+        named: dict[str, set[str]] = defaultdict(set)
         for limit in self.limits:
-            if limit.kind in named:
-                named[limit.kind].add(limit.name)
-        forced = {limit.index for limit in self.limits if limit.kind == "force"}
-        model, coordinates = self.system.model, self.system.coordinates
+            named[limit.kind].add(limit.name)
+        model = self.system.model
 
+        def chosen(names: tuple[str, ...], kind: str) -> tuple[int, ...]:
+            """Numbers of the elements that have a limit of a kind."""
+            return tuple(i for i, name in enumerate(names) if name in named[kind])
+
+        tendons = unique_names(model, "tendon")
         return Relaxation(
-            joints=tuple(c.joint for c in coordinates if c.name in named["position"]),
-            joint_forces=tuple(c.joint for c in coordinates if c.name in named["joint_force"]),
-            actuators=tuple(
-                i for i in range(model.nactuator) if int(model.actuator_outadr[i]) in forced
-            ),
+            joints=chosen(joint_names(model), "position"),
+            joint_forces=chosen(joint_names(model), "joint_force"),
+            actuators=chosen(actuator_names(model), "force"),
+            tendons=chosen(tendons, "tendon_length"),
+            tendon_forces=chosen(tendons, "tendon_force"),
             controls=True,
             contacts=stated.clearance is not None and not stated.ignored,
         )

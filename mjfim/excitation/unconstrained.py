@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopReason
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.constraints import ConstraintSet
+from mjfim.excitation.constraints import FORCE_KINDS, ConstraintSet
 from mjfim.excitation.extended_system import ExtendedDesignProblem
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
@@ -449,7 +449,7 @@ def _worst_margin_sign(task: DesignTask, constraints: ConstraintSet, control: Ar
         return -1.0
 
     margins = constraints.margins(values)
-    is_clamped = any(margins.get(kind, 1.0) <= 0.0 for kind in ("force", "joint_force"))
+    is_clamped = any(margins.get(kind, 1.0) <= 0.0 for kind in FORCE_KINDS)
     return 0.0 if is_clamped else 1.0
 
 

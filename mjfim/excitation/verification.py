@@ -18,7 +18,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.constraint_kinds import ClearanceConstraint
-from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.constraints import FORCE_KINDS, ConstraintSet, constraint_set_of
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.model.variants import unconstrained
@@ -29,6 +29,9 @@ from mjfim.records.trajectory import Trajectory
 
 # Deviation of a state up to which two simulations agree, relative to the sizes of the state.
 SAME_STATE_TOLERANCE = 1e-6
+
+# Limits that a state keeps or violates whatever the control is.
+STATE_KINDS = ("position", "tilt", "velocity", "angular_velocity", "tendon_length")
 
 # Share of the clearance that stands for contact where the clearance is divided by the distance.
 CONTACT_SHARE = 1e-9
@@ -184,18 +187,19 @@ def _unenforced_kinds(task: DesignTask) -> frozenset[str]:
 def _usage_within_samples(
     task: DesignTask, constraints: ConstraintSet, observed: Array
 ) -> Iterator[LimitUsage]:
-    """Position of the observed quantities, (N, rows, w), in their ranges."""
+    """Position of the limited quantities in their ranges; observed: (N, rows, w)."""
     substeps = constraints.substeps
-    N, _, w = observed.shape
+    quantities = substeps.quantities(observed)
+    N, _, count = quantities.shape
     steps = task.system.grid.substeps
-    shares = substeps.bounds.relative_position(observed)
+    shares = substeps.bounds.relative_position(quantities)
 
     # The position of an engine step is the farthest one of all rows that belong to it.
     within = shares[:, :steps].copy()
     for row, step in enumerate(constraints.observations.force_rows, start=steps):
         farther = np.abs(shares[:, row]) > np.abs(within[:, step])
         within[:, step] = np.where(farther, shares[:, row], within[:, step])
-    positions = within.reshape(N * steps, w)
+    positions = within.reshape(N * steps, count)
 
     t = _engine_times(task, len(positions))
     for i, (kind, name) in enumerate(zip(substeps.kinds, substeps.names, strict=True)):
@@ -288,33 +292,54 @@ def _require_feasible_start(task: DesignTask) -> None:
         _require_inside(task, constraints, "the final state", task.target)
 
     if boundary.start == "rest":
-        _require_held(task, "boundary.start", start, task.initial_hold)
+        _require_held(task, constraints, "boundary.start", start, task.initial_hold)
     if boundary.end == "rest":
-        _require_held(task, "boundary.end", task.target, task.final_hold)
+        _require_held(task, constraints, "boundary.end", task.target, task.final_hold)
 
 
 def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, state: Array) -> None:
-    """Require that a state, (ns,), keeps the limits on positions, velocities and distances."""
-    qpos, qvel, _ = task.space.split(state)
-    units = {c.name: c.unit for c in task.system.coordinates}
-
-    for limit in task.limits:
-        if limit.kind == "position":
-            value, unit = float(qpos[limit.index]), units[limit.name]
-        elif limit.kind == "velocity":
-            value, unit = float(qvel[limit.index]), f"{units[limit.name]}/s"
-        else:
+    """Require that a state, (ns,), keeps the limits on its motion and on distances."""
+    for limit, value in _quantities_at(task, constraints, state, task.system.rest):
+        if limit.kind not in STATE_KINDS or limit.lower <= value <= limit.upper:
             continue
-
-        if not limit.lower <= value <= limit.upper:
-            raise ExperimentError(
-                f"limits.{limit.kind}.{limit.name}: {where} is at {value:g} {unit}, outside "
-                f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (in the MJCF if it is stated "
-                f"there) or move {where}"
-            )
+        raise ExperimentError(
+            f"limits.{limit.kind}.{limit.name}: {where} is at {value:g} {limit.unit}, outside "
+            f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (in the MJCF if it is stated "
+            f"there) or move {where}"
+        )
 
     if constraints.clearance is not None:
         _require_clear(constraints.clearance, where, state[: task.space.nq])
+
+
+def _quantities_at(
+    task: DesignTask, constraints: ConstraintSet, state: Array, ctrl: Array
+) -> Iterator[tuple[Limit, float]]:
+    """The quantities that are limited within samples, at a state under a control.
+
+    Args:
+        task: The task.
+        constraints: Its constraints.
+        state: (ns,) state.
+        ctrl: (nu,) control [u-unit].
+
+    Yields:
+        Each limit with its quantity; accelerations are zero.
+    """
+    model = task.plant.model(task.theta)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:] = task.space.split(state)
+    data.ctrl[:] = ctrl
+    mujoco.mj_forward(model, data)
+
+    substeps = constraints.substeps
+    limits = {(limit.kind, limit.name): limit for limit in task.limits}
+    observed = substeps.observations.values(
+        data.qpos, data.qvel, data.qvel, lambda name: np.asarray(getattr(data, name))
+    )
+    values = substeps.quantities(observed).tolist()
+    for kind, name, value in zip(substeps.kinds, substeps.names, values, strict=True):
+        yield limits[kind, name], value
 
 
 def _require_clear(clearance: ClearanceConstraint, where: str, qpos: Array) -> None:
@@ -331,11 +356,14 @@ def _require_clear(clearance: ClearanceConstraint, where: str, qpos: Array) -> N
     )
 
 
-def _require_held(task: DesignTask, where: str, state: Array, hold: Array) -> None:
+def _require_held(
+    task: DesignTask, constraints: ConstraintSet, where: str, state: Array, hold: Array
+) -> None:
     """Require that the control that holds a state keeps the limits on controls and forces.
 
     Args:
         task: The task.
+        constraints: Its constraints.
         where: Key of the experiment file, for the error message.
         state: (ns,) state.
         hold: (nu,) control that holds it [u-unit].
@@ -343,17 +371,13 @@ def _require_held(task: DesignTask, where: str, state: Array, hold: Array) -> No
     Raises:
         ExperimentError: A control or a force is outside its limit.
     """
-    model = task.plant.model(task.theta)
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:], data.act[:] = task.space.split(state)
-    data.ctrl[:] = hold
-    mujoco.mj_forward(model, data)
-
-    needed = {"control": hold, "force": data.actuator_force, "joint_force": data.qfrc_actuator}
-    for limit in task.limits:
-        if limit.kind not in needed:
-            continue
-        value = needed[limit.kind][limit.index]
+    controls = [(limit, hold[limit.index]) for limit in task.limits if limit.kind == "control"]
+    forces = [
+        (limit, value)
+        for limit, value in _quantities_at(task, constraints, state, hold)
+        if limit.kind in FORCE_KINDS
+    ]
+    for limit, value in (*controls, *forces):
         if not limit.lower <= value <= limit.upper:
             raise ExperimentError(
                 f"{where}: standing still requires {limit.name} = {value:.4g}, outside "
@@ -363,6 +387,6 @@ def _require_held(task: DesignTask, where: str, state: Array, hold: Array) -> No
 
 def _key_of(limit: Limit) -> str:
     """The key or the range of the MJCF that states a limit, for error messages."""
-    if limit.kind == "joint_force":
-        return "limits.force or the MJCF's actuatorfrcrange"
+    if limit.kind in ("joint_force", "tendon_force"):
+        return f"limits.{limit.kind} or the MJCF's actuatorfrcrange"
     return f"limits.{limit.kind}"

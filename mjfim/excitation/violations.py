@@ -9,6 +9,7 @@ import numpy as np
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import Verification
+from mjfim.model.units import LENGTH
 from mjfim.records.design import LimitUsage, LimitViolation
 
 
@@ -39,9 +40,11 @@ def _violations_over_time(
         worst = int(np.argmax(np.abs(usage.share)))
         limit = limits.get((usage.kind, usage.name))
         if limit is None:
+            unit = LENGTH
             lower, upper = task.experiment.limits.clearance, None
             value = (lower or 0.0) / float(usage.share[worst])
         else:
+            unit = limit.unit
             lower, upper = _finite(limit.lower), _finite(limit.upper)
             value = _value_at(limit, usage, worst)
 
@@ -53,6 +56,7 @@ def _violations_over_time(
             value=value,
             lower=lower,
             upper=upper,
+            unit=unit,
         )
 
 

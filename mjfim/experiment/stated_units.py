@@ -16,11 +16,11 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.outputs import columns_of_keys
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import NoiseSpec, ParameterSpec, Signal
-from mjfim.model.coordinates import actuator_names
 from mjfim.model.elements import identifier
+from mjfim.model.limited_elements import limited_elements
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import unit_of
-from mjfim.model.units import ANGLE, control_unit, force_unit, per_second, sensor_unit
+from mjfim.model.units import ANGLE, control_unit, per_second, sensor_unit
 from mjfim.quantities import Quantity, Unit, wrong_unit
 
 # Angles beyond this number of turns look like degrees if they are round in degrees.
@@ -151,7 +151,7 @@ def _by_name(
         return
 
     for name, value in stated.items():
-        for number in value if isinstance(value, tuple) else (value,):
+        for number in _flat(value):
             if name in units and isinstance(number, float):
                 yield StatedNumber(
                     key=f"{key}.{name}",
@@ -160,6 +160,15 @@ def _by_name(
                     range=None if ranges is None else ranges.get(name),
                     is_position=ranges is not None,
                 )
+
+
+def _flat(value: Any) -> Iterator[Any]:
+    """The numbers of a number, of a range, or of several ranges."""
+    if not isinstance(value, tuple):
+        yield value
+        return
+    for each in value:
+        yield from _flat(each)
 
 
 def _initial_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
@@ -193,23 +202,17 @@ def _initial_numbers(experiment: Experiment, source: ModelSource) -> Iterator[St
 
 def _limit_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
     """Numbers of the table `limits`."""
-    stated, model = experiment.limits, source.model
-    joints = {joint.name: joint.unit for joint in source.coordinates.scalar_joints}
-    speeds = {name: per_second(unit) for name, unit in joints.items()}
-    controls = _control_units(source)
-    rates = {name: unit and per_second(unit) for name, unit in controls.items()}
-    forces = {name: force_unit(model, i) for i, name in enumerate(actuator_names(model))}
+    stated, controls = experiment.limits, source.coordinates.controls
+    ranges = {"position": _joint_ranges(source), "control": _servo_ranges(source)}
+    period = 1.0 / experiment.rate
 
-    yield from _by_name("limits.position", stated.position, joints, _joint_ranges(source))
-    yield from _by_name("limits.velocity", stated.velocity, speeds)
-    yield from _by_name(
-        "limits.acceleration",
-        stated.acceleration,
-        {name: per_second(unit) for name, unit in speeds.items()},
-    )
-    yield from _by_name("limits.control", stated.control, controls, _servo_ranges(source))
-    yield from _by_name("limits.control_rate", stated.control_rate, rates)
-    yield from _by_name("limits.force", stated.force, forces)
+    for kind, elements in limited_elements(source.model, controls, period).by_kind.items():
+        units = {name: element.unit for name, element in elements.items()}
+
+        # A free joint is stated by its name, with the ranges of its coordinates.
+        boxes = {name.removesuffix(".x"): units[name] for name in units if name.endswith(".x")}
+        key = f"limits.{kind}"
+        yield from _by_name(key, getattr(stated, kind), {**boxes, **units}, ranges.get(kind))
 
 
 def _noise_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:

@@ -24,6 +24,9 @@ from mjfim.recordings.spec import (
     Section,
 )
 
+# Ranges of the three coordinates of a place.
+Box = tuple[RangeWithUnit, RangeWithUnit, RangeWithUnit]
+
 # Largest numbers of repeated work; larger ones are mistyped and would not end.
 MAX_STARTS = 10_000
 MAX_ITERATIONS = 1_000_000
@@ -220,24 +223,52 @@ class Descent(Section):
 class Limits(Section):
     """Hard limits, which a design respects at every engine step.
 
-    The ranges of the MJCF (joint range, ctrlrange, forcerange) are always part of them; if the
-    file states a limit too, both hold. A number means the range from minus this number to this
-    number. A number instead of a table holds for all names.
+    The ranges of the MJCF (joint range, ctrlrange, forcerange, actuatorfrcrange, ranges of tendons)
+    are always part of them; if the file states a limit too, both hold. A number means the range
+    from minus this number to this number, or the largest size of a vector or of an angle. A number
+    instead of a table holds for all names.
     """
 
-    position: dict[str, RangeWithUnit] = Field(
+    position: dict[str, RangeWithUnit | Box] = Field(
         default_factory=dict,
-        description="Range of a joint position by joint name [m or rad].",
+        description=(
+            "Range of a joint position by joint name [m or rad]. A free joint has three ranges, "
+            "`[[lower, upper], [lower, upper], [lower, upper]]` of x, y and z, or one range by "
+            'coordinate, `"base.z" = [0.2, 2.0]`. For a ball joint it is the angle of its '
+            "rotation from the reference position, `[0, upper]`."
+        ),
         examples=[{"hinge": [-1.0, 1.0]}],
     )
+    tilt: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+        default_factory=dict,
+        description=(
+            "Largest tilt of the free and ball joints [rad]: the angle between the upward "
+            "direction (against gravity) and the direction in the body that is upward in the "
+            "reference position `qpos0` of the model. For a ball joint it is measured in its "
+            "parent. A rotation about the upward direction is free."
+        ),
+    )
     velocity: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
-        default_factory=dict, description="Limit of the joint velocities [m/s or rad/s]."
+        default_factory=dict,
+        description=(
+            "Limit of the joint velocities [m/s or rad/s]. For a free joint it is the linear "
+            "speed of its body, for a ball joint the angular speed. The velocity along one axis "
+            'of the world has the name of the coordinate, `"base.z" = [-0.5, 1.0]`.'
+        ),
+    )
+    angular_velocity: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+        default_factory=dict,
+        description=(
+            "Largest angular speed of the free and ball joints [rad/s]. The angular velocity "
+            'about one axis of the body has the name of the coordinate, `"base.rz" = 1.0`.'
+        ),
     )
     acceleration: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
         default_factory=dict,
         description=(
             "Limit of the joint accelerations [m/s² or rad/s²]: the change of the velocity over "
-            "each engine step, divided by the timestep."
+            "each engine step, divided by the timestep. For free and ball joints it is the size of "
+            "the change of the vector, as for `velocity`."
         ),
     )
     control: dict[str, RangeWithUnit] = Field(
@@ -257,8 +288,27 @@ class Limits(Section):
         default_factory=dict,
         description=(
             "Limit of the actuator forces [N or N m], at the beginning and at the end of each "
-            "engine step, as MuJoCo's force sensors read them."
+            "engine step, as MuJoCo's force sensors read them. For an actuator with several forces "
+            "it is their norm; one of them has the name `actuator[i]`."
         ),
+    )
+    joint_force: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+        default_factory=dict,
+        description=(
+            "Limit of the sum of all actuator forces on a joint [N or N m], as the MJCF's "
+            "actuatorfrcrange of joints."
+        ),
+    )
+    tendon_force: PositiveWithUnit | dict[str, PositiveWithUnit | RangeWithUnit] = Field(
+        default_factory=dict,
+        description=(
+            "Limit of the sum of all actuator forces on a tendon [N or N m], as the MJCF's "
+            "actuatorfrcrange of tendons."
+        ),
+    )
+    tendon_length: dict[str, RangeWithUnit] = Field(
+        default_factory=dict,
+        description="Range of the length of a tendon by tendon name [m or rad].",
     )
     clearance: Metres | None = Field(
         default=None,

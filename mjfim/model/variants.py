@@ -135,6 +135,8 @@ class Relaxation:
         joints: Ids of joints whose range is removed.
         joint_forces: Ids of joints whose limit of actuator force is removed.
         actuators: Ids of actuators whose force range is removed.
+        tendons: Ids of tendons whose range of lengths is removed.
+        tendon_forces: Ids of tendons whose limit of actuator force is removed.
         controls: Whether all control ranges are removed.
         contacts: Whether all contacts are removed.
         smoothing_speeds: Speeds below which dry friction is viscous [m/s or rad/s]; empty for the
@@ -144,6 +146,8 @@ class Relaxation:
     joints: tuple[int, ...] = ()
     joint_forces: tuple[int, ...] = ()
     actuators: tuple[int, ...] = ()
+    tendons: tuple[int, ...] = ()
+    tendon_forces: tuple[int, ...] = ()
     controls: bool = False
     contacts: bool = False
     smoothing_speeds: tuple[float, ...] = ()
@@ -153,6 +157,8 @@ class Relaxation:
         model.jnt_limited[list(self.joints)] = 0
         model.jnt_actfrclimited[list(self.joint_forces)] = 0
         model.actuator_forcelimited[list(self.actuators)] = 0
+        model.tendon_limited[list(self.tendons)] = 0
+        model.tendon_actfrclimited[list(self.tendon_forces)] = 0
         if self.controls:
             model.actuator_ctrllimited[:] = 0
         if self.contacts:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import mujoco
@@ -81,7 +81,9 @@ def state_space(model: Any) -> StateSpace:
 class SubstepObservations:
     """Quantities that are observed at the engine steps within a sample.
 
-    There are w numbers per engine step, in the order of the attributes.
+    There are w numbers per engine step: positions, velocities, accelerations and turns, then the
+    forces of actuators, on joints and of tendons, and the lengths of tendons, which count as forces
+    below.
 
     A force is what MuJoCo keeps in its field after the step. That is the force at the beginning of
     the step, which a force sensor reads, and with RK4 the force of the last of its four stages.
@@ -97,6 +99,11 @@ class SubstepObservations:
             differs from qacc.
         actuator_forces: Addresses in actuator_force.
         joint_forces: Addresses in qfrc_actuator.
+        turns: (n, 4) addresses in qpos of quaternions, after the step.
+        turn_weights: (n, 4) weights of their components; the weighted sums are observed.
+        tendon_forces: For each tendon, the addresses in actuator_force of its actuators; the sum
+            of their forces is observed.
+        tendon_lengths: Addresses in ten_length; the lengths belong to the same instant as forces.
         derivative_substeps: Engine steps of a sample, counted from 1, at which derivatives are
             taken; the last one ends the sample.
         timestep: Engine timestep [s].
@@ -113,6 +120,10 @@ class SubstepObservations:
     derivative_substeps: tuple[int, ...]
     timestep: float
     force_rows: tuple[int, ...] = ()
+    turns: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.intp))
+    turn_weights: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    tendon_forces: tuple[tuple[int, ...], ...] = ()
+    tendon_lengths: np.ndarray = field(default_factory=lambda: np.zeros(0, np.intp))
 
     @property
     def has_stages(self) -> bool:
@@ -133,10 +144,12 @@ class SubstepObservations:
     def fields(self) -> tuple[str, ...]:
         """MjData fields that have to be recorded in addition to the state."""
         names = []
-        if len(self.actuator_forces):
+        if len(self.actuator_forces) or self.tendon_forces:
             names.append("actuator_force")
         if len(self.joint_forces):
             names.append("qfrc_actuator")
+        if len(self.tendon_lengths):
+            names.append("ten_length")
         return tuple(names)
 
     def values(
@@ -155,6 +168,8 @@ class SubstepObservations:
         """
         change = qvel[..., self.accelerations] - qvel_before[..., self.accelerations]
         motion = [qpos[..., self.positions], qvel[..., self.velocities], change / self.timestep]
+        if len(self.turns):
+            motion.append((qpos[..., self.turns] * self.turn_weights).sum(axis=-1))
         if not self.fields:
             return np.concatenate(motion, axis=-1)
         return np.concatenate([*motion, self.forces(read)], axis=-1)
@@ -173,6 +188,12 @@ class SubstepObservations:
             parts.append(read("actuator_force")[..., self.actuator_forces])
         if len(self.joint_forces):
             parts.append(read("qfrc_actuator")[..., self.joint_forces])
+        if self.tendon_forces:
+            forces = read("actuator_force")
+            sums = [forces[..., list(pulling)].sum(axis=-1) for pulling in self.tendon_forces]
+            parts.append(np.stack(sums, axis=-1))
+        if len(self.tendon_lengths):
+            parts.append(read("ten_length")[..., self.tendon_lengths])
         return np.concatenate(parts, axis=-1)
 
 

@@ -227,6 +227,7 @@ class LimitViolation:
             largest deviation.
         lower: Lower bound, or None [unit of the kind].
         upper: Upper bound, or None [unit of the kind].
+        unit: Unit of the limited quantity; empty where it is unknown.
     """
 
     kind: str
@@ -236,13 +237,16 @@ class LimitViolation:
     value: float
     lower: float | None
     upper: float | None
+    unit: str = ""
 
     def __str__(self) -> str:
-        low = "-inf" if self.lower is None else f"{self.lower:.4g}"
-        high = "inf" if self.upper is None else f"{self.upper:.4g}"
+        is_above = self.upper is not None and self.value > self.upper
+        side, bound = ("above", self.upper) if is_above else ("below", self.lower)
+        quantity = " ".join([f"{self.value:.4g}", *([self.unit] if self.unit else [])])
+        limit = "its limit" if bound is None else f"{bound:.4g}"
         return (
-            f"{self.kind} of {self.name} is {self.value:.4g} at {self.t:.4g} s, outside "
-            f"[{low}, {high}] (first at {self.since:.4g} s)"
+            f"{self.kind.replace('_', ' ')} of {self.name} is {quantity} at {self.t:.4g} s, "
+            f"{side} {limit} (first at {self.since:.4g} s)"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -255,6 +259,7 @@ class LimitViolation:
             "value": self.value,
             "lower": self.lower,
             "upper": self.upper,
+            "unit": self.unit,
         }
 
 

@@ -195,7 +195,7 @@ class Robustness(ShownRecord):
 
         A force at its limit is clamped by the simulation, which does not count as kept.
         """
-        clamped = [limit.kind in ("force", "joint_force") for limit in self.limits]
+        clamped = [limit.kind in ("force", "joint_force", "tendon_force") for limit in self.limits]
         return np.where(clamped, self.margins > 0.0, self.margins >= 0.0)
 
     @property

@@ -10,12 +10,11 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, listed
-from mjfim.excitation.limits import Limit, limits_of_model, unsupported_ranges
-from mjfim.model.coordinates import actuator_names
+from mjfim.excitation.limits import limits_of_model, unsupported_ranges
 from mjfim.model.elements import identifier, names_of, unique_names, unnamed_count
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import INERTIAL_FIELDS, MODEL_ARRAYS, fields_of, resolve, unit_of
-from mjfim.model.units import FORCE_UNITS, control_unit, force_unit, sensor_unit
+from mjfim.model.units import control_unit, sensor_unit
 from mjfim.records.inventory import (
     Inventory,
     ListedActuator,
@@ -187,23 +186,8 @@ def _limits(source: ModelSource) -> Iterator[ListedLimit]:
             name=limit.name,
             lower=limit.lower,
             upper=limit.upper,
-            unit=_limit_unit(source, limit),
+            unit=limit.unit,
         )
-
-
-def _limit_unit(source: ModelSource, limit: Limit) -> str:
-    """Unit of a range of the MJCF."""
-    model = source.model
-    if limit.kind == "control":
-        return control_unit(model, _actuator_of_control(model)[limit.index])
-
-    if limit.kind == "force":
-        return force_unit(model, actuator_names(model).index(limit.name))
-
-    unit = next(
-        joint.unit for joint in source.coordinates.scalar_joints if joint.name == limit.name
-    )
-    return FORCE_UNITS[unit] if limit.kind == "joint_force" else unit
 
 
 def _remarks(model: Any) -> Iterator[str]:

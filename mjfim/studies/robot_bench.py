@@ -496,7 +496,8 @@ class RobotBench:
         """
         constraints = self.constraints
         bounds = constraints.substeps.bounds
-        inside = bounds.margin(observed).min(axis=(0, 1), initial=np.inf) / bounds.scale
+        quantities = constraints.substeps.quantities(observed)
+        inside = bounds.margin(quantities).min(axis=(0, 1), initial=np.inf) / bounds.scale
         rates = self._control_rates(sent, before, feedback)
 
         margins = []

@@ -36,9 +36,7 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
 
     # A file for recordings alone needs no task of a design.
     if missing:
-        limits = limits_of(
-            system.model, system.coordinates, system.controls, experiment.limits, system.dt
-        )
+        limits = limits_of(system.model, system.controls, experiment.limits, system.dt)
     else:
         limits = DesignTask.of(system).limits
 

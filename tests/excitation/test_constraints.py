@@ -16,8 +16,8 @@ from mjfim.excitation.interior_problem import InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
 from mjfim.optimize.lq import TangentCurve
-from tests.support.limits import ARM, directions_of, floating_task
-from tests.support.numerics import directional_check, make_task
+from tests.support.limits import ARM, barrier_check, directions_of, floating_task
+from tests.support.numerics import make_task
 
 WIDE = {
     "position": 0.5,
@@ -70,20 +70,6 @@ def arm_task(folder: Path, **tables: Any) -> DesignTask:
         },
     }
     return make_task(ARM, folder, **{**defaults, **tables}).relaxed()
-
-
-def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
-    """Largest relative error of the slope of the barrier, against differences of simulations."""
-    problem = InteriorProblem(
-        base=task.problem, constraints=constraint_set_of(task), mu=1.0, delta=delta, with_cost=False
-    )
-    expansion = problem.expand(problem.point(task.control))
-    open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
-    gradient = expansion.gradient(open_loop)
-    sizes = np.abs(task.control - task.centre).max(axis=0)
-    ways = directions_of(task, 6) * sizes
-    curves = [lambda s, way=way: problem.point(task.control + s * way).barrier for way in ways]
-    return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
 
 
 @pytest.mark.parametrize("delta", [0.1, 3e-3])

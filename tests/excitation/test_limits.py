@@ -14,7 +14,7 @@ from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.limits import Limit, limits_of
 from mjfim.experiment.labels import labels_of_model
 from mjfim.experiment.task_tables import Limits
-from mjfim.model.coordinates import control_names, scalar_joints
+from mjfim.model.coordinates import control_names
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.trajectory import Trajectory
 from tests.support.numerics import make_task
@@ -46,7 +46,7 @@ def model() -> mujoco.MjModel:
 
 def limits(model: mujoco.MjModel, **tables: object) -> tuple[Limit, ...]:
     """Limits of the model and of tables of an experiment file."""
-    return limits_of(model, scalar_joints(model), control_names(model), Limits(**tables), 0.01)
+    return limits_of(model, control_names(model), Limits(**tables), 0.01)
 
 
 def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajectory:
@@ -94,10 +94,12 @@ def test_the_file_narrows_ranges_and_adds_others(model: mujoco.MjModel) -> None:
 
 
 def test_one_number_stands_for_all_names(model: mujoco.MjModel) -> None:
-    """It holds for slide and hinge joints, controls, and actuators with a single force."""
+    """It holds for all joints, controls and actuators."""
     found = limits(model, velocity=2.0, acceleration=9.0, control_rate=7.0, force=1.5)
     joints, places = (("lift", 3), ("turn", 4)), (("push", 0), ("twist", 1))
     assert set(found) - set(limits(model)) == {
+        Limit(kind="velocity", name="ball", index=0, lower=0.0, upper=2.0, count=3),
+        Limit(kind="acceleration", name="ball", index=0, lower=0.0, upper=9.0, count=3),
         *(
             Limit(kind=kind, name=name, index=v, lower=-b, upper=b)
             for kind, b in (("velocity", 2.0), ("acceleration", 9.0))
@@ -133,7 +135,7 @@ def test_every_range_of_the_model_is_a_limit() -> None:
     [
         (
             {"position": {"ball": (-1, 1)}},
-            r"limits\.position: 'ball' is a ball joint.*; valid: lift, turn",
+            r"limits\.position\.ball: \[-1, 1\] should be one number.* a magnitude",
         ),
         (
             {"velocity": {"turm": 1.0}},
@@ -154,8 +156,8 @@ def test_every_range_of_the_model_is_a_limit() -> None:
             r"limits\.position\.lift: \[0\.3, 1\] and the MJCF's range \[-0\.5, 0\.25\] excl",
         ),
         (
-            {"acceleration": {"ball": 1.0}},
-            r"limits\.acceleration: 'ball' is a ball joint.*; valid: lift, turn",
+            {"joint_force": {"ball": 1.0}},
+            r"limits\.joint_force: 'ball' is a ball joint.*; valid: lift, turn",
         ),
         (
             {"control_rate": {"lift": 1.0}},
@@ -266,10 +268,7 @@ SERVOED = """
 
 
 def test_every_control_of_an_actuator_has_its_range() -> None:
-    """MuJoCo has one range per control.
-
-    The range of a single force is a limit too, that of a norm is not.
-    """
+    """MuJoCo has one range per control; the range of several forces is that of their norm."""
     found = limits(mujoco.MjModel.from_xml_string(SERVOED))
     aims = [
         Limit(kind="control", name=f"aim[{i}]", index=i, lower=-1.0, upper=1.0) for i in range(3)
@@ -277,6 +276,7 @@ def test_every_control_of_an_actuator_has_its_range() -> None:
     assert found == (
         *aims,
         Limit(kind="control", name="actuator1", index=3, lower=-5.0, upper=5.0),
+        Limit(kind="force", name="aim", index=0, lower=0.0, upper=2.0, count=3),
         Limit(kind="force", name="actuator1", index=3, lower=-3.0, upper=4.0),
     )
 

@@ -13,17 +13,15 @@ import pytest
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.evaluation import open_boundary_warnings
 from mjfim.excitation.holding_control import holding_control
 from mjfim.excitation.limits import limits_of, unsupported_ranges
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import Limits
-from mjfim.model.coordinates import control_names, scalar_joints
+from mjfim.model.coordinates import control_names
 from mjfim.output import folders
 from tests.support.cli import loads, misused, names, run, write_experiment
-from tests.support.limits import floating_task
 from tests.support.numerics import CART_PENDULUM, make_task
 
 MOTOR = (
@@ -349,22 +347,7 @@ LOOSE = """
 
 def test_ranges_of_the_mjcf_that_are_no_limits_are_named() -> None:
     model = mujoco.MjModel.from_xml_string(LOOSE)
-    assert unsupported_ranges(model) == (
-        "ball joint wrist",
-        "tendon rope",
-        "the actuator force on tendon rope",
-        "the activation of muscle",
-    )
-
-
-def test_a_limit_of_all_joints_names_those_without_it(tmp_path: Path) -> None:
-    task = floating_task(tmp_path, limits={"velocity": 9.0, "force": 50.0})
-    told = [w for w in open_boundary_warnings(task) if "limits." in w]
-    assert told == [
-        "limits.velocity does not apply to the free joint float: it limits slides and hinges only"
-    ]
-    task = floating_task(tmp_path, limits={"velocity": {"elbow": 9.0}})
-    assert [w for w in open_boundary_warnings(task) if "limits.velocity" in w] == []
+    assert unsupported_ranges(model) == ("the activation of muscle",)
 
 
 # A ball on a free joint with a thruster.
@@ -372,18 +355,24 @@ BALL = """<mujoco><worldbody><body><freejoint name="free"/><geom size="0.1"/></b
 <actuator><motor name="push" joint="free" gear="0 0 1 0 0 0"/></actuator></mujoco>"""
 
 
+def test_a_speed_of_all_joints_holds_for_a_free_body() -> None:
+    model = mujoco.MjModel.from_xml_string(BALL)
+    (found,) = limits_of(model, control_names(model), Limits(velocity=1.0), 0.01)
+    assert (found.kind, found.name, found.lower, found.upper) == ("velocity", "free", 0.0, 1.0)
+
+
 @pytest.mark.parametrize(
     ("limits", "message"),
     [
-        ({"velocity": 1.0}, "limits.velocity applies to nothing in this model: 'free' is a free"),
-        ({"velocity": {"free": 1.0}}, "limits.velocity: 'free' is a free joint; this key limits"),
+        ({"joint_force": 1.0}, "limits.joint_force applies to nothing in this model: 'free' is a"),
+        ({"joint_force": {"free": 1.0}}, "limits.joint_force: 'free' is a free joint, which can"),
         ({"position": {"free": (-1.0, 1.0)}}, "limits.position: 'free' is a free joint"),
     ],
 )
 def test_a_limit_that_applies_to_nothing_is_refused(limits: dict[str, Any], message: str) -> None:
     model = mujoco.MjModel.from_xml_string(BALL)
     with pytest.raises(ExperimentError, match=re.escape(message)):
-        limits_of(model, scalar_joints(model), control_names(model), Limits(**limits), 0.01)
+        limits_of(model, control_names(model), Limits(**limits), 0.01)
 
 
 def test_a_jump_at_rest_is_warned_about(tmp_path: Path) -> None:

@@ -460,8 +460,8 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [
             HOME,
             "limits.speed",
-            "acceleration, bandwidth, clearance, control, control_rate, enforce, force, ignored, "
-            "position, velocity",
+            "acceleration, angular_velocity, bandwidth, clearance, control, control_rate, enforce, "
+            "force, ignored, joint_force, position, tendon_force, tendon_length, tilt, velocity",
         ],
     ),
     "boundary key": (
@@ -1038,7 +1038,10 @@ def test_integers_and_truth_values_are_not_converted(
     [
         (
             SHORT + "[limits]\n" + "".join(f"k{i} = 1.0\n" for i in range(5000)),
-            ["limits.k0: unknown key 'k0'; valid: acceleration, bandwidth", "further faults"],
+            [
+                "limits.k0: unknown key 'k0'; valid: acceleration, angular_velocity",
+                "further faults",
+            ],
         ),
         (SHORT + f"[limits]\n{'x' * 2000} = 1.0\n", ["limits.xxx", "the beginning of 2002 char"]),
         (

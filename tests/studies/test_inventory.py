@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mjfim.errors import ModelError
@@ -23,6 +24,10 @@ ODD = """
     </body>
     <body><joint type="slide"/><geom size="0.1" mass="1"/></body>
   </worldbody>
+  <actuator>
+    <general name="muscle" joint="ball" gear="0 0 1" dyntype="filter" dynprm="0.1"
+             actlimited="true" actrange="0 1"/>
+  </actuator>
 </mujoco>
 """
 
@@ -67,9 +72,19 @@ def test_outputs_actuators_keyframes_and_limits_are_listed() -> None:
 def test_elements_without_a_name_and_ranges_that_are_not_kept_are_said(tmp_path: Path) -> None:
     path = tmp_path / "odd.xml"
     path.write_text(ODD, encoding="utf-8")
-    remarks = " ".join(list_model(path).remarks)
-    for words in ("1 of kind body have no name", "1 of kind joint have no name", "ball joint ball"):
+    inventory = list_model(path)
+    remarks = " ".join(inventory.remarks)
+    for words in (
+        "1 of kind body have no name",
+        "1 of kind joint have no name",
+        "the activation of muscle",
+    ):
         assert words in remarks
+
+    # The range of a ball joint is its largest angle.
+    turned = next(limit for limit in inventory.limits if limit.name == "ball")
+    assert (turned.quantity, turned.lower, turned.unit) == ("position", 0.0, "rad")
+    assert turned.upper == pytest.approx(np.deg2rad(1.0))
 
 
 def test_selections_keep_what_is_wanted() -> None:

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
-from tests.support.numerics import Array, cart_task, make_task
+from tests.support.numerics import Array, cart_task, directional_check, make_task
 
 # An arm of two servos on a floating hull: the addresses of positions, velocities, joints and
 # actuators all differ. One servo has an activation state, the other a limited force; one joint
@@ -50,7 +52,7 @@ FLOATING = """
 FLOATING_LIMITS = {
     "position": {"elbow": (-2.0, 2.0), "shoulder": (-1.5, 2.5)},
     "velocity": {"shoulder": 9.0},
-    "acceleration": 300.0,
+    "acceleration": {"shoulder": 300.0, "elbow": 300.0},
     "force": {"shoulder": 8.0, "thrust": 50.0},
 }
 
@@ -118,6 +120,20 @@ def directions_of(task: DesignTask, count: int, seed: int = 0) -> Array:
     ]
     rough = rng.normal(size=(count - count // 2, *task.control.shape))
     return np.array([*smooth, *rough])
+
+
+def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
+    """Largest relative error of the slope of the barrier, against differences of simulations."""
+    problem = InteriorProblem(
+        base=task.problem, constraints=constraint_set_of(task), mu=1.0, delta=delta, with_cost=False
+    )
+    expansion = problem.expand(problem.point(task.control))
+    open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
+    gradient = expansion.gradient(open_loop)
+    sizes = np.abs(task.control - task.centre).max(axis=0)
+    ways = directions_of(task, 6) * sizes
+    curves = [lambda s, way=way: problem.point(task.control + s * way).barrier for way in ways]
+    return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
 
 
 # Limits that the cart-pendulum meets quickly.

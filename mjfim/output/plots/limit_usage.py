@@ -24,10 +24,14 @@ from mjfim.records.design import Design, LimitUsage
 # Kinds of limits in the order of their panels.
 LIMIT_KINDS = (
     "position",
+    "tilt",
     "velocity",
+    "angular_velocity",
     "acceleration",
     "force",
     "joint_force",
+    "tendon_force",
+    "tendon_length",
     "control",
     "control_rate",
     "clearance",

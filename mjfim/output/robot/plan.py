@@ -117,7 +117,7 @@ def drives_of(system: System) -> tuple[Drive, ...]:
     """
     model = system.model
     period = system.dt
-    limits = limits_of(model, system.coordinates, system.controls, system.experiment.limits, period)
+    limits = limits_of(model, system.controls, system.experiment.limits, period)
     ranges = {each.name: (each.lower, each.upper) for each in limits if each.kind == "control"}
     joints = {joint.joint: joint for joint in system.coordinates}
 

@@ -1,0 +1,327 @@
+"""Which joints, actuators and tendons of a model can have which limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.model.coordinates import ROTATION_VECTOR, TRANSLATION, actuator_names, joint_names
+from mjfim.model.elements import unique_names
+from mjfim.model.orientation import quaternion_address
+from mjfim.model.sizes import (
+    LEAST_MOVE_PER_SAMPLE,
+    actuator_force_sizes,
+    control_sizes,
+    force_sizes,
+    model_length,
+    position_sizes,
+)
+from mjfim.model.units import (
+    ANGLE,
+    FORCE_UNITS,
+    LENGTH,
+    control_unit,
+    force_unit,
+    joint_unit,
+    per_second,
+)
+
+Range = tuple[float, float]
+
+# Kinds of limits, in the order in which they are listed.
+KINDS = (
+    "position",
+    "tilt",
+    "velocity",
+    "angular_velocity",
+    "acceleration",
+    "control",
+    "control_rate",
+    "force",
+    "joint_force",
+    "tendon_force",
+    "tendon_length",
+)
+
+# What each kind limits: the element that has a name, and its elements in words.
+OWNERS: dict[str, tuple[Literal["joint", "actuator", "tendon"], str]] = {
+    "position": ("joint", "slides, hinges, ball joints and free joints"),
+    "tilt": ("joint", "ball joints and free joints"),
+    "velocity": ("joint", "slides, hinges, ball joints and free joints"),
+    "angular_velocity": ("joint", "ball joints and free joints"),
+    "acceleration": ("joint", "slides, hinges, ball joints and free joints"),
+    "control": ("actuator", "controls"),
+    "control_rate": ("actuator", "controls"),
+    "force": ("actuator", "actuators"),
+    "joint_force": ("joint", "slides and hinges"),
+    "tendon_force": ("tendon", "tendons with an actuator"),
+    "tendon_length": ("tendon", "tendons"),
+}
+
+# Joints in words.
+JOINT_WORDS = {
+    int(mujoco.mjtJoint.mjJNT_SLIDE): "a slide",
+    int(mujoco.mjtJoint.mjJNT_HINGE): "a hinge",
+    int(mujoco.mjtJoint.mjJNT_BALL): "a ball joint",
+    int(mujoco.mjtJoint.mjJNT_FREE): "a free joint",
+}
+
+BALL = int(mujoco.mjtJoint.mjJNT_BALL)
+FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+
+# Number of numbers that describe the tilt: both components of a rotation that tilt the body.
+TILT_COMPONENTS = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitedElement:
+    """One element that can have a limit of some kind.
+
+    Attributes:
+        index: Address of the limited number, or of the first of them: in qpos, qvel, ctrl,
+            actuator_force or qfrc_actuator. For a tilt it is the quaternion in qpos, for a tendon
+            its number.
+        count: Number of numbers; with several of them, their norm is limited, which is a speed, a
+            force or the sine of half an angle.
+        unit: Unit of the quantity; empty where the model does not determine it.
+        size: Natural size of the quantity [unit of the kind].
+        stated: Range of the MJCF, or None.
+        is_part: True for one coordinate of a ball or free joint and for one force of an actuator.
+            A number without a table does not hold for it.
+    """
+
+    index: int
+    count: int = 1
+    unit: str = ""
+    size: float = 1.0
+    stated: Range | None = None
+    is_part: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitedElements:
+    """All elements of a model that can have limits.
+
+    Attributes:
+        by_kind: Elements by kind and name; the kinds have the order of `KINDS`.
+        joints: What each joint is, in words by name.
+    """
+
+    by_kind: dict[str, dict[str, LimitedElement]] = field(
+        default_factory=lambda: {kind: {} for kind in KINDS}
+    )
+    joints: Mapping[str, str]
+
+    def kinds_of(self, name: str) -> tuple[str, ...]:
+        """Kinds of limits that a joint can have, by its name."""
+        return tuple(
+            kind
+            for kind, elements in self.by_kind.items()
+            if OWNERS[kind][0] == "joint" and (name in elements or f"{name}.x" in elements)
+        )
+
+
+def limited_elements(model: Any, controls: tuple[str, ...], period: float) -> LimitedElements:
+    """Look up all elements of a model that can have limits.
+
+    Args:
+        model: MjModel.
+        controls: Names of its nu controls.
+        period: Sample period, from which the natural sizes of rates follow [s].
+    """
+    words = [JOINT_WORDS[kind] for kind in model.jnt_type.tolist()]
+    names = joint_names(model)
+    found = LimitedElements(joints=dict(zip(names, words, strict=True)))
+    time = period / LEAST_MOVE_PER_SAMPLE
+
+    sizes = position_sizes(model)
+    forces = force_sizes(model, time)
+    for joint, name in enumerate(names):
+        _add_joint(found, model, joint, name, sizes, time)
+        if int(model.jnt_type[joint]) not in (BALL, FREE):
+            dof = int(model.jnt_dofadr[joint])
+            found.by_kind["joint_force"][name] = LimitedElement(
+                index=dof,
+                unit=FORCE_UNITS[joint_unit(model, joint)],
+                size=float(forces[dof]),
+                stated=_range(model.jnt_actfrclimited, model.jnt_actfrcrange, joint),
+            )
+
+    _add_controls(found, model, controls, time)
+    _add_actuators(found, model, time)
+    _add_tendons(found, model, time)
+    return found
+
+
+def actuators_of_tendon(model: Any, tendon: int) -> tuple[int, ...]:
+    """Addresses in actuator_force of the actuators that pull at a tendon.
+
+    Args:
+        model: MjModel.
+        tendon: Number of the tendon.
+    """
+    pulls = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    pulling = np.flatnonzero(pulls & (model.actuator_trnid[:, 0] == tendon))
+    return tuple(int(model.actuator_outadr[i]) for i in pulling)
+
+
+def _add_joint(
+    found: LimitedElements, model: Any, joint: int, name: str, sizes: Array, time: float
+) -> None:
+    """Enter the motion of one joint.
+
+    Args:
+        found: The elements, changed in place.
+        model: MjModel.
+        joint: Number of the joint.
+        name: Its name.
+        sizes: (nv,) natural sizes of the degrees of freedom [m or rad].
+        time: Natural time of a motion [s].
+    """
+    kinds = found.by_kind
+    kind = int(model.jnt_type[joint])
+    q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    stated = _range(model.jnt_limited, model.jnt_range, joint)
+    size = float(sizes[v])
+    count = 3 if kind in (BALL, FREE) else 1
+
+    unit = joint_unit(model, joint)
+    rates = {
+        "velocity": (per_second(unit), size / time),
+        "acceleration": (f"{per_second(unit)}²", size / time**2),
+    }
+
+    # The velocity of a free joint is that of its translation.
+    for rate, (per_time, typical) in rates.items():
+        kinds[rate][name] = LimitedElement(index=v, count=count, unit=per_time, size=typical)
+
+    if kind == FREE:
+        for i, part in enumerate(TRANSLATION):
+            each = f"{name}.{part}"
+            place = LimitedElement(index=q + i, unit=unit, size=size, is_part=True)
+            kinds["position"][each] = place
+            for rate, (per_time, typical) in rates.items():
+                moving = LimitedElement(index=v + i, unit=per_time, size=typical, is_part=True)
+                kinds[rate][each] = moving
+    else:
+        # The range of a ball joint in the MJCF is its largest angle of rotation.
+        kinds["position"][name] = LimitedElement(
+            index=q, count=count, unit=unit, size=size, stated=_below_half_turn(stated, kind)
+        )
+
+    if kind in (BALL, FREE):
+        turning = v + 3 if kind == FREE else v
+        speed = LimitedElement(index=turning, count=3, unit=per_second(ANGLE), size=1.0 / time)
+        kinds["angular_velocity"][name] = speed
+        for i, part in enumerate(ROTATION_VECTOR):
+            about = replace(speed, index=turning + i, count=1, is_part=True)
+            kinds["angular_velocity"][f"{name}.{part}"] = about
+        address = quaternion_address(model, joint)
+        kinds["tilt"][name] = LimitedElement(index=address, count=TILT_COMPONENTS, unit=ANGLE)
+
+
+def _add_controls(
+    found: LimitedElements, model: Any, controls: tuple[str, ...], time: float
+) -> None:
+    """Enter the controls and their rates."""
+    sizes = control_sizes(model, time)
+    actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum).tolist()
+    for i, name in enumerate(controls):
+        stated = _range(model.actuator_ctrllimited, model.actuator_ctrlrange, i)
+        size, unit = float(sizes[i]), control_unit(model, actuators[i])
+        per_time = per_second(unit) if unit else ""
+        found.by_kind["control"][name] = LimitedElement(
+            index=i, unit=unit, size=size, stated=stated
+        )
+        found.by_kind["control_rate"][name] = LimitedElement(
+            index=i, unit=per_time, size=size / time
+        )
+
+
+def _add_actuators(found: LimitedElements, model: Any, time: float) -> None:
+    """Enter the forces of the actuators.
+
+    The range of an actuator with several forces limits their norm.
+    """
+    sizes = actuator_force_sizes(model, time)
+    forces = found.by_kind["force"]
+    for i, name in enumerate(actuator_names(model)):
+        first, count = int(model.actuator_outadr[i]), int(model.actuator_outnum[i])
+        forces[name] = LimitedElement(
+            index=first,
+            count=count,
+            unit=_force_unit(model, i),
+            size=float(sizes[first]),
+            stated=_range(model.actuator_forcelimited, model.actuator_forcerange, i),
+        )
+        if count > 1:
+            for part in range(count):
+                address = first + part
+                each = LimitedElement(index=address, size=float(sizes[address]), is_part=True)
+                forces[f"{name}[{part}]"] = each
+
+
+def _add_tendons(found: LimitedElements, model: Any, time: float) -> None:
+    """Enter the lengths of the tendons, and the sums of the forces of their actuators."""
+    sizes = actuator_force_sizes(model, time)
+    for i, name in enumerate(unique_names(model, "tendon")):
+        found.by_kind["tendon_length"][name] = LimitedElement(
+            index=i,
+            unit=LENGTH if _is_spatial(model, i) else "",
+            size=_tendon_size(model, i),
+            stated=_range(model.tendon_limited, model.tendon_range, i),
+        )
+        pulling = actuators_of_tendon(model, i)
+        if pulling:
+            found.by_kind["tendon_force"][name] = LimitedElement(
+                index=i,
+                unit=FORCE_UNITS[LENGTH] if _is_spatial(model, i) else "",
+                size=float(sizes[list(pulling)].max()),
+                stated=_range(model.tendon_actfrclimited, model.tendon_actfrcrange, i),
+            )
+
+
+def _force_unit(model: Any, actuator: int) -> str:
+    """Unit of the force of an actuator; empty for one with several forces or on a free joint."""
+    joint = int(model.actuator_trnid[actuator, 0])
+    acts_on_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    if not acts_on_joint or int(model.jnt_type[joint]) in (BALL, FREE):
+        return ""
+    return force_unit(model, actuator)
+
+
+def _is_spatial(model: Any, tendon: int) -> bool:
+    """Whether a tendon is a path in space, and not a sum of joint coordinates."""
+    first = int(model.tendon_adr[tendon])
+    return int(model.wrap_type[first]) != int(mujoco.mjtWrap.mjWRAP_JOINT)
+
+
+def _tendon_size(model: Any, tendon: int) -> float:
+    """Natural size of the length of a tendon, where only one bound is stated."""
+    return float(abs(model.tendon_length0[tendon])) or model_length(model)
+
+
+def _below_half_turn(stated: Range | None, kind: int) -> Range | None:
+    """The range of a joint; None for a ball joint that may turn by half a turn or more."""
+    if kind == BALL and stated is not None and stated[1] >= np.pi:
+        return None
+    return stated
+
+
+def _range(limited: Any, ranges: Any, index: int) -> Range | None:
+    """Range of an element in the MJCF, or None.
+
+    Args:
+        limited: (n,) nonzero where the model limits an element.
+        ranges: (n, 2) ranges of all elements.
+        index: Number of the element.
+    """
+    if not limited[index]:
+        return None
+    lower, upper = ranges[index].tolist()
+    return lower, upper

@@ -1,0 +1,459 @@
+"""Limits on free bodies, ball joints, tendons and actuators with several forces."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjfim.errors import ExperimentError
+from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.evaluation import open_boundary_warnings
+from mjfim.excitation.limits import limits_of
+from mjfim.excitation.magnitudes import Magnitude, VectorBarrier
+from mjfim.excitation.task import DesignTask
+from mjfim.excitation.verification import require_feasible_start, verify
+from mjfim.excitation.violations import violations_of
+from mjfim.experiment.task_tables import Limits
+from mjfim.model.coordinates import control_names
+from tests.support.limits import barrier_check
+from tests.support.numerics import Array, make_task
+
+# A hull that floats, with a mast on a ball joint and an arm on a hinge. The mast is turned by an
+# actuator with three forces, the arm by two actuators on a tendon and by one on its joint.
+SHIP = """
+<mujoco model="ship">
+  <compiler angle="degree"/>
+  <option timestep="0.002" integrator="{integrator}" gravity="0.3 0 -1">
+    <flag contact="disable"/>
+  </option>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="hull" pos="0 0 1" euler="20 -30 40">
+      <freejoint name="float"/>
+      <geom type="box" size="0.2 0.1 0.1" mass="3"/>
+      <body name="mast" pos="0 0 0.2" euler="0 60 0">
+        <joint name="wrist" type="ball" damping="0.05"{wrist}/>
+        <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.03" mass="0.5"/>
+        <body name="fore" pos="0 0 0.3">
+          <joint name="elbow" axis="0 1 0" damping="0.1" armature="0.005"/>
+          <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.3"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="rope"{rope}><joint joint="elbow" coef="0.5"/></fixed>
+  </tendon>
+  <actuator>
+    <motor name="thrust" joint="float" gear="1 0.3 1 0.2 0.1 0.3"/>
+    <orientation name="aim" joint="wrist" kp="3"{aim}/>
+    <motor name="pull" tendon="rope" gear="2"/>
+    <general name="ease" tendon="rope" gainprm="2" biastype="affine" biasprm="0 -2 -0.1"/>
+    <motor name="push" joint="elbow"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def ship(integrator: str = "implicitfast", **attributes: str) -> str:
+    """The model with further attributes of its elements."""
+    words = {"wrist": "", "rope": "", "aim": ""}
+    words |= {name: f" {text}" for name, text in attributes.items()}
+    return SHIP.format(integrator=integrator, **words)
+
+
+def ship_task(folder: Path, text: str | None = None, **tables: Any) -> DesignTask:
+    """The ship for 0.2 s, with five engine steps in each sample; everything moves."""
+    turned = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
+    control = {
+        "kind": "sine",
+        "frequency": 3.0,
+        "amplitude": {
+            "thrust": 3.0,
+            "aim[0]": 0.6,
+            "aim[1]": 0.5,
+            "aim[2]": 0.4,
+            "pull": 0.3,
+            "ease": 0.2,
+            "push": 0.1,
+        },
+        "offset": {"thrust": 2.0, "aim[0]": 0.2, "pull": 0.2},
+    }
+    defaults: dict[str, Any] = {
+        "horizon": 0.2,
+        "parameters": {"m": {"target": "body/fore:mass"}},
+        "noise": {"qpos:elbow": 0.01},
+        "initial": {
+            "qpos": (0.0, 0.0, 1.0, *turned, *turned[[0, 2, 1, 3]], -0.3),
+            "qvel": (0.3, -0.1, 0.2, 0.5, -0.4, 0.3, 0.4, -0.8, 0.2, 1.0),
+            "control": control,
+        },
+    }
+    return make_task(text or ship(), folder, **{**defaults, **tables})
+
+
+# Limits that the motion of the ship partly violates.
+KINDS: dict[str, dict[str, Any]] = {
+    "place": {"position": {"float": ((-0.1, 0.02), (-0.1, 0.1), (0.9, 1.02))}},
+    "height": {"position": {"float.z": (0.9, 1.03)}},
+    "turn": {"position": {"wrist": (0.0, 0.8)}},
+    "tilt": {"tilt": {"float": 0.4, "wrist": 1.0}},
+    "velocity": {"velocity": {"float": 0.5, "wrist": 1.2, "elbow": 2.0}},
+    "velocity of a coordinate": {"velocity": {"float.y": (-0.2, 0.1)}},
+    "angular velocity": {"angular_velocity": {"float": 1.0, "wrist.rz": 0.3}},
+    "acceleration": {"acceleration": {"float": 2.0, "wrist": 30.0, "float.x": 3.0}},
+    "force": {"force": {"aim": 2.2, "aim[1]": 1.0, "ease": 0.5}},
+    "force on a joint": {"joint_force": {"elbow": 0.5}},
+    "force on a tendon": {"tendon_force": {"rope": (-0.1, 0.4)}},
+    "length of a tendon": {"tendon_length": {"rope": (-0.2, -0.1)}},
+}
+EVERY = {
+    "position": {**KINDS["place"]["position"], **KINDS["turn"]["position"]},
+    **{
+        key: value
+        for name, table in KINDS.items()
+        if name not in ("place", "height", "turn", "velocity of a coordinate")
+        for key, value in table.items()
+    },
+}
+
+
+def limits(text: str = "", **tables: Any) -> dict[tuple[str, str], tuple[float, float]]:
+    """Ranges of all limits of the ship by kind and name."""
+    model = mujoco.MjModel.from_xml_string(text or ship())
+    found = limits_of(model, control_names(model), Limits(**tables), 0.01)
+    return {(limit.kind, limit.name): (limit.lower, limit.upper) for limit in found}
+
+
+def test_one_number_holds_for_every_joint() -> None:
+    """It is the largest speed of a free body and the largest angular speed of a ball joint."""
+    assert limits(velocity=1.5, acceleration=9.0, angular_velocity=2.0, tilt=0.3) == {
+        ("velocity", "float"): (0.0, 1.5),
+        ("velocity", "wrist"): (0.0, 1.5),
+        ("velocity", "elbow"): (-1.5, 1.5),
+        ("acceleration", "float"): (0.0, 9.0),
+        ("acceleration", "wrist"): (0.0, 9.0),
+        ("acceleration", "elbow"): (-9.0, 9.0),
+        ("angular_velocity", "float"): (0.0, 2.0),
+        ("angular_velocity", "wrist"): (0.0, 2.0),
+        ("tilt", "float"): (0.0, 0.3),
+        ("tilt", "wrist"): (0.0, 0.3),
+    }
+
+
+def test_a_box_is_three_ranges_and_a_coordinate_narrows_it() -> None:
+    box = ((-1.0, 1.0), (-2.0, 2.0), (0.5, 3.0))
+    wanted = {
+        ("position", "float.x"): (-1.0, 1.0),
+        ("position", "float.y"): (-2.0, 2.0),
+        ("position", "float.z"): (0.5, 2.0),
+    }
+    narrower = {"float.z": (0.0, 2.0)}
+    assert limits(position={"float": box, **narrower}) == wanted
+    assert limits(position={**narrower, "float": box}) == wanted
+    assert limits(velocity={"float.z": (-0.5, 1.0)}) == {("velocity", "float.z"): (-0.5, 1.0)}
+    assert limits(angular_velocity={"float.rz": 1.0}) == {("angular_velocity", "float.rz"): (-1, 1)}
+
+
+def test_ranges_of_ball_joints_tendons_and_several_forces_in_the_mjcf_are_limits() -> None:
+    text = ship(
+        wrist='range="0 50"',
+        rope='range="-1 2" actuatorfrcrange="-3 4"',
+        aim='forcerange="0 5"',
+    )
+    assert limits(text) == {
+        ("position", "wrist"): (0.0, pytest.approx(np.deg2rad(50.0))),
+        ("force", "aim"): (0.0, 5.0),
+        ("tendon_force", "rope"): (-3.0, 4.0),
+        ("tendon_length", "rope"): (-1.0, 2.0),
+    }
+    narrower = limits(text, tendon_force=2.0, force={"aim": 1.0})
+    assert narrower["tendon_force", "rope"] == (-2.0, 2.0)
+    assert narrower["force", "aim"] == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        (
+            {"position": {"float": (-1.0, 1.0)}},
+            "limits.position: 'float' is a free joint: it needs three ranges, [[lower, upper], "
+            "[lower, upper], [lower, upper]] of x, y and z; or limit single coordinates: float.x, "
+            "float.y, float.z",
+        ),
+        (
+            {"position": {"elbow": ((-1.0, 1.0),) * 3}},
+            "limits.position.elbow: three ranges are for free joints; it needs one range",
+        ),
+        (
+            {"tilt": {"elbow": 0.3}},
+            "limits.tilt: 'elbow' is a hinge, which can have position, velocity, acceleration, "
+            "joint_force; this key limits ball joints and free joints only; valid: float, wrist",
+        ),
+        (
+            {"joint_force": {"float": 1.0}},
+            "limits.joint_force: 'float' is a free joint, which can have position, tilt, velocity, "
+            "angular_velocity, acceleration; this key limits slides and hinges only; valid: elbow",
+        ),
+        (
+            {"velocity": {"float": (-1.0, 1.0)}},
+            "limits.velocity.float: [-1, 1] should be one number: this quantity is a magnitude",
+        ),
+        ({"tilt": {"float": 45.0}}, "limits.tilt.float: 45 rad limits nothing: this angle is in"),
+        ({"tendon_force": {"elbow": 1.0}}, "limits.tendon_force: unknown tendon 'elbow'; valid: r"),
+    ],
+)
+def test_a_limit_that_an_element_cannot_have_is_refused(
+    tables: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ExperimentError, match=re.escape(message)):
+        limits(**tables)
+
+
+def test_a_limit_of_free_bodies_alone_is_refused_without_one() -> None:
+    text = """<mujoco><worldbody><body><joint name="turn"/><geom size="0.1"/></body></worldbody>
+    </mujoco>"""
+    said = "limits.tilt applies to nothing in this model: 'turn' is a hinge. It limits ball joints"
+    with pytest.raises(ExperimentError, match=re.escape(said)):
+        limits(text, tilt=0.5)
+
+
+def test_units_are_those_of_the_quantities() -> None:
+    model = mujoco.MjModel.from_xml_string(ship())
+    found = limits_of(
+        model,
+        control_names(model),
+        Limits(
+            velocity=1.0,
+            tilt=1.0,
+            angular_velocity=1.0,
+            position={"float.x": (0.0, 1.0), "wrist": (0.0, 1.0)},
+            acceleration={"float": 1.0},
+            force={"aim[0]": 1.0, "push": 1.0},
+            tendon_length={"rope": (0.0, 1.0)},
+        ),
+        0.01,
+    )
+    assert {(x.kind, x.name): x.unit for x in found} == {
+        ("position", "float.x"): "m",
+        ("position", "wrist"): "rad",
+        ("tilt", "float"): "rad",
+        ("tilt", "wrist"): "rad",
+        ("velocity", "float"): "m/s",
+        ("velocity", "wrist"): "rad/s",
+        ("velocity", "elbow"): "rad/s",
+        ("angular_velocity", "float"): "rad/s",
+        ("angular_velocity", "wrist"): "rad/s",
+        ("acceleration", "float"): "m/s²",
+        ("force", "aim[0]"): "",
+        ("force", "push"): "N m",
+        ("tendon_length", "rope"): "",
+    }
+
+
+@pytest.mark.parametrize("delta", [0.1, 3e-3])
+@pytest.mark.parametrize("name", KINDS)
+def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
+    name: str, delta: float, tmp_path: Path
+) -> None:
+    task = ship_task(tmp_path, limits=KINDS[name], horizon=0.1).relaxed()
+    assert barrier_check(task, delta) < 2e-3
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_the_slope_of_all_limits_together_holds_with_every_integrator(
+    integrator: str, tmp_path: Path
+) -> None:
+    task = ship_task(tmp_path, ship(integrator), limits=EVERY, horizon=0.1).relaxed()
+    assert barrier_check(task, 0.05) < 2e-3
+
+
+@pytest.mark.parametrize("name", ["tilt", "velocity", "turn"])
+def test_a_wrong_slope_of_a_magnitude_would_be_noticed(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = Magnitude.barrier
+
+    def wrong(*args: Any, **kwargs: Any) -> VectorBarrier:
+        found = right(*args, **kwargs)
+        slope = 1.05 * found.slope
+        return VectorBarrier(value=found.value, slope=slope, curvature=found.curvature)
+
+    monkeypatch.setattr(Magnitude, "barrier", wrong)
+    task = ship_task(tmp_path, limits=KINDS[name], horizon=0.1).relaxed()
+    assert barrier_check(task, 0.1) > 1e-2
+
+
+@pytest.mark.parametrize("is_angle", [False, True])
+def test_derivatives_of_the_barrier_of_a_norm_are_those_of_differences(is_angle: bool) -> None:
+    """Also at the norm zero, near the bound and beyond it."""
+    magnitude, step = Magnitude(columns=(1, 2, 3), is_angle=is_angle), 1e-5
+    way = np.array([2.0, -1.0, 2.0]) / 3.0
+    share = magnitude.norm_at(0.7)
+    for norm in (0.0, 1e-6, 0.3, 0.995, 1.2):
+        here = np.concatenate([[9.0], norm * share * way])
+
+        def at(y: Array) -> VectorBarrier:
+            return magnitude.barrier(y, 0.7, 0.8, delta=0.01, weight=0.5)
+
+        moves = step * share * np.eye(4)[1:]
+        ups, downs = ([at(here + sign * move) for move in moves] for sign in (1.0, -1.0))
+        pairs = list(zip(ups, downs, strict=True))
+        slope = np.array([up.value - down.value for up, down in pairs]) / (2 * step * share)
+        bend = np.array([up.slope - down.slope for up, down in pairs]) / (2 * step * share)
+        found = at(here)
+        size = np.abs(found.curvature).max()
+        np.testing.assert_allclose(found.slope, slope, rtol=1e-5, atol=1e-7 * size)
+        np.testing.assert_allclose(found.curvature, bend, rtol=1e-4, atol=1e-4 * size)
+        assert np.linalg.eigvalsh(found.curvature).min() > 0.0
+
+
+def direction_up(model: Any) -> Array:
+    """Unit vector against gravity."""
+    return -model.opt.gravity / np.linalg.norm(model.opt.gravity)
+
+
+def reference_orientation(model: Any, body: str) -> Array:
+    """(3, 3) orientation of a body in the reference position."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return np.array(data.body(body).xmat.reshape(3, 3))
+
+
+def angle_between(a: Array, b: Array) -> float:
+    """Angle between two unit vectors [rad]."""
+    return float(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b)))
+
+
+def played(model: Any, task: DesignTask) -> dict[tuple[str, str], Array]:
+    """The limited quantities at every engine step in plain MuJoCo, computed another way.
+
+    Angles come from matrices of rotation, forces and lengths from `mj_forward` before each step.
+    """
+    data, start = mujoco.MjData(model), mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], _ = task.space.split(task.initial.state[0])
+    up = direction_up(model)
+    hull, mast = (reference_orientation(model, name) for name in ("hull", "mast"))
+    body_up, mast_up = hull.T @ up, mast.T @ up
+    between = hull.T @ mast
+    rows: dict[tuple[str, str], list[float]] = {}
+
+    def see(kind: str, name: str, value: float) -> None:
+        rows.setdefault((kind, name), []).append(float(value))
+
+    for held in task.control:
+        data.ctrl[:] = held
+        for _ in range(task.system.grid.substeps):
+            start.qpos[:], start.qvel[:], start.ctrl[:] = data.qpos, data.qvel, held
+            mujoco.mj_forward(model, start)
+            see("force", "aim", np.linalg.norm(start.actuator("aim").force))
+            see("joint_force", "elbow", start.joint("elbow").qfrc_actuator[0])
+            pulled = sum(start.actuator(name).force[0] for name in ("pull", "ease"))
+            see("tendon_force", "rope", pulled)
+            see("tendon_length", "rope", start.ten_length[0])
+
+            before = data.qvel.copy()
+            mujoco.mj_step(model, data)
+            mujoco.mj_kinematics(model, data)
+            change = (data.qvel - before) / model.opt.timestep
+            for part, value in zip("xyz", data.qpos[:3], strict=True):
+                see("position", f"float.{part}", value)
+            see("velocity", "float", np.linalg.norm(data.qvel[:3]))
+            see("velocity", "wrist", np.linalg.norm(data.qvel[6:9]))
+            see("angular_velocity", "float", np.linalg.norm(data.qvel[3:6]))
+            see("acceleration", "float", np.linalg.norm(change[:3]))
+            see("acceleration", "wrist", np.linalg.norm(change[6:9]))
+
+            turned = data.body("hull").xmat.reshape(3, 3)
+            within = between.T @ turned.T @ data.body("mast").xmat.reshape(3, 3)
+            see("tilt", "float", angle_between(turned @ body_up, up))
+            see("tilt", "wrist", angle_between(within @ mast_up, mast_up))
+            see("position", "wrist", np.arccos(0.5 * (np.trace(within) - 1.0)))
+    return {key: np.array(values) for key, values in rows.items()}
+
+
+def test_every_engine_step_of_the_unmodified_model_is_checked(tmp_path: Path) -> None:
+    """Usage and violations are those of plain MuJoCo, whose quantities are computed another way."""
+    task = ship_task(tmp_path, limits=EVERY)
+    model = mujoco.MjModel.from_xml_string(ship())
+    plain = played(model, task)
+    found = verify(task, task.initial)
+    stated = {(limit.kind, limit.name): limit for limit in task.limits}
+    shown = {(usage.kind, usage.name): usage for usage in found.usage}
+
+    for key, values in plain.items():
+        limit = stated[key]
+        if "force" in key[0] or key[0] == "tendon_length":
+            # These belong to the beginning of a step; the last step shows its end as well.
+            continue
+        middle = 0.0 if limit.is_magnitude else 0.5 * (limit.lower + limit.upper)
+        share = (values - middle) / (limit.upper - middle)
+        np.testing.assert_allclose(shown[key].share, share, rtol=1e-6, atol=1e-7)
+
+    for kind in {kind for kind, _ in plain}:
+        margins = [
+            np.minimum(values - limit.lower, limit.upper - values).min()
+            if not limit.is_magnitude
+            else limit.upper - values.max()
+            for (other, name), values in plain.items()
+            if other == kind
+            for limit in [stated[other, name]]
+        ]
+        # The end of the last sample and single components may be worse.
+        assert found.margins[kind] <= min(margins) + 1e-9
+
+    said = {(v.kind, v.name): v for v in violations_of(task, found)}
+    tilt = plain["tilt", "float"]
+    assert said["tilt", "float"].value == pytest.approx(tilt.max(), rel=1e-6)
+    assert str(said["tilt", "float"]).startswith(f"tilt of float is {tilt.max():.4g} rad at ")
+    assert ", above 0.4 (first at " in str(said["tilt", "float"])
+
+
+def test_a_clamped_sum_of_forces_is_lifted_in_the_search_and_kept_as_a_limit(
+    tmp_path: Path,
+) -> None:
+    """The ranges of the MJCF do not clamp the private copy, whose derivatives they would hide."""
+    text = ship(
+        wrist='range="0 50"',
+        rope='range="-1 2" actuatorfrcrange="-0.1 0.1"',
+        aim='forcerange="0 0.2"',
+    )
+    task = ship_task(tmp_path, text)
+    relaxed = task.relaxed().plant.model(task.theta)
+    assert not relaxed.tendon_actfrclimited.any()
+    assert not relaxed.tendon_limited.any()
+    assert not relaxed.jnt_limited.any()
+    assert not relaxed.actuator_forcelimited.any()
+
+    free = task.relaxed()
+    constraints = constraint_set_of(free)
+    watched = free.plant.observe(free.theta, free.control, constraints.observations)
+    assert watched is not None
+    margins = constraints.margins(constraints.evaluate(*watched, slopes=False))
+    assert margins["tendon_force"] < 0.0
+    assert margins["force"] < 0.0
+    assert verify(task, task.initial).margins["tendon_force"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_start_outside_is_refused_with_its_unit(tmp_path: Path) -> None:
+    for tables, message in (
+        ({"tilt": {"float": 0.1}}, r"limits\.tilt\.float: the initial state is at 0\.\d+ rad"),
+        ({"velocity": {"float": 0.1}}, r"limits\.velocity\.float: the initial state is at 0\.37\d"),
+        (
+            {"position": {"float.z": (1.5, 2.0)}},
+            r"limits\.position\.float\.z: the initial state is at 1 m, outside \[1\.5, 2\]",
+        ),
+        ({"tendon_length": {"rope": (0.0, 1.0)}}, r"limits\.tendon_length\.rope: .* at -0\.15"),
+    ):
+        with pytest.raises(ExperimentError, match=message):
+            require_feasible_start(ship_task(tmp_path, limits=tables))
+
+
+def test_nothing_is_said_about_joints_that_all_have_the_limit(tmp_path: Path) -> None:
+    task = ship_task(tmp_path, limits={"velocity": 9.0, "force": 50.0, "acceleration": 99.0})
+    assert [w for w in open_boundary_warnings(task) if "limits." in w] == []
