@@ -238,7 +238,8 @@ def test_a_design_says_what_the_initial_control_violates_and_when(tmp_path: Path
     # The summary and the JSON name joint, value and time.
     parts = describe_design(design, task.system.units).parts
     text = " ".join(part.text for part in parts if isinstance(part, Paragraph))
-    assert f"position of slide is {slide.value:.4g} at {slide.t:.4g} s" in text
+    said = f"position of slide is {slide.value:.4g} m at {slide.t:.4g} s, above 0.5"
+    assert said in text
     kinds = [entry["kind"] for entry in design.summary()["limits"]["initial"]]
     assert set(kinds) == {kind for kind, _ in found}
     design.save(tmp_path)
