@@ -9,11 +9,13 @@ import typer
 
 from mjfim.atomic_io import replacing
 from mjfim.cli.common import Force, ModelFile, claim_file, errors, out, progress, verb
-from mjfim.errors import ExperimentError, unknown
+from mjfim.cli.questions import ask as ask_for
+from mjfim.errors import ExperimentError
 from mjfim.studies.first_experiment.candidates import GROUPS, Group
 from mjfim.studies.first_experiment.document import experiment_text
-from mjfim.studies.first_experiment.propose import propose_experiment
+from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
 from mjfim.studies.first_experiment.urdf import is_urdf
+from mjfim.studies.first_experiment.wishes import Wishes, groups_of
 
 
 @verb
@@ -40,21 +42,31 @@ def init(
         str | None,
         typer.Option(metavar="BODY", help="Body that carries a load of unknown mass and place."),
     ] = None,
+    ask: Annotated[
+        bool,
+        typer.Option(
+            "--ask",
+            help="Ask for the start, the parameters, rate, duration and noise. Enter takes what is "
+            "proposed; answers may come from a file or a pipe, one a line.",
+        ),
+    ] = False,
     force: Force = False,
 ) -> None:
     """Write a first experiment file for a model, with a comment for every choice."""
     file = output or Path(f"{model.stem}.toml")
     companion = file.with_name(f"{file.stem}_motors.xml")
-    groups = _groups(parameters)
+    wishes = Wishes(groups=_groups(parameters), payload=payload)
     claim_file(file, [model], force=force)
     if is_urdf(model):
         claim_file(companion, [model], force=force)
 
-    with progress("looking at the model"):
-        proposal = propose_experiment(
-            model, file.parent, groups=groups, payload=payload, companion_name=companion.name
-        )
-        text = experiment_text(proposal)
+    def propose(wanted: Wishes) -> Proposal:
+        """The experiment that fulfils some wishes."""
+        with progress("looking at the model"):
+            return propose_experiment(model, file.parent, wanted, companion_name=companion.name)
+
+    proposal = propose(ask_for(propose, wishes) if ask else wishes)
+    text = experiment_text(proposal)
 
     if proposal.companion is not None:
         with replacing(companion) as temporary:
@@ -70,11 +82,8 @@ def init(
 
 
 def _groups(text: str) -> list[Group]:
-    """Groups of parameters from a list with commas."""
-    found: list[Group] = []
-    for name in (part.strip() for part in text.split(",")):
-        group = next((each for each in GROUPS if each == name), None)
-        if group is None:
-            raise ExperimentError(f"--parameters: {unknown('group', name, GROUPS)}")
-        found.append(group)
-    return found
+    """Groups of parameters of the option `--parameters`."""
+    try:
+        return groups_of(text)
+    except ExperimentError as error:
+        raise ExperimentError(f"--parameters: {error}") from None

@@ -231,9 +231,13 @@ class _Encoder:
         return _encode_scalar(hint, value, path)
 
     def _keep(self, value: np.ndarray, path: str) -> str:
-        """Collect an array and return its name; an array that occurs twice is collected once."""
+        """Collect an array and return its name.
+
+        An array that occurs twice is collected once, unless it has a documented name, which other
+        programs read.
+        """
         array = np.asarray(value)
-        if id(array) in self._name_of:
+        if id(array) in self._name_of and path not in self._known_names:
             return self._name_of[id(array)][0]
 
         name = self._known_names.get(path, path)

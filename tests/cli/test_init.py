@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner, Result
 
+from mjfim.cli import main as cli
 from tests.support.cli import MODELS, loads, names, run
 
 
@@ -46,6 +49,43 @@ def test_init_writes_nothing_for_a_wrong_group(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert "unknown group 'frictions'" in result.stderr
     assert "friction" in result.stderr
+    assert names(tmp_path) == set()
+
+
+def asked(file: Path, *answers: str) -> Result:
+    """`mjfim init --ask` for a slide with a pendulum, with these answers."""
+    words = ["init", str(MODELS / "cart_pendulum.xml"), "-o", str(file), "--ask"]
+    return CliRunner().invoke(cli.app, words, input="".join(f"{each}\n" for each in answers))
+
+
+def test_enter_takes_what_init_proposes_without_questions(tmp_path: Path) -> None:
+    assert asked(tmp_path / "asked.toml", *[""] * 5).exit_code == 0
+    assert run("init", MODELS / "cart_pendulum.xml", "-o", tmp_path / "silent.toml").exit_code == 0
+    texts = [(tmp_path / name).read_text("utf-8") for name in ("asked.toml", "silent.toml")]
+    assert texts[0] == texts[1]
+
+
+def test_wrong_answers_are_asked_again(tmp_path: Path) -> None:
+    answers = ["up", "hanging", "frictions", "friction", "hand", "none", "333", "100", "-1", "3.0"]
+    result = asked(tmp_path / "asked.toml", *answers)
+    assert result.exit_code == 0, result.stderr
+    for fault in (
+        "unknown keyframe at rest 'up'",
+        "unknown group 'frictions'",
+        "unknown body 'hand'",
+        "rates nearby: 50, 100",
+        "'-1' is no positive number",
+    ):
+        assert fault in result.stderr
+    values = tomllib.loads((tmp_path / "asked.toml").read_text("utf-8"))
+    assert (values["rate"], values["horizon"]) == (100.0, 3.0)
+    assert all("damping" in name for name in values["parameters"])
+
+
+def test_answers_that_end_too_early_are_a_misuse(tmp_path: Path) -> None:
+    result = asked(tmp_path / "asked.toml", "", "")
+    assert result.exit_code == 2
+    assert "the input ended before the last question" in result.stderr
     assert names(tmp_path) == set()
 
 

@@ -19,6 +19,7 @@ from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
 from mjfim.studies.first_experiment.selection import identifiable
 from mjfim.studies.first_experiment.start import _candidates, choose_start
 from mjfim.studies.first_experiment.time_scale import RATE_RANGE, _rate, reach, time_scale
+from mjfim.studies.first_experiment.wishes import Wishes
 from tests.support.cli import MODELS
 
 URDF = """
@@ -81,7 +82,7 @@ def pendulum(folder: Path, *, length: float, mass: float) -> Path:
 
 def proposed(path: Path, folder: Path, **options: object) -> tuple[Proposal, Experiment]:
     """The proposal for a model, and the experiment that its file states."""
-    proposal = propose_experiment(path, folder, companion_name="motors.xml", **options)
+    proposal = propose_experiment(path, folder, Wishes(**options), companion_name="motors.xml")
     if proposal.companion is not None:
         (folder / "motors.xml").write_text(proposal.companion, encoding="utf-8")
     file = folder / "first.toml"
@@ -162,9 +163,9 @@ def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Pat
 
 def test_faults_are_named(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match="--payload: unknown body 'hand'"):
-        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, payload="hand")
+        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(payload="hand"))
     with pytest.raises(ExperimentError, match="no parameter of motors can be proposed"):
-        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, groups=("motors",))
+        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(groups=("motors",)))
 
     bare = tmp_path / "bare.xml"
     text = pendulum(tmp_path, length=1.0, mass=1.0).read_text(encoding="utf-8")
@@ -371,3 +372,38 @@ def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path:
     proposal, _ = proposed(path, tmp_path)
     assert any("amplifies small disturbances" in remark for remark in proposal.remarks)
     assert 0.4 * proposal.times.period < proposal.times.horizon < 2.9 * proposal.times.period
+
+
+def test_wishes_are_fulfilled(tmp_path: Path) -> None:
+    wished: dict[str, object] = {
+        "keyframe": "settled",
+        "groups": ("friction",),
+        "rate": 250.0,
+        "horizon": 1.0,
+    }
+    proposal, experiment = proposed(MODELS / "servo_arm.xml", tmp_path, **wished)
+    assert proposal.start.keyframe == experiment.initial.keyframe == "settled"
+    assert (experiment.rate, experiment.horizon) == (250.0, 1.0)
+    assert {each.group for each in proposal.chosen} == {"friction"}
+
+    # Noise is wished by kind of coordinate, where the MJCF states none.
+    path = pendulum(tmp_path, length=1.0, mass=1.0)
+    _, experiment = proposed(path, tmp_path, sigmas={"angle": 0.02})
+    assert experiment.noise["qpos:hinge"] == 0.02
+    assert experiment.noise["qvel:hinge"] != 0.02
+
+
+@pytest.mark.parametrize(
+    ("wished", "message"),
+    [
+        ({"keyframe": "up"}, "unknown keyframe at rest 'up'; valid: hanging"),
+        ({"rate": 33.0}, "33 Hz is no whole number of timesteps of 0.01 s; rates nearby: 25, 33.3"),
+        ({"rate": 333.0}, "rates nearby: 50, 100$"),
+        ({"horizon": 0.01, "rate": 100.0}, "less than two samples at 100 Hz.* at least 0.02 s"),
+    ],
+)
+def test_wishes_that_cannot_be_fulfilled_are_named(
+    wished: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ExperimentError, match=message):
+        propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(**wished))

@@ -115,17 +115,27 @@ def _with_unique_names(found: Iterable[Candidate]) -> Iterator[Candidate]:
         yield Candidate(**{**each.__dict__, "name": name})
 
 
-def _payload(model: Any, name: str) -> Iterator[Candidate]:
-    """Mass and first moments of an unknown payload that is fixed to a body."""
+def require_carrier(model: Any, name: str) -> int:
+    """Number of a body that can carry a payload. Raises ExperimentError for another one.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        name: Name of the body.
+    """
     body = identifier(model, "body", name)
     if body < 0:
         raise ExperimentError(f"--payload: {unknown('body', name, names_of(model, 'body'))}")
-    mass = float(model.body_mass[body])
-    if not mass > 0.0:
+    if not float(model.body_mass[body]) > 0.0:
         raise ExperimentError(
             f"--payload: body {name!r} has no mass; name the body with mass that carries the load"
         )
+    return body
 
+
+def _payload(model: Any, name: str) -> Iterator[Candidate]:
+    """Mass and first moments of an unknown payload that is fixed to a body."""
+    body = require_carrier(model, name)
+    mass = float(model.body_mass[body])
     radius = body_inertia(model, body).gyration_radius
     yield Candidate(
         name="payload",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,23 +27,43 @@ class ProposedNoise:
         key: Key of the table `noise`.
         sigma: Standard deviation [output unit].
         stated: Whether the MJCF states it.
+        kind: Kind of a joint's coordinate, see `Wishes.sigmas`; empty for sensors.
     """
 
     key: str
     sigma: float
     stated: bool
+    kind: str = ""
 
 
-def proposed_noise(model: Any, length: float, period: float) -> list[ProposedNoise]:
+def proposed_noise(
+    model: Any, length: float, period: float, wanted: Mapping[str, float]
+) -> list[ProposedNoise]:
     """Noise of the sensors whose noise the MJCF states; else of all joints, by their type.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
         length: Length of the robot [m].
         period: Characteristic period of its motion [s].
+        wanted: Standard deviations of joints that the user states, by kind; see `Wishes.sigmas`.
     """
     sensors = list(_sensors(model))
-    return sensors or list(_joints(model, length, period))
+    return sensors or list(_joints(model, {**typical_sigmas(length, period), **wanted}))
+
+
+def typical_sigmas(length: float, period: float) -> dict[str, float]:
+    """Typical standard deviations of joints by kind.
+
+    Args:
+        length: Length of the robot [m].
+        period: Characteristic period of its motion [s].
+    """
+    return {
+        "angle": ANGLE_SIGMA,
+        "length": _rounded(LENGTH_SIGMA * length),
+        "angular velocity": _rounded(VELOCITY_SIGMA / period),
+        "velocity": _rounded(VELOCITY_SIGMA * length / period),
+    }
 
 
 def _sensors(model: Any) -> Iterator[ProposedNoise]:
@@ -55,26 +75,24 @@ def _sensors(model: Any) -> Iterator[ProposedNoise]:
             yield ProposedNoise(key=name, sigma=sigma, stated=True)
 
 
-def _joints(model: Any, length: float, period: float) -> Iterator[ProposedNoise]:
+def _joints(model: Any, sigmas: Mapping[str, float]) -> Iterator[ProposedNoise]:
     """Positions and velocities of all joints."""
-    sigmas = {
-        "pos": _rounded(LENGTH_SIGMA * length),
-        "rot": ANGLE_SIGMA,
-        "vel": _rounded(VELOCITY_SIGMA * length / period),
-        "omega": _rounded(VELOCITY_SIGMA / period),
-    }
-    for field in ("qpos", "qvel"):
-        length_key, angle_key = ("pos", "rot") if field == "qpos" else ("vel", "omega")
+    kinds = {"qpos": ("length", "angle"), "qvel": ("velocity", "angular velocity")}
+    for field, (length_kind, angle_kind) in kinds.items():
         for joint, name in enumerate(joint_names(model)):
             kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
             key = f"{field}:{name}"
             if kind == mujoco.mjtJoint.mjJNT_FREE:
-                yield ProposedNoise(key=f"{key}.pos", sigma=sigmas[length_key], stated=False)
-                yield ProposedNoise(key=f"{key}.rot", sigma=sigmas[angle_key], stated=False)
+                yield _noise(f"{key}.pos", length_kind, sigmas)
+                yield _noise(f"{key}.rot", angle_kind, sigmas)
                 continue
             slides = kind == mujoco.mjtJoint.mjJNT_SLIDE
-            sigma = sigmas[length_key if slides else angle_key]
-            yield ProposedNoise(key=key, sigma=sigma, stated=False)
+            yield _noise(key, length_kind if slides else angle_kind, sigmas)
+
+
+def _noise(key: str, kind: str, sigmas: Mapping[str, float]) -> ProposedNoise:
+    """Noise of an output of some kind."""
+    return ProposedNoise(key=key, sigma=sigmas[kind], stated=False, kind=kind)
 
 
 def _rounded(value: float) -> float:

@@ -22,7 +22,7 @@ from mjfim.model.loading import ModelSource
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.sizes import position_sizes
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.studies.first_experiment.candidates import GROUPS, Candidate, Group, candidates
+from mjfim.studies.first_experiment.candidates import Candidate, candidates
 from mjfim.studies.first_experiment.excitation import (
     SHRINKING,
     TRIALS,
@@ -35,6 +35,7 @@ from mjfim.studies.first_experiment.selection import identifiable
 from mjfim.studies.first_experiment.start import Start, choose_start, influence_of_controls
 from mjfim.studies.first_experiment.time_scale import TimeScale, reach, time_scale
 from mjfim.studies.first_experiment.urdf import UrdfModel, is_urdf, read_urdf
+from mjfim.studies.first_experiment.wishes import Wishes, require_rate
 
 # First and last frequency of the chirp, in characteristic periods of the motion.
 FIRST_FREQUENCY = 0.4
@@ -58,6 +59,9 @@ WITHOUT_ROOM = ("control",)
 # break contacts are predictable for a short time only.
 LARGEST_AMPLIFICATION = 100.0
 SHORTEST_MOTION = 0.5
+
+# Wishes of a user who has none.
+NO_WISHES = Wishes()
 
 # Largest number of candidates whose information is computed.
 MOST_CANDIDATES = 48
@@ -148,9 +152,8 @@ class Proposal:
 def propose_experiment(
     path: Path,
     folder: Path,
+    wishes: Wishes = NO_WISHES,
     *,
-    groups: Sequence[Group] = GROUPS,
-    payload: str | None = None,
     companion_name: str = "",
 ) -> Proposal:
     """Propose a first experiment for a model.
@@ -158,13 +161,13 @@ def propose_experiment(
     Args:
         path: MJCF or URDF file.
         folder: Folder of the experiment file, to which the path of the model is relative.
-        groups: Groups of parameters that are wanted.
-        payload: Body that carries an unknown payload; None without one.
+        wishes: What the user wants; the rest is proposed.
         companion_name: Name of the MJCF that is written beside the experiment file for a URDF.
 
     Raises:
         ModelError: The model cannot be read.
-        ExperimentError: The model has no actuator or no parameter of the wanted groups.
+        ExperimentError: The model has no actuator or no parameter of the wanted groups, or a wish
+            cannot be fulfilled.
     """
     urdf, source = _model(path)
     model = source.model
@@ -174,20 +177,20 @@ def propose_experiment(
             "<actuator> elements to the MJCF"
         )
 
-    found = candidates(model, groups, payload)[:MOST_CANDIDATES]
+    found = candidates(model, wishes.groups, wishes.payload)[:MOST_CANDIDATES]
     if not found:
         raise ExperimentError(
-            f"{path}: no parameter of {', '.join(groups)} can be proposed: bodies and joints need "
-            "names, and friction and armature a value > 0"
+            f"{path}: no parameter of {', '.join(wishes.groups)} can be proposed: bodies and "
+            "joints need names, and friction and armature a value > 0"
         )
 
     data = mujoco.MjData(model)
-    start = choose_start(model)
+    start = choose_start(model, wishes.keyframe)
     data.qpos[:] = start.qpos
     data.ctrl[:] = start.control
     mujoco.mj_forward(model, data)
     length = reach(model, data)
-    times = time_scale(model, data)
+    times = wanted_times(time_scale(model, data), model, wishes)
 
     controls = source.coordinates.controls
     wanted = first_amplitudes(
@@ -204,7 +207,7 @@ def propose_experiment(
             float(f"{FIRST_FREQUENCY / times.period:.2g}"),
             float(f"{LAST_FREQUENCY / times.period:.2g}"),
         ),
-        noise=proposed_noise(model, length, times.period),
+        noise=proposed_noise(model, length, times.period, wishes.sigmas),
         chosen=found,
         others=(),
         control_limits=_control_limits(source, start, wanted),
@@ -212,7 +215,31 @@ def propose_experiment(
         rest=False,
         remarks=(),
     )
-    return _Refinement(source=source, folder=folder).refined(draft)
+    return _Refinement(source=source, folder=folder, wishes=wishes).refined(draft)
+
+
+def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
+    """The proposed times with the rate and the horizon that the user wants.
+
+    Args:
+        times: The proposed times.
+        model: The compiled model.
+        wishes: What the user wants.
+
+    Raises:
+        ExperimentError: The rate does not fit to the timestep, or the horizon is too short.
+    """
+    rate = times.rate if wishes.rate is None else require_rate(model, wishes.rate)
+    horizon = times.horizon if wishes.horizon is None else wishes.horizon
+    samples = round(horizon * rate)
+    if samples < 2:
+        raise ExperimentError(
+            f"a horizon of {horizon:g} s has less than two samples at {rate:g} Hz; it must be at "
+            f"least {2.0 / rate:g} s"
+        )
+
+    unstable = times.unstable and wishes.horizon is None
+    return replace(times, rate=rate, samples=samples, unstable=unstable)
 
 
 def _model(path: Path) -> tuple[UrdfModel | None, ModelSource]:
@@ -261,10 +288,12 @@ class _Refinement:
     Attributes:
         source: The model.
         folder: Folder of the experiment file.
+        wishes: What the user wants.
     """
 
     source: ModelSource
     folder: Path
+    wishes: Wishes
 
     def refined(self, draft: Proposal) -> Proposal:
         """The draft with amplitudes that keep all limits, and with identified parameters."""
@@ -292,7 +321,12 @@ class _Refinement:
         if draft.times.unstable:
             remarks.append("Note: the start is unstable, so the horizon is short.")
         samples = self._predictable_samples(system, moved)
-        if samples < draft.times.samples:
+        if samples < draft.times.samples and self.wishes.horizon is not None:
+            remarks.append(
+                "Note: the motion amplifies small disturbances; a horizon of "
+                f"{samples / draft.times.rate:.3g} s would be safer."
+            )
+        elif samples < draft.times.samples:
             moved = replace(moved, times=replace(draft.times, samples=samples))
             remarks.append(
                 "Note: the motion amplifies small disturbances, so the horizon is short."

@@ -15,6 +15,7 @@ from mjfim.model.coordinates import joint_dofs
 from mjfim.model.servos import AT_JOINT, actuator_gear, commanded_joint, is_integrated
 from mjfim.model.sizes import control_sizes, translations
 from mjfim.studies.first_experiment.time_scale import free_time, pendulum_time, reach
+from mjfim.studies.first_experiment.wishes import require_keyframe, resting_keyframes
 
 # A state is held where the robot needs this many characteristic periods, sqrt(length / gravity), to
 # move by its own length, or a joint by a radian.
@@ -66,7 +67,7 @@ class Start:
         return self.drift <= 1.0
 
 
-def choose_start(model: Any) -> Start:
+def choose_start(model: Any, keyframe: str | None = None) -> Start:
     """Choose a state at rest in which an experiment can begin.
 
     Named keyframes that a control holds come first, then the reference positions, then the state in
@@ -75,7 +76,15 @@ def choose_start(model: Any) -> Start:
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
+        keyframe: Keyframe that the user wants; None for the best start.
+
+    Raises:
+        ExperimentError: There is no such keyframe at rest.
     """
+    if keyframe is not None:
+        number = model.key(require_keyframe(model, keyframe)).id
+        return _start_in_keyframe(model, int(number))
+
     candidates = []
     for start in _candidates(model):
         if start.held:
@@ -86,16 +95,8 @@ def choose_start(model: Any) -> Start:
 
 def _candidates(model: Any) -> Iterator[Start]:
     """Starts in the order of preference."""
-    for i in range(model.nkey):
-        name = model.key(i).name
-        if name and not model.key_qvel[i].any():
-            qpos, ctrl = model.key_qpos[i], model.key_ctrl[i]
-            reason = f"the keyframe {name!r} of the MJCF"
-            inside = _inside_ranges(model, qpos)
-            if np.array_equal(inside, qpos):
-                yield _start(model, qpos, ctrl, keyframe=name, reason=reason)
-            else:
-                yield _start(model, inside, ctrl, keyframe=None, reason=f"{reason}{MOVED_INSIDE}")
+    for name in resting_keyframes(model):
+        yield _start_in_keyframe(model, int(model.key(name).id))
 
     inside = _inside_ranges(model, model.qpos0)
     reason = "the reference positions of the MJCF"
@@ -116,6 +117,17 @@ def _candidates(model: Any) -> Iterator[Start]:
         if not np.array_equal(inside, settled):
             reason += MOVED_INSIDE
         yield _start(model, inside, first.control, keyframe=None, reason=reason)
+
+
+def _start_in_keyframe(model: Any, number: int) -> Start:
+    """The start in a keyframe, whose joints are moved away from the ends of their ranges."""
+    qpos, ctrl = model.key_qpos[number], model.key_ctrl[number]
+    name = model.key(number).name
+    reason = f"the keyframe {name!r} of the MJCF"
+    inside = _inside_ranges(model, qpos)
+    if np.array_equal(inside, qpos):
+        return _start(model, qpos, ctrl, keyframe=name, reason=reason)
+    return _start(model, inside, ctrl, keyframe=None, reason=f"{reason}{MOVED_INSIDE}")
 
 
 def _start(model: Any, qpos: Array, guess: Array, *, keyframe: str | None, reason: str) -> Start:
