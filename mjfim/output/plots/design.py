@@ -381,7 +381,14 @@ def convergence(design: Design) -> Figure:
         axes.xaxis.get_major_locator().set_params(integer=True)
 
     handles = [
-        Line2D([], [], color=INITIAL_COLOUR, marker="o", linestyle="", label="initial"),
+        Line2D(
+            [],
+            [],
+            color=INITIAL_COLOUR,
+            marker="o",
+            linestyle="",
+            label=f"start: {design.found_by}",
+        ),
         Line2D([], [], color=OPTIMIZED_COLOUR, marker="o", linestyle="", label="optimized"),
     ]
     if relative_slope is not None:
