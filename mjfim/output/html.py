@@ -7,7 +7,8 @@ come from files of others.
 
 from __future__ import annotations
 
-from html import escape
+import re
+from html import escape as escape_characters
 
 from mjfim.output.summary_parts import (
     Column,
@@ -31,6 +32,15 @@ STYLES = {
     ),
     Emphasis.DERIVED: "font-style: italic",
 }
+
+
+# Names of commands, keys and files in sentences.
+CODE = re.compile(r"`([^`\n]+)`")
+
+
+def escape(text: str) -> str:
+    """Return a text as HTML; words in backquotes are code."""
+    return CODE.sub(r"<code>\1</code>", escape_characters(text))
 
 
 def render(summary: Summary) -> str:

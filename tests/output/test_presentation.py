@@ -199,3 +199,8 @@ def test_every_part_of_a_summary_is_escaped() -> None:
     assert found.count(HOSTILE) == 13
     assert f"Warning: {HOSTILE}" in found
     assert "second line" in found
+
+
+def test_words_in_backquotes_are_code() -> None:
+    summary = Summary(title="", outcome="", parts=(Paragraph(text="use `a<b` or ` alone"),))
+    assert "<p>use <code>a&lt;b</code> or ` alone</p>" in render(summary)
