@@ -84,5 +84,5 @@ def test_notebooks_run(path: Path, tmp_path: Path) -> None:
 
     # The notebook claims that the limits hold on an arm that differs from the guess.
     if path.stem == "arm-under-limits":
-        printed = "".join(output.get("text", "") for output in shown)
-        assert "all limits hold: True" in printed
+        printed = [line for output in shown for line in output.get("text", [])]
+        assert "all limits hold: True\n" in printed
