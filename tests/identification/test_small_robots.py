@@ -1,0 +1,136 @@
+"""A small robot that its model describes completely is told no misfit and no missing term."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
+from mjfim.identification.identify import identify_system
+from mjfim.records.estimate import Estimate
+from tests.support.numerics import shared_model
+from tests.support.paths import SHARED_MODELS
+from tests.support.rescaling import Units, rescale
+from tests.support.shared_models import EXPERIMENTS
+
+SEEDS = range(4)
+
+# A rotary pendulum for a table top: friction of 1e-3 N m, inertias of 1e-4 kg m².
+FURUTA = """
+<mujoco model="furuta">
+  <option timestep="0.005" integrator="implicitfast"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="arm" pos="0 0 0.1">
+      <inertial pos="0.04 0 0" mass="0.1" diaginertia="2e-5 1e-4 1e-4"/>
+      <joint name="yaw" type="hinge" axis="0 0 1" damping="2e-4" frictionloss="1e-3"/>
+      <body name="pole" pos="0.085 0 0">
+        <inertial pos="0 0 -0.065" mass="0.025" diaginertia="3.5e-5 3.5e-5 1e-6"/>
+        <joint name="swing" type="hinge" axis="1 0 0" damping="1e-5"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="yaw"/></actuator>
+</mujoco>
+"""
+
+STATED: dict[str, Any] = {
+    "model": "furuta.xml",
+    "rate": 100.0,
+    "horizon": 3.0,
+    "initial": {
+        "control": {"kind": "multisine", "amplitude": 0.02, "frequency": 0.7, "harmonics": 6}
+    },
+    "parameters": {
+        "mass": {"target": "body/pole:mass", "guess": 0.03, "true": 0.025, "unit": "kg"},
+        "length": {"target": "body/pole:ipos[2]", "guess": -0.06, "true": -0.065, "unit": "m"},
+        "damping": {
+            "target": "joint/yaw:damping",
+            "guess": 3e-4,
+            "true": 2e-4,
+            "unit": "N m s/rad",
+        },
+        "friction": {
+            "target": "joint/yaw:frictionloss",
+            "guess": 8e-4,
+            "true": 1e-3,
+            "unit": "N m",
+        },
+    },
+    "noise": {"qpos:yaw": 2e-3, "qpos:swing": 2e-3, "qvel:yaw": 0.02, "qvel:swing": 0.02},
+    "fit": {"bootstrap": 0},
+}
+
+# The same robot as large as a crane, as small as an insect, and with other times and masses.
+SIZES = {
+    "crane": Units(length=1e2, mass=1e6, time=1e1),
+    "insect": Units(length=1e-1, mass=1e-3, time=0.3),
+    "long": Units(length=1e3),
+    "short": Units(length=1e-3),
+    "heavy": Units(mass=1e3),
+    "light": Units(mass=1e-3),
+    "slow": Units(time=1e3),
+    "quick": Units(time=1e-3),
+}
+
+
+def fits(system: System, seeds: range) -> list[Estimate]:
+    """Estimates from recordings of the complete model."""
+    task = DesignTask.of(system)
+    return [
+        identify_system(system, [simulate_system(system, task.initial, seed)]) for seed in seeds
+    ]
+
+
+def verdict(found: Estimate) -> tuple[bool, list[str], tuple[str, ...]]:
+    """Whether there is a misfit, the missing terms, and the reasons."""
+    return found.misfit, [term.path for term in found.missing_terms], found.reasons
+
+
+def assert_is_complete(found: list[Estimate]) -> None:
+    """Assert that no seed gives a misfit, a missing term, or an estimate far off."""
+    assert [verdict(each) for each in found] == [(False, [], ())] * len(found)
+    assert all(each.success for each in found)
+
+
+@pytest.fixture(scope="module")
+def furuta(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+    """The rotary pendulum."""
+    folder = tmp_path_factory.mktemp("furuta")
+    (folder / "furuta.xml").write_text(FURUTA, encoding="utf-8")
+    return Experiment(**STATED, directory=folder, source="furuta")
+
+
+def test_a_table_top_furuta_has_no_misfit(furuta: Experiment) -> None:
+    assert_is_complete(fits(System.resolve(furuta), SEEDS[:1]))
+
+
+@pytest.mark.slow
+def test_a_table_top_furuta_has_no_misfit_with_any_seed(furuta: Experiment) -> None:
+    system = System.resolve(furuta)
+    found = fits(system, SEEDS)
+    assert_is_complete(found)
+    for each in found:
+        assert 0.8 < each.chi2 / each.dof < 1.2
+        assert (abs(each.theta - system.parameters.true) < 4.0 * each.std).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", SIZES)
+def test_its_verdicts_are_the_same_in_all_sizes(
+    size: str, furuta: Experiment, tmp_path: Path
+) -> None:
+    rescaled = rescale(furuta, SIZES[size], tmp_path)
+    assert_is_complete(fits(System.resolve(rescaled.experiment), SEEDS))
+
+
+@pytest.mark.slow
+def test_the_furuta_of_another_project_has_no_misfit() -> None:
+    shared_model(EXPERIMENTS["furuta"]["model"])
+    stated = {**EXPERIMENTS["furuta"], "fit": {"bootstrap": 0}}
+    experiment = Experiment(**stated, directory=SHARED_MODELS, source="furuta")
+    assert_is_complete(fits(System.resolve(experiment), SEEDS))
