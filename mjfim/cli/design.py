@@ -27,6 +27,7 @@ from mjfim.cli.common import (
     worker_processes,
     writing,
 )
+from mjfim.errors import first_ones
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, ShortestExperiment
 from mjfim.excitation.task import DesignTask
@@ -131,8 +132,21 @@ def design(
     errors.print(f"wrote {output}/ (to see the motion: mjfim replay {output})", markup=False)
     if not result.success:
         errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
+    if not result.separable:
+        errors.print(f"mjfim: {_inseparable(result)}", markup=False)
     _say_if_default_ended(result, has_default)
-    raise typer.Exit(0 if result.sound and (found is None or found.closed) else 1)
+    is_done = result.sound and result.separable and (found is None or found.closed)
+    raise typer.Exit(0 if is_done else 1)
+
+
+def _inseparable(result: Design) -> str:
+    """Sentence about parameters that do the same, which `mjfim check` says, too."""
+    groups = first_ones(result.combinations, "; ")
+    return (
+        "the design is made for combinations of parameters, because no control separates these "
+        f"parameters: {groups}. Remove or fix one of each group, give it a prior, or measure "
+        "another output"
+    )
 
 
 def _announced(system: System, has_default: bool) -> System:

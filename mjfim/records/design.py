@@ -355,7 +355,7 @@ class Design(ShownRecord):
 
     @property
     def sound(self) -> bool:
-        """True if the trajectory can be used as it is; the command line then exits with 0.
+        """True if the trajectory can be used as it is.
 
         The optimisation converged, or it used up its budget and found a trajectory other than the
         initial one. The trajectory keeps all limits, and derivatives exist along it.
@@ -363,6 +363,16 @@ class Design(ShownRecord):
         has_moved = not np.array_equal(self.final.trajectory.ctrl, self.initial.trajectory.ctrl)
         is_useful = self.status.success or has_moved
         return self.status.ended_as_planned and self.within_limits and is_useful
+
+    @property
+    def separable(self) -> bool:
+        """True if every wanted parameter is identifiable alone, from data or with its prior.
+
+        Otherwise the design was made for the combinations that are. The command line exits with 0
+        for a design that is sound and separable.
+        """
+        std = dict(zip(self.parameters, self.final.std.tolist(), strict=True))
+        return all(np.isfinite(std[name]) for name in std if name not in self.nuisance)
 
     @property
     def within_limits(self) -> bool:

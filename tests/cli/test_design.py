@@ -121,6 +121,24 @@ def test_budget_used_up_where_derivatives_do_not_exist(tmp_path: Path) -> None:
     assert (result.exit_code, loads(result.stdout)["status"]) == (1, "rough")
 
 
+@pytest.mark.usefixtures("no_files")
+@pytest.mark.parametrize(("prior", "code"), [("", 1), ("prior = 0.1\n", 0)])
+def test_parameters_that_do_the_same_give_the_code_of_check(
+    tmp_path: Path, prior: str, code: int
+) -> None:
+    """The mass of the cart and the armature of its slide add up; a prior separates them."""
+    path = write_experiment(tmp_path, max_iterations="1")
+    with path.open("a", encoding="utf-8") as experiment:
+        experiment.write(
+            '\n[parameters.cart]\ntarget = "body/cart:mass"\n\n[parameters.rotor]\n'
+            f'target = "joint/slide:armature"\nguess = 0.5\n{prior}'
+        )
+
+    designed = run("design", path, "-o", tmp_path / "out")
+    assert (designed.exit_code, run("check", path).exit_code) == (code, code)
+    assert ("no control separates these parameters: cart" in designed.stderr) is bool(code)
+
+
 BAD_LINES: dict[str, tuple[dict[str, str], list[str]]] = {
     "unknown key": (
         {"horizon": "1.0\nhorizn = 2"},
