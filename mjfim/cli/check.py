@@ -31,7 +31,7 @@ from mjfim.output import archive
 from mjfim.output.folders import CHECK_FILES
 from mjfim.output.summaries.check import describe_check
 from mjfim.output.text import render
-from mjfim.recordings.read import read_recording
+from mjfim.recordings.read import read_recording, recording_paths
 
 
 @verb
@@ -56,7 +56,8 @@ def check(
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(stated, threads=threads)
     with progress("reading"):
-        loaded = [read_recording(path, system.channels) for path in recordings or []]
+        logs = recording_paths(recordings or [], system.channels)
+        loaded = [read_recording(path, system.channels) for path in logs]
     trajectory = None
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]

@@ -37,7 +37,9 @@ def export(
     ],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="PATH", help="File to write, or folder of a bag."),
+        typer.Option(
+            "--output", "-o", metavar="PATH", help="File to write, or folder of a bag or dataset."
+        ),
     ],
     experiment: Annotated[
         Path | None,
@@ -52,9 +54,12 @@ def export(
         ),
     ] = None,
     storage: Annotated[str, typer.Option(help="Format of a bag: mcap or sqlite3.")] = "mcap",
+    unit: Annotated[
+        str, typer.Option(help="Unit of angles in a LeRobot dataset: rad or deg.")
+    ] = "rad",
     force: Force = False,
 ) -> None:
-    """Write a design for ROS 2, or as a stand-alone Python program that plays it."""
+    """Write a design for ROS 2 or LeRobot, or as a stand-alone Python program that plays it."""
     target = target_of(to)
     file = design_folder / "design.npz" if design_folder.is_dir() else design_folder
     stated = mjfim.Experiment.from_file(experiment or find_experiment_file(file))
@@ -68,7 +73,7 @@ def export(
         design = mjfim.Design.load(file)
         plan = RobotPlan.of(design, System.resolve(stated), file)
         keep_result(output if is_folder(target) else output.parent)
-        options = ExportOptions(positions=positions, storage=storage)
+        options = ExportOptions(positions=positions, storage=storage, unit=unit)
         remarks = write_export(plan, output, target, options)
 
     for sentence in remarks:

@@ -22,7 +22,7 @@ from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.output.folders import SYSID_FILES
 from mjfim.output.text import render
-from mjfim.recordings.read import read_recording
+from mjfim.recordings.read import read_recording, recording_paths
 
 
 @verb
@@ -43,7 +43,8 @@ def export_sysid(
     system = System.resolve(mjfim.Experiment.from_file(experiment))
     inputs = input_files(system.experiment, recordings)
     claim_folder(output, SYSID_FILES, inputs, force=force)
-    loaded = [read_recording(path, system.channels) for path in recordings]
+    logs = recording_paths(recordings, system.channels)
+    loaded = [read_recording(path, system.channels) for path in logs]
 
     result = sysid_comparison.compare_with_sysid(system, loaded)
     out.print(render(sysid_comparison.describe_sysid_comparison(result)))

@@ -31,7 +31,7 @@ from mjfim.output.folders import estimate_files, parts_of_identified
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summaries.logs import describe_logs
 from mjfim.output.text import render
-from mjfim.recordings.read import read_log
+from mjfim.recordings.read import read_log, recording_paths
 
 
 @verb
@@ -39,7 +39,10 @@ def identify(
     experiment: ExperimentFile,
     recordings: Annotated[
         list[Path],
-        typer.Argument(metavar="RECORDING", help="Logs: CSV, Parquet, npz, JSON, or a ROS 2 bag."),
+        typer.Argument(
+            metavar="RECORDING",
+            help="Logs: CSV, Parquet, npz, JSON, a ROS 2 bag, or a LeRobot dataset.",
+        ),
     ],
     output: Folder,
     held_out: Annotated[
@@ -63,12 +66,14 @@ def identify(
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     inputs = input_files(system.experiment, [*recordings, *(held_out or [])])
-    names = (*estimate_files(len(recordings)), *parts_of_identified(output, system.model_path))
+    logs = recording_paths(recordings, system.channels)
+    held_out_logs = recording_paths(held_out or [], system.channels)
+    names = (*estimate_files(len(logs)), *parts_of_identified(output, system.model_path))
     claim_folder(output, names, inputs, force=force)
 
     with progress("reading") as show:
-        fitted = [read_log(path, system.channels) for path in recordings]
-        predicted = [read_log(path, system.channels) for path in held_out or []]
+        fitted = [read_log(path, system.channels) for path in logs]
+        predicted = [read_log(path, system.channels) for path in held_out_logs]
         if not as_json:
             summaries = [log.summary for log in (*fitted, *predicted)]
             out.print(render(describe_logs(summaries)))

@@ -2,7 +2,7 @@
 
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.formats.read import read_table
-from mjfim.recordings.read import Log, read_log, read_recording
+from mjfim.recordings.read import Log, read_log, read_recording, recording_paths
 from mjfim.recordings.spec import ColumnSpec, RecordingSpec
 from mjfim.recordings.summary import LogSummary, summarize
 
@@ -15,5 +15,6 @@ __all__ = [
     "read_log",
     "read_recording",
     "read_table",
+    "recording_paths",
     "summarize",
 ]

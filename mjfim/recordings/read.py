@@ -18,6 +18,7 @@ from mjfim.model.coordinates import state_components, unknown_coordinate
 from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.column_units import check_unit, convert, units_of
+from mjfim.recordings.formats.lerobot import is_lerobot_dataset, lerobot_episodes
 from mjfim.recordings.formats.read import read_columns
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec, RecordingSpec
@@ -31,6 +32,11 @@ from mjfim.recordings.validity import (
     hold_last_value,
 )
 from mjfim.records.recording import Recording
+
+# Endings of the names in a LeRobot dataset: of measured states, with the coordinates that they are,
+# and of controls.
+LEROBOT_STATES = {".pos": "qpos:", ".vel": "qvel:"}
+LEROBOT_CONTROLS = (".pos", ".vel", ".effort")
 
 # Tolerance of the beginning and the end of the window [s].
 WINDOW_TOLERANCE = 1e-9
@@ -98,7 +104,12 @@ def read_log(path: Path, channels: Channels) -> Log:
     for name in measured:
         check_measured(f"{path}: column {sources[name].column!r}", t, columns[name], spec.gap)
     stated = {name for name, source in sources.items() if source.unit is not None}
-    check_angles(str(path), channels.model, t, columns, stated)
+    if table.unit_hint:
+        _check_units_of_controls(table, sources)
+    try:
+        check_angles(str(path), channels.model, t, columns, stated)
+    except RecordingError as error:
+        raise RecordingError(f"{error}. {table.unit_hint}" if table.unit_hint else error) from None
 
     # The control of the last row is left out, because it would act after the end of the recording.
     # A model without actuators has none.
@@ -111,6 +122,26 @@ def read_log(path: Path, channels: Channels) -> Log:
         recording=Recording(t=t, ctrl=ctrl, y=y, outputs=measured, name=str(path)),
         summary=summarize(str(path), t, columns, column_names, dropped=len(stamps) - len(t)),
     )
+
+
+def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:
+    """List the recordings that logs hold: one for each log, or for each episode of a dataset.
+
+    Args:
+        paths: Logs, and folders of LeRobot datasets, of which all episodes or those of
+            `recording.episodes` are recordings.
+        channels: The signals of the experiment, and how to read them.
+
+    Returns:
+        One path for each recording.
+
+    Raises:
+        RecordingError: A dataset cannot be read.
+    """
+    found: list[Path] = []
+    for path in paths:
+        found += lerobot_episodes(path, channels.spec) if is_lerobot_dataset(path) else [path]
+    return found
 
 
 def check_spec(channels: Channels) -> None:
@@ -130,6 +161,25 @@ def check_spec(channels: Channels) -> None:
         if name not in units:
             raise ExperimentError(f"{where}: {unknown_coordinate('column', name, list(units))}")
         check_unit(f"{where}.{name}", source, units[name])
+
+
+def _check_units_of_controls(table: Table, sources: Mapping[str, ColumnSpec]) -> None:
+    """Refuse commands without a unit beside positions that have one: both have that of the robot.
+
+    Args:
+        table: The log, in whose format commands of servos end in `.pos`.
+        sources: Rules of the columns.
+    """
+    converted = [name for name, s in sources.items() if s.unit is not None or s.scale != 1.0]
+    positions = [name for name in converted if name.startswith("qpos:")]
+    for name, source in sources.items():
+        is_command = source.column.startswith("action:") and source.column.endswith(".pos")
+        if positions and is_command and name not in converted:
+            raise RecordingError(
+                f"{table.source}: {positions[0]!r} has a unit or a scale in [recording.columns], "
+                f"but the command {name!r} has none; state the same for it, as in {name!r} = "
+                f'{{ column = "{source.column}", unit = "deg" }}, or unit = "rad"'
+            )
 
 
 def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
@@ -230,6 +280,7 @@ def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]
         for quantity, coordinate in (("position:", "qpos:"), ("velocity:", "qvel:")):
             if name.startswith(quantity):
                 found[coordinate + name.removeprefix(quantity)] = name
+        found |= dict.fromkeys(_names_of_lerobot_column(name), name)
 
     for matrix, parts in _matrices(channels).items():
         labels = [name for name in table.names if name == matrix or name.startswith(f"{matrix}[")]
@@ -244,6 +295,23 @@ def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]
 
     found.update({name: name for name in table.names})
     return found
+
+
+def _names_of_lerobot_column(name: str) -> list[str]:
+    """Names in mjfim that a column of a LeRobot dataset may mean.
+
+    A state without an ending is a position. The control of a motor may have any ending.
+    """
+    feature, _, component = name.partition(":")
+    stem, dot, ending = component.rpartition(".")
+
+    if feature == "observation.state":
+        coordinate = LEROBOT_STATES.get(f"{dot}{ending}")
+        return [f"{coordinate}{stem}"] if coordinate else [f"qpos:{component}"]
+    if feature == "action":
+        is_stem = f"{dot}{ending}" in LEROBOT_CONTROLS
+        return [f"ctrl:{stem}" if is_stem else f"ctrl:{component}"]
+    return []
 
 
 def _matrices(channels: Channels) -> dict[str, list[str]]:

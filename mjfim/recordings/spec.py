@@ -132,6 +132,13 @@ class RecordingSpec(Section):
             "Topics of the joint states of a ROS bag. Default: the only such topic in the bag."
         ),
     )
+    episodes: tuple[Annotated[int, Field(ge=0, strict=True)], ...] = Field(
+        default=(),
+        description=(
+            "Numbers of the episodes of a LeRobot dataset, each of which is one recording. "
+            "Default: all episodes."
+        ),
+    )
     window: Period | None = Field(
         default=None,
         description=(

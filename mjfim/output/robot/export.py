@@ -14,13 +14,18 @@ from mjfim.output.robot.joint_trajectory import (
     trajectory_remarks,
     write_trajectory_yaml,
 )
+from mjfim.output.robot.lerobot_dataset import (
+    DATASET_FILES,
+    unit_of,
+    write_lerobot_dataset,
+)
 from mjfim.output.robot.plan import RobotPlan
 from mjfim.output.robot.player_script import write_player
 from mjfim.output.robot.ros2_bag import bag_files, storage_of, write_bag
 from mjfim.records.design import Design
 
 # Programs for which a design can be exported.
-Target = Literal["ros2", "ros2-bag", "player"]
+Target = Literal["ros2", "ros2-bag", "player", "lerobot"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,10 +36,12 @@ class ExportOptions:
         positions: What the positions of a joint trajectory are: `motion` or `command`; default: the
             commands where every driven joint has a position servo.
         storage: Format of the file in a ROS 2 bag: `mcap` or `sqlite3`.
+        unit: Unit of angles in a LeRobot dataset: `rad` or `deg`.
     """
 
     positions: str | None = None
     storage: str = "mcap"
+    unit: str = "rad"
 
 
 def target_of(text: str) -> Target:
@@ -54,7 +61,7 @@ def target_of(text: str) -> Target:
 
 def is_folder(target: Target) -> bool:
     """Whether an export to a target is a folder instead of a file."""
-    return target == "ros2-bag"
+    return target in ("ros2-bag", "lerobot")
 
 
 def exported_files(target: Target, path: Path) -> tuple[str, ...]:
@@ -64,6 +71,8 @@ def exported_files(target: Target, path: Path) -> tuple[str, ...]:
         target: The target.
         path: The folder, or the file, whose folder is its parent.
     """
+    if target == "lerobot":
+        return DATASET_FILES
     return bag_files(path) if target == "ros2-bag" else (path.name,)
 
 
@@ -75,12 +84,14 @@ def export_design(
     to: str,
     positions: str | None = None,
     storage: str = "mcap",
+    unit: str = "rad",
 ) -> list[str]:
     """Write a design for a program that runs robots.
 
     `to` is `ros2` for a YAML file with a `trajectory_msgs/JointTrajectory`, `ros2-bag` for the
-    folder of a ROS 2 bag with this message, the planned joint states and the controls, or `player`
-    for a stand-alone Python program that plays the controls, with or without feedback.
+    folder of a ROS 2 bag with this message, the planned joint states and the controls, `player` for
+    a stand-alone Python program that plays the controls, with or without feedback, or `lerobot` for
+    the folder of a LeRobot dataset (v3.0) with one episode.
 
     Args:
         experiment: The experiment for which the design was made.
@@ -90,6 +101,7 @@ def export_design(
         positions: What the positions of a joint trajectory are: `motion` or `command`; default: the
             commands where every driven joint has a position servo.
         storage: Format of the file in a ROS 2 bag: `mcap` or `sqlite3`.
+        unit: Unit of angles in a LeRobot dataset: `rad` or `deg`.
 
     Returns:
         Sentences that the user of the export needs.
@@ -101,7 +113,7 @@ def export_design(
             the target needs is not installed.
     """
     target = target_of(to)
-    options = ExportOptions(positions=positions, storage=storage)
+    options = ExportOptions(positions=positions, storage=storage, unit=unit)
     plan = RobotPlan.of(design, System.resolve(experiment))
     return write_export(plan, Path(path), target, options)
 
@@ -121,6 +133,10 @@ def write_export(plan: RobotPlan, path: Path, target: Target, options: ExportOpt
     if target == "player":
         write_player(path, plan)
         return [f"`python {path}` says what the design needs, and how to play it"]
+
+    if target == "lerobot":
+        write_lerobot_dataset(path, plan, unit_of(options.unit))
+        return []
 
     storage = storage_of(options.storage)
     trajectory = joint_trajectory(plan, options.positions)

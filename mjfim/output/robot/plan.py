@@ -14,6 +14,14 @@ from mjfim.arrays import Array
 from mjfim.excitation.limits import limits_of
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint, actuator_names
+from mjfim.model.servos import (
+    AFFINE,
+    AT_JOINT,
+    Servo,
+    actuator_gear,
+    is_integrated,
+    servo_kind,
+)
 from mjfim.output.archive import check_fits
 from mjfim.output.playback import reference_columns, simulate_playback
 from mjfim.records.design import Design
@@ -27,6 +35,14 @@ class DriveKind(Enum):
     POSITION = "position of a servo"
     VELOCITY = "velocity of a servo"
     OTHER = "none of these"
+
+
+# What the controls of servos mean.
+KINDS_OF_SERVOS: dict[Servo | None, DriveKind] = {
+    "position": DriveKind.POSITION,
+    "velocity": DriveKind.VELOCITY,
+    None: DriveKind.OTHER,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +149,7 @@ def drives_of(system: System) -> tuple[Drive, ...]:
                     name=name,
                     kind=_kind(model, i) if count == 1 else DriveKind.OTHER,
                     joint=joint,
-                    gear=float(model.actuator_gear[int(model.actuator_outadr[i]), 0]),
+                    gear=actuator_gear(model, i),
                     holds_position=_holds_position(model, i),
                     lower=float(lower),
                     upper=float(upper),
@@ -144,43 +160,27 @@ def drives_of(system: System) -> tuple[Drive, ...]:
 
 def _joint_number(model: Any, actuator: int) -> int:
     """Number of the joint on which an actuator acts; -1 where it acts on something else."""
-    kinds = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    at_joint = mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in kinds
+    at_joint = mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
     return int(model.actuator_trnid[actuator, 0]) if at_joint else -1
 
 
 def _holds_position(model: Any, actuator: int) -> bool:
     """Whether an actuator pulls its coordinate to a place that its control states."""
-    is_affine = int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    return (
-        is_affine
-        and float(model.actuator_biasprm[actuator, 1]) < 0.0
-        and not _integrates(model, actuator)
-    )
-
-
-def _integrates(model: Any, actuator: int) -> bool:
-    """Whether the control of an actuator is the rate of its activation."""
-    return int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+    is_affine = mujoco.mjtBias(int(model.actuator_biastype[actuator])) in AFFINE
+    pulls = is_affine and float(model.actuator_biasprm[actuator, 1]) < 0.0
+    return pulls and not is_integrated(model, actuator)
 
 
 def _kind(model: Any, actuator: int) -> DriveKind:
     """What the control of an actuator with one control means."""
-    gain = float(model.actuator_gainprm[actuator, 0])
-    bias = model.actuator_biasprm[actuator]
     has_fixed_gain = int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
-    bias_type = mujoco.mjtBias(int(model.actuator_biastype[actuator]))
-    if not has_fixed_gain or gain == 0.0 or _integrates(model, actuator):
+    has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
+    if not has_fixed_gain or not has_gain or is_integrated(model, actuator):
         return DriveKind.OTHER
 
-    if bias_type == mujoco.mjtBias.mjBIAS_NONE:
+    if int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE):
         return DriveKind.FORCE
-    if bias_type != mujoco.mjtBias.mjBIAS_AFFINE:
-        return DriveKind.OTHER
 
-    # A servo pulls its coordinate to the control: force = gain control + bias (1, length, speed).
-    if bias[0] == 0.0 and bias[1] == -gain:
-        return DriveKind.POSITION
-    if bias[0] == 0.0 and bias[1] == 0.0 and bias[2] == -gain:
-        return DriveKind.VELOCITY
-    return DriveKind.OTHER
+    # A servo with a constant force beside does not rest at its command.
+    has_constant = float(model.actuator_biasprm[actuator, 0]) != 0.0
+    return DriveKind.OTHER if has_constant else KINDS_OF_SERVOS[servo_kind(model, actuator)]

@@ -19,6 +19,11 @@ import pyarrow.parquet
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.recordings.formats.json_records import read_json
+from mjfim.recordings.formats.lerobot import (
+    is_lerobot_dataset,
+    lerobot_episode,
+    read_lerobot,
+)
 from mjfim.recordings.formats.npz import read_npz
 from mjfim.recordings.formats.ros2_bag import read_bag
 from mjfim.recordings.formats.table import (
@@ -45,7 +50,8 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     """Read the columns of a log.
 
     Args:
-        path: A file whose ending determines its format, or the folder of a ROS 2 bag.
+        path: A file whose ending determines its format, the folder of a ROS 2 bag, or an episode
+            of a LeRobot dataset.
         spec: The `[recording]` table; it determines which columns are needed.
 
     Returns:
@@ -54,13 +60,16 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     Raises:
         RecordingError: The file is missing, of an unknown format, or damaged.
     """
+    if lerobot_episode(path) is not None or is_lerobot_dataset(path):
+        return read_lerobot(path, spec)
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
 
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
             raise RecordingError(
-                f"{path}: a folder without metadata.yaml is not a ROS 2 bag; name a file"
+                f"{path}: a folder without metadata.yaml is not a ROS 2 bag, and one without "
+                "meta/info.json is not a LeRobot dataset; name a file"
             )
         return read_bag(path, spec)
 
@@ -69,7 +78,7 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     if reader is None:
         raise RecordingError(
             f"{path}: unknown format; a log is a file that ends in {', '.join(READERS)}, or the "
-            "folder of a ROS 2 bag"
+            "folder of a ROS 2 bag or of a LeRobot dataset"
         )
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty")

@@ -30,6 +30,7 @@ class Table:
         unread: Names of the columns that were not read because they were not requested.
         truth_values: Names of the columns that hold true and false in the file, which are 1 and 0
             in `columns`. They may switch a control, but they are no measurement.
+        unit_hint: How to state the units of columns of this format; empty without a special rule.
     """
 
     source: Path
@@ -37,6 +38,7 @@ class Table:
     faults: dict[str, str] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
     truth_values: frozenset[str] = frozenset()
+    unit_hint: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:

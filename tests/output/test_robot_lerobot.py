@@ -1,0 +1,196 @@
+"""Designs as LeRobot datasets: the files of format v3.0, and back by `identify`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.experiment import System
+from mjfim.recordings import read_recording
+from tests.support.cli import misused, run
+from tests.support.paths import MODELS
+
+CART = MODELS / "cart_pendulum.toml"
+
+# Files of a dataset that LeRobot 0.4 writes for one episode.
+FILES = {
+    "meta/info.json",
+    "meta/stats.json",
+    "meta/tasks.parquet",
+    "meta/episodes/chunk-000/file-000.parquet",
+    "data/chunk-000/file-000.parquet",
+}
+
+# Columns that LeRobot adds to every dataset, with their types.
+DEFAULTS = {
+    "timestamp": "float",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+
+# Keys of info.json that LeRobot 0.4 writes, and statistics of each feature.
+INFO_KEYS = {
+    "codebase_version",
+    "robot_type",
+    "total_episodes",
+    "total_frames",
+    "total_tasks",
+    "chunks_size",
+    "data_files_size_in_mb",
+    "video_files_size_in_mb",
+    "fps",
+    "splits",
+    "data_path",
+    "video_path",
+    "features",
+}
+STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
+
+
+@pytest.fixture(scope="module")
+def cart() -> tuple[mjfim.Experiment, mjfim.Design]:
+    """A design with one motor."""
+    stated = mjfim.Experiment.from_file(CART).replace(descent={"max_iterations": 1})
+    return stated, mjfim.design(stated)
+
+
+@pytest.fixture(scope="module")
+def arm() -> tuple[mjfim.Experiment, mjfim.Design]:
+    """A design with four position servos."""
+    stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
+    stated = stated.replace(horizon=0.5, descent={"max_iterations": 1})
+    return stated, mjfim.design(stated)
+
+
+def described(folder: Path) -> dict[str, Any]:
+    """The contents of info.json."""
+    info: dict[str, Any] = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
+    return info
+
+
+def table(folder: Path, file: str) -> Any:
+    """A table of the dataset."""
+    return pyarrow.parquet.read_table(folder / file, partitioning=None)
+
+
+def test_the_files_follow_the_format(
+    arm: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+) -> None:
+    """Files, keys, columns and types are those of LeRobot 0.4; each feature has statistics."""
+    mjfim.export_design(*arm, tmp_path, to="lerobot")
+    found = {
+        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
+    }
+    assert found == FILES
+
+    info = described(tmp_path)
+    assert set(info) == INFO_KEYS
+    assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", 100, 51)
+    assert info["splits"] == {"train": "0:1"} and info["video_path"] is None
+    joints = ["yaw", "shoulder", "elbow", "wrist"]
+    assert info["features"]["action"] == {
+        "dtype": "float32",
+        "shape": [4],
+        "names": [f"{joint}.pos" for joint in joints],
+    }
+    assert info["features"]["observation.state"]["names"] == [
+        f"{joint}.{ending}" for ending in ("pos", "vel") for joint in joints
+    ]
+
+    data = table(tmp_path, "data/chunk-000/file-000.parquet")
+    types = {name: str(data.schema.field(name).type) for name in data.column_names}
+    assert {name: types[name] for name in DEFAULTS} == DEFAULTS
+    assert data.schema.field("action").type == pa.list_(pa.float32(), 4)
+    assert data.schema.field("observation.state").type == pa.list_(pa.float32(), 8)
+    assert set(info["features"]) == set(data.column_names)
+    assert data.column("timestamp").to_pylist()[-1] == 0.5
+
+    stats = json.loads((tmp_path / "meta" / "stats.json").read_text(encoding="utf-8"))
+    assert set(stats) == set(info["features"])
+    for feature, numbers in stats.items():
+        width = info["features"][feature]["shape"][0]
+        assert set(numbers) == STATISTICS
+        assert {len(value) for key, value in numbers.items() if key != "count"} == {width}
+        assert numbers["count"] == [51]
+
+    episodes = table(tmp_path, "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert len(episodes) == 1 and episodes[0]["tasks"] == ["mjfim design servo_arm"]
+    assert (episodes[0]["dataset_from_index"], episodes[0]["dataset_to_index"]) == (0, 51)
+    assert episodes[0]["stats/action/max"] == stats["action"]["max"]
+    assert {key for key in episodes[0] if key.startswith(("data/", "meta/"))} == {
+        "data/chunk_index",
+        "data/file_index",
+        "meta/episodes/chunk_index",
+        "meta/episodes/file_index",
+    }
+
+    # pandas makes the texts the index of the table of tasks.
+    tasks = table(tmp_path, "meta/tasks.parquet")
+    metadata = json.loads(tasks.schema.metadata[b"pandas"])
+    assert metadata["index_columns"] == ["__index_level_0__"]
+    assert tasks.to_pydict() == {
+        "task_index": [0],
+        "__index_level_0__": ["mjfim design servo_arm"],
+    }
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_actions_are_the_controls_in_the_unit(
+    unit: str, arm: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+) -> None:
+    mjfim.export_design(*arm, tmp_path, to="lerobot", unit=unit)
+    data = table(tmp_path, "data/chunk-000/file-000.parquet")
+    curve, factor = arm[1].trajectory, 180.0 / np.pi if unit == "deg" else 1.0
+    actions = np.array(data.column("action").to_pylist())
+    states = np.array(data.column("observation.state").to_pylist())
+    np.testing.assert_allclose(actions[:-1], factor * curve.ctrl, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(actions[-1], actions[-2])
+    wanted = factor * np.concatenate([curve.qpos, curve.qvel], axis=1)
+    np.testing.assert_allclose(states, wanted, rtol=1e-6, atol=1e-5)
+
+
+def test_identify_reads_the_dataset(
+    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+) -> None:
+    """Names are found without a table `[recording]`; the values have single precision."""
+    mjfim.export_design(*cart, tmp_path, to="lerobot")
+    recording = read_recording(tmp_path, System.resolve(cart[0]).channels)
+    np.testing.assert_allclose(recording.ctrl, cart[1].trajectory.ctrl, rtol=1e-6)
+    assert set(recording.outputs) == {"qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"}
+    estimate = mjfim.identify(cart[0], [recording])
+    np.testing.assert_allclose(list(estimate.theta), [2.0, 1.0, 1.0], rtol=1e-4)
+
+
+def test_the_verb_replaces_its_own_dataset(
+    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+) -> None:
+    """Twice into one folder; a file of the user and a wrong unit are refused."""
+    cart[1].save(tmp_path / "design")
+    words = ("export", tmp_path / "design", "--experiment", CART, "--to", "lerobot")
+    for _ in range(2):
+        done = run(*words, "-o", tmp_path / "set")
+        assert done.exit_code == 0, done.stderr
+    assert described(tmp_path / "set")["total_frames"] == 401
+
+    info = tmp_path / "set" / "meta" / "info.json"
+    info.write_text("{}", encoding="utf-8")
+    misused(run(*words, "-o", tmp_path / "set"), "info.json", "--force")
+    misused(run(*words, "-o", tmp_path / "set2", "--unit", "turn"), "--unit: unknown unit 'turn'")
+
+
+def test_a_rate_that_is_no_whole_number_is_refused(
+    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+) -> None:
+    stated = cart[0].replace(rate=100.0 / 3.0, measure_rate=100.0 / 3.0, horizon=0.3)
+    with pytest.raises(ExperimentError, match=r"33\.3333 rows per second; state another rate"):
+        mjfim.export_design(stated, mjfim.design(stated), tmp_path, to="lerobot")

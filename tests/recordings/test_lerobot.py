@@ -1,0 +1,208 @@
+"""LeRobot datasets of both formats: episodes, names, units, times, and damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.experiment import System
+from mjfim.recordings import RecordingSpec, read_recording, recording_paths
+from mjfim.recordings.formats.read import read_columns
+from tests.support.cli import misused, run
+from tests.support.lerobot import write_dataset
+from tests.support.paths import MODELS
+
+ALL = RecordingSpec()
+NAMES = {"action": ["force.effort"], "observation.state": ["slide.pos", "hinge.pos"]}
+both = pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
+
+
+def episodes(count: int = 2, rows: int = 40) -> list[dict[str, np.ndarray]]:
+    """Episodes whose numbers tell episode, row and component."""
+    k = np.arange(rows)
+    return [
+        {
+            "action": np.sin(0.1 * k + e),
+            "observation.state": np.column_stack([0.01 * k + e, 3.0 + np.cos(0.1 * k)]),
+        }
+        for e in range(count)
+    ]
+
+
+def cart(**recording: Any) -> System:
+    """The cart-pendulum with a table `[recording]`."""
+    stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return System.resolve(stated.replace(recording=recording))
+
+
+@both
+def test_each_episode_is_a_recording(version: str, tmp_path: Path) -> None:
+    """Episodes of a folder, chosen ones, and one by its name; times have no rounding."""
+    data = episodes(3)
+    folder = write_dataset(tmp_path / "set", data, NAMES, version=version)
+    paths = recording_paths([folder, tmp_path / "other.csv"], cart().channels)
+    assert [path.name for path in paths] == [*(f"episode_{i:06d}" for i in range(3)), "other.csv"]
+    chosen = recording_paths([folder], cart(episodes=[2, 0]).channels)
+    assert [path.name for path in chosen] == ["episode_000002", "episode_000000"]
+
+    for number, path in enumerate(paths[:3]):
+        recording = read_recording(path, cart().channels)
+        assert recording.outputs == ("qpos:slide", "qpos:hinge")
+        np.testing.assert_array_equal(recording.t, np.arange(40) / 100.0)
+        single = data[number]["observation.state"].astype(np.float32)
+        np.testing.assert_array_equal(recording.y, single)
+        np.testing.assert_array_equal(
+            recording.ctrl[:, 0], data[number]["action"].astype(np.float32)[:-1]
+        )
+
+    with pytest.raises(RecordingError, match=r"set: has 3 episodes; name one, as in episode_0000"):
+        read_columns(folder, ALL)
+    table = read_columns(folder, RecordingSpec(episodes=(1,)))
+    assert table.column("observation.state:slide.pos")[0] == 1.0
+    with pytest.raises(RecordingError, match="no episode 3; the dataset has the episodes 0 to 2"):
+        recording_paths([folder], cart(episodes=[3]).channels)
+    with pytest.raises(RecordingError, match="has no "):
+        read_columns(folder / "episode_000009", ALL)
+
+
+@pytest.mark.parametrize(
+    ("stated", "columns"),
+    [
+        (["a", "b"], ["observation.state:a", "observation.state:b"]),
+        ({"motors": ["a", "b"]}, ["observation.state:a", "observation.state:b"]),
+        ({"b": 1, "a": 0}, ["observation.state:a", "observation.state:b"]),
+        ([["a", "b"]], ["observation.state:a", "observation.state:b"]),
+        (["a"], ["observation.state[0]", "observation.state[1]"]),
+        (None, ["observation.state[0]", "observation.state[1]"]),
+    ],
+)
+def test_names_have_many_forms(stated: Any, columns: list[str], tmp_path: Path) -> None:
+    names = {"observation.state": stated}
+    table = read_columns(write_dataset(tmp_path / "set", episodes(1), names), ALL)
+    assert set(table.names) == {"t", "action", *columns}
+
+
+def test_columns_are_mapped_by_the_experiment_file(tmp_path: Path) -> None:
+    """Names of another robot, degrees, and a window."""
+    data = episodes(1)[0]
+    data = {**data, "observation.state": np.rad2deg(data["observation.state"])}
+    names = {"action": ["m.torque"], "observation.state": ["x", "main_hinge"]}
+    folder = write_dataset(tmp_path / "set", [data], names)
+    columns = {
+        "ctrl:force": "action:m.torque",
+        "qpos:hinge": {"column": "observation.state:main_hinge", "unit": "deg"},
+    }
+    recording = read_recording(folder, cart(columns=columns, window=[0.1, 0.3]).channels)
+    wanted = episodes(1)[0]["observation.state"][10:31, 1]
+    np.testing.assert_allclose(recording.y[:, 0], wanted, rtol=1e-6)
+
+
+def test_degrees_are_refused_with_the_way_to_state_units(tmp_path: Path) -> None:
+    """A joint with a range whose positions are in degrees; then commands without a unit."""
+    model = System.resolve(mjfim.Experiment.from_file(MODELS / "servo_arm.toml")).model
+    joints = [model.joint(i).name for i in range(model.njnt)]
+    k = np.arange(100)[:, None]
+    angles = np.rad2deg(0.8 + 0.3 * np.sin(0.05 * k + np.arange(4)))
+    names = [f"{joint}.pos" for joint in joints]
+    features = {"action": angles, "observation.state": angles}
+    folder = write_dataset(tmp_path / "set", [features], dict.fromkeys(features, names))
+
+    stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
+    noise = {f"qpos:{joint}": 0.01 for joint in joints}
+    arm = stated.replace(noise=noise)
+    with pytest.raises(RecordingError, match=r"probably in deg.*LeRobot robots store degrees.*sca"):
+        read_recording(folder, System.resolve(arm).channels)
+
+    columns: dict[str, Any] = {
+        f"qpos:{joint}": {"column": f"observation.state:{joint}.pos", "unit": "deg"}
+        for joint in joints
+    }
+    half = System.resolve(arm.replace(recording={"columns": columns}))
+    with pytest.raises(
+        RecordingError, match=r"but the command 'ctrl:yaw' has none; state the same"
+    ):
+        read_recording(folder, half.channels)
+
+    columns |= {
+        f"ctrl:{joint}": {"column": f"action:{joint}.pos", "unit": "deg"} for joint in joints
+    }
+    whole = System.resolve(arm.replace(recording={"columns": columns}))
+    recording = read_recording(folder, whole.channels)
+    np.testing.assert_allclose(recording.y, np.deg2rad(angles), rtol=1e-5)
+    np.testing.assert_allclose(recording.ctrl, np.deg2rad(angles[:-1]), rtol=1e-5)
+
+
+def test_stamps_of_a_clock_are_kept(tmp_path: Path) -> None:
+    """Time stamps that are not those of the frame numbers are the times."""
+    folder = write_dataset(tmp_path / "set", episodes(1), NAMES, info={"fps": 90.0})
+    np.testing.assert_allclose(
+        read_columns(folder, ALL).column("t"), np.arange(40) / 100, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("info", "said"),
+    [
+        ({"codebase_version": "v1.6"}, "LeRobot format 'v1.6'; the formats v2.0, v2.1 and v3.0"),
+        ({"codebase_version": None}, "LeRobot format 'None'"),
+        ({"total_episodes": "two"}, "total_episodes is 'two'; expected at least 1"),
+        ({"fps": 0}, "fps is 0; expected a positive number"),
+        ({"features": []}, "has no table of features"),
+    ],
+)
+def test_wrong_descriptions(info: dict[str, Any], said: str, tmp_path: Path) -> None:
+    folder = write_dataset(tmp_path / "set", episodes(1), NAMES, info=info)
+    with pytest.raises(RecordingError, match=said):
+        read_columns(folder, ALL)
+
+
+def test_damage_is_one_sentence(tmp_path: Path) -> None:
+    """Overwritten or missing data, and an info.json that is none."""
+    folder = write_dataset(tmp_path / "set", episodes(1), NAMES)
+    file = next(folder.rglob("*.parquet"))
+    whole = file.read_bytes()
+    for share in (0.0, 0.3, 0.9):
+        file.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(RecordingError, match="not a readable Parquet file"):
+            read_columns(folder, ALL)
+    file.unlink()
+    with pytest.raises(RecordingError, match="has no data file of episode 0"):
+        read_columns(folder, ALL)
+    (folder / "meta" / "info.json").write_text("[]", encoding="utf-8")
+    with pytest.raises(RecordingError, match="not a JSON object"):
+        read_columns(folder, ALL)
+
+
+def test_a_frame_of_another_length_is_a_fault(tmp_path: Path) -> None:
+    """Info.json states another number of components than the frames have."""
+    features = {"observation.state": {"dtype": "float32", "shape": [3], "names": None}}
+    folder = write_dataset(tmp_path / "set", episodes(1), NAMES, info={"features": features})
+    with pytest.raises(RecordingError, match="not 3 numbers per frame"):
+        read_columns(folder, ALL).column("observation.state[0]")
+
+
+def test_keys_that_do_not_fit(tmp_path: Path) -> None:
+    folder = write_dataset(tmp_path / "set", episodes(1), NAMES)
+    with pytest.raises(RecordingError, match=r"recording\.time_unit.*LeRobot dataset is in sec"):
+        read_columns(folder, RecordingSpec(time_unit="ms"))
+    with pytest.raises(ExperimentError, match=r"recording\.episodes"):
+        cart(episodes=[-1])
+
+
+def test_the_verbs_read_all_episodes(tmp_path: Path) -> None:
+    """Each episode of a folder is a recording of the check; a wrong folder is one sentence."""
+    stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    folder = write_dataset(tmp_path / "set", episodes(2), NAMES)
+    done = run("check", stated.source, folder, "--json")
+    assert done.exit_code in (0, 1), done.stderr
+    assert "confounded" in done.stdout or "verdict" in done.stdout
+    (tmp_path / "empty").mkdir()
+    misused(
+        run("identify", stated.source, tmp_path / "empty", "-o", tmp_path / "out"),
+        "without meta/info.json is not a LeRobot dataset",
+    )
