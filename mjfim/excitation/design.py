@@ -24,6 +24,8 @@ from mjfim.excitation.initial_controls import InitialControl, initial_controls_o
 from mjfim.excitation.levels import DescentLevel, coarse_level, easier_level
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.release_search import ReleaseSearch
+from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
@@ -128,6 +130,9 @@ def design_task(
         The design.
     """
     budget = design_budget(task) if budget is None else budget
+    if task.release is not None:
+        return _design_release(task, task.release, budget, callback)
+
     _require_controls(task)
     require_feasible_start(task)
     steps_before = task.plant.engine_steps
@@ -154,13 +159,64 @@ def design_task(
     return report.design(best, results, budget.seconds_used, steps, interrupted)
 
 
+def _design_release(
+    task: DesignTask, space: ReleaseSpace, budget: Budget, callback: DesignCallback | None
+) -> Design:
+    """Design the initial state of a motion whose control is given. See `design`."""
+    require_feasible_start(task)
+    steps_before = task.plant.engine_steps
+
+    first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
+    identifiability = _identifiability(task, first, None)
+    require_designable(task, identifiability)
+    stage = DescentLevel(task, identifiability.basis)
+    first = stage.problem.reevaluated(first)
+
+    search = ReleaseSearch(stage, space, budget, callback)
+    found = search.run()
+    interrupted = budget.stop.requested
+
+    # The stated release stays where no better one within the limits was found.
+    chosen, played = found.best.point, task
+    if first.cost < chosen.cost and _keeps_limits(task, first):
+        chosen = first
+    elif chosen.trajectory is not None:
+        played = task.released_as(chosen.trajectory.state[0])
+
+    best = RunResult(
+        name=found.found_by,
+        control=task.control,
+        cost=chosen.cost,
+        status=found.status,
+        slope=np.nan,
+        history=found.history,
+        point=chosen,
+    )
+    report = _Report(
+        stage=stage,
+        identifiability=identifiability,
+        initial=first,
+        final=chosen,
+        played=played,
+        remarks=tuple(space.edges(found.best.shares)),
+    )
+    steps = task.plant.engine_steps - steps_before
+    made = report.design(best, (), budget.seconds_used, steps, interrupted)
+    return replace(made, starts=found.starts)
+
+
 def _require_controls(task: DesignTask) -> None:
     """Raise ExperimentError where the model has no actuators, so that there is no control."""
-    if not task.controls:
-        raise ExperimentError(
-            f"{task.experiment.source}: the model has no actuators, so there is no control to "
-            "design; `check`, `simulate` and `identify` need none"
-        )
+    if task.controls:
+        return
+
+    # An example for the first joint whose position is one number.
+    joint = next((joint.position_column for joint in task.system.coordinates), "qpos:<joint>")
+    raise ExperimentError(
+        f"{task.experiment.source}: the model has no actuators, so there is no control to design. "
+        "State in initial.free which initial state a design may choose, for example [initial] "
+        f'free = {{ "{joint}" = [-1.0, 1.0] }}'
+    )
 
 
 def _checked_control(task: DesignTask, control: Array) -> Array:
@@ -345,12 +401,16 @@ class _Report:
         identifiability: The combinations that can be identified.
         initial: The initial control, evaluated.
         final: The designed control, evaluated.
+        played: The task with the initial state of the design; None where it is the stated one.
+        remarks: Warnings that belong to the search.
     """
 
     stage: DescentLevel
     identifiability: Identifiability
     initial: DesignPoint
     final: DesignPoint
+    played: DesignTask | None = None
+    remarks: tuple[str, ...] = ()
 
     def design(
         self,
@@ -366,7 +426,7 @@ class _Report:
         final = evaluate_point(self.stage, self.final)
 
         # The limits, on the model as the user wrote it.
-        found = verify(task, final.trajectory)
+        found = verify(self.played or task, final.trajectory)
         model = task.system.model_at(task.theta)
         clamped = saturated_actuators(model, final.trajectory)
 
@@ -388,7 +448,7 @@ class _Report:
         if task.is_limited and not found.is_feasible and not interrupted:
             status = Status.INFEASIBLE
 
-        warnings = tuple(design_warnings(final, found, task, clamped, rough))
+        warnings = (*design_warnings(final, found, task, clamped, rough), *self.remarks)
         return self._record(
             best=best,
             results=results,
@@ -491,11 +551,12 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     estimated = [parameters.parameters[j] for j in parameters.interest]
 
     # Parameters without any effect.
+    tried = "control" if task.release is None else "release"
     silent = [estimated[i].name for i in along_all.silent if not estimated[i].group]
     if silent:
         raise UnidentifiableError(
             f"{_subject(silent)} nothing in the measured outputs, neither along the initial "
-            f"control nor along {PROBES} random controls; remove "
+            f"{tried} nor along {PROBES} random {tried}s; remove "
             f"{'it' if len(silent) == 1 else 'them'}, or measure a quantity that shows the effect"
         )
 
@@ -511,7 +572,10 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     if not along_all.basis.shape[1]:
         raise UnidentifiableError("no parameter has an effect on the measured outputs")
 
-    # Combinations that random controls excite, but not the initial one.
+    # Combinations that random controls excite, but not the initial one. A search over all releases
+    # does not need it.
+    if task.release is not None:
+        return
     if identifiability.along_trajectory.count > along_all.count:
         groups = identifiability.groups_along_trajectory
         unexcited = first_ones([_unexcited_group(group) for group in groups], "; ", GROUPS_TEXT)

@@ -106,7 +106,7 @@ def evaluate(
 @one_blas_thread()
 def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
     """Evaluate the control of a trajectory in a resolved task. See `evaluate`."""
-    return _evaluate_control(task, trajectory.ctrl)
+    return _evaluate_control(task.released_as(trajectory.state[0]), trajectory.ctrl)
 
 
 def criterion_of(task: DesignTask, control: Array) -> float:

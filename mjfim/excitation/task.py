@@ -15,6 +15,7 @@ from mjfim.excitation.holding_control import holding_control, least_drift_contro
 from mjfim.excitation.limits import Limit, limits_of
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.prior_information import information_of
+from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.robust import ParameterSamples
 from mjfim.excitation.task_parts import (
     contrast_of,
@@ -74,6 +75,8 @@ class DesignTask:
             experiment's `earlier` files, or None.
         samples_of_parameters: Parameter values over which a robust design pools its criterion, or
             None.
+        release: Ranges of the initial state within which the release is designed, or None where
+            the control is.
     """
 
     system: System
@@ -87,6 +90,7 @@ class DesignTask:
     prior_information: Array
     added_information: Array | None
     samples_of_parameters: ParameterSamples | None
+    release: ReleaseSpace | None
 
     @classmethod
     def resolve(
@@ -182,6 +186,7 @@ class DesignTask:
             prior_information=prior,
             added_information=added,
             samples_of_parameters=parameter_samples_of(system),
+            release=ReleaseSpace.of(system, limits),
         )
 
     # Shortcuts to the parts of the system that nearly every step of a design needs.
@@ -479,7 +484,7 @@ class DesignTask:
         return np.asarray(window)
 
     def probes(self, count: int) -> Iterator[Trajectory]:
-        """Simulate random controls.
+        """Simulate random controls, or random releases where the release is designed.
 
         Args:
             count: Number of controls.
@@ -489,6 +494,10 @@ class DesignTask:
             left out.
         """
         rng = np.random.default_rng(self.experiment.descent.seed)
+        if self.release is not None:
+            yield from self._random_releases(self.release, count, rng)
+            return
+
         for _ in range(count):
             control = self.random_control(rng, LEAST_PROBE_AMPLITUDE, MOST_PROBE_AMPLITUDE)
             try:
@@ -496,7 +505,25 @@ class DesignTask:
             except SimulationDivergedError:
                 continue
 
+    def _random_releases(
+        self, release: ReleaseSpace, count: int, rng: np.random.Generator
+    ) -> Iterator[Trajectory]:
+        """Motions from random releases within the ranges; those that diverge are left out."""
+        for _ in range(count):
+            state = release.state(rng.uniform(size=len(release.names)))
+            try:
+                yield self.plant.with_initial_state(state).simulate(self.theta, self.control)
+            except SimulationDivergedError:
+                continue
+
     # Variants of the plant
+
+    def released_as(self, state: Array) -> DesignTask:
+        """This task, which begins in a state: (ns,), where the release is designed."""
+        if self.release is None:
+            return self
+        system, reference = _calibrated(self.system.released_as(state), self.control)
+        return replace(self, system=system, reference=reference, release=None)
 
     def with_variant(self, variant: ModelVariant) -> DesignTask:
         """This task on another plant.

@@ -20,7 +20,9 @@ def simulate(
 ) -> Recording:
     """Simulate a recording at the `true` parameter values.
 
-    The trajectory's control is applied open loop, and noise is added to the measured samples.
+    The trajectory's control is applied open loop, and noise is added to the measured samples. The
+    motion begins at the initial state of the experiment, or where a design chooses the release, at
+    that of the trajectory.
 
     Args:
         experiment: The experiment.
@@ -41,6 +43,7 @@ def simulate_system(
     system: System, trajectory: Trajectory, seed: int | np.random.Generator = 0
 ) -> Recording:
     """Simulate a recording of a resolved system. See `simulate`."""
+    system = system.released_as(trajectory.state[0])
     rng = np.random.default_rng(seed)
     true = system.parameters.true
     outputs, finite = system.plant.measure(true[None], trajectory.ctrl)

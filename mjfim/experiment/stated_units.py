@@ -242,6 +242,7 @@ def _nuisance_numbers(experiment: Experiment, source: ModelSource) -> Iterator[S
     deviations = {c.name: c.unit for c in source.coordinates.deviations}
 
     yield from _by_name("nuisance.initial", stated.initial, deviations)
+    yield from _by_name("initial.free", experiment.initial.free, deviations)
     yield from _by_name("nuisance.bias", stated.bias, _output_units(source))
 
 

@@ -193,6 +193,34 @@ class System:
             return replace(self, variant=variant, plant=plant(speeds, None))
         return replace(self, variant=variant, plant=plant((), plant(speeds, None)))
 
+    def released(self, state: Array) -> System:
+        """This system with another nominal initial state, which a design does not choose any more.
+
+        Args:
+            state: (ns,) initial state where no parameter moves it.
+        """
+        initial = self.experiment.initial.model_copy(update={"free": {}})
+        return replace(
+            self,
+            experiment=self.experiment.model_copy(update={"initial": initial}),
+            nominal_initial_state=np.array(state),
+            plant=self.plant.with_initial_state(state),
+        )
+
+    def released_as(self, state: Array) -> System:
+        """This system, which begins in a state where a design chooses the release.
+
+        Args:
+            state: (ns,) first state of a trajectory, at the theta of the design.
+
+        Returns:
+            This system itself where the experiment fixes the initial state.
+        """
+        if not self.experiment.initial.free:
+            return self
+        moves = self.parameters.initial_state_derivative(self.space.nx) @ self.theta
+        return self.released(self.space.plus(state, -moves))
+
     def with_substeps(self, substeps: int) -> System:
         """This system, as the experiment states it, with samples of another length.
 

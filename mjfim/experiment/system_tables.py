@@ -98,6 +98,18 @@ class Initial(Section):
     act: tuple[Finite, ...] | None = Field(
         default=None, description="Initial actuator activations, na numbers. Default: 0."
     )
+    free: dict[str, RangeWithUnit] = Field(
+        default_factory=dict,
+        description=(
+            "Ranges within which `design` chooses the release, the initial state of a motion that "
+            "no control drives, by coordinate: `qpos:<joint>` and `qvel:<joint>`, with the parts "
+            "`.x .y .z .rx .ry .rz` of ball and free joints [m, rad, m/s or rad/s]. Rotations "
+            "`.rx .ry .rz` are relative to the stated initial state. The stated control is "
+            "played unchanged. Recordings begin wherever they were released: the initial state is "
+            "then estimated from each of them, or, with `nuisance.initial`, these coordinates are "
+            "read from its first rows. Default: the initial state is fixed."
+        ),
+    )
     control: str | Signal | None = Field(
         default=None,
         description=(

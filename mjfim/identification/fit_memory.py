@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mjfim.experiment.system import System
+from mjfim.identification.segments import free_release
 from mjfim.memory import NUMBER_BYTES, require_memory
 from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE
 from mjfim.records.recording import Recording
@@ -56,7 +57,8 @@ def recordings_bytes(system: System, rows: int, *, fit: bool) -> float:
     """
     settings = system.experiment.fit
     directions = len(system.parameters)
-    if settings.start == "measured" or settings.segments is not None:
+    is_free = settings.start == "measured" or settings.segments is not None
+    if is_free or free_release(system):
         directions += system.space.nx
 
     # The simulations are divided into blocks.

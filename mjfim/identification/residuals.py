@@ -19,7 +19,13 @@ from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedErro
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.segment_simulation import SegmentRows, SegmentSimulation
-from mjfim.identification.segments import Segment, cut_into_segments, whole_recordings
+from mjfim.identification.segments import (
+    Segment,
+    cut_into_segments,
+    free_release,
+    recorded_release,
+    whole_recordings,
+)
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
 from mjfim.model.parameters import ParameterSet
@@ -147,10 +153,11 @@ class FitProblem:
         # Difference steps depend on how strongly each parameter changes the recorded motion.
         longest = max(aligned, key=lambda recording: len(recording.ctrl))
         samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
-        system = system.calibrated(parameters.guess, longest.ctrl[:samples])
+        system = _calibrated_along(system, longest, samples)
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = settings.start == "measured" or settings.segments is not None
+        free_starts = free_starts or free_release(system)
         segments, directions = _segments_of(system, aligned, free_starts)
 
         masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
@@ -691,6 +698,17 @@ class FitProblem:
         return rows
 
 
+def _calibrated_along(system: System, recording: AlignedRecording, samples: int) -> System:
+    """The system with difference steps that suit the first samples of a recording."""
+    guess, control = system.parameters.guess, recording.ctrl[:samples]
+    nominal = system.plant.nominal_initial_state
+    begun = replace(
+        system, plant=system.plant.with_initial_state(recorded_release(system, recording))
+    )
+    calibrated = begun.calibrated(guess, control)
+    return replace(calibrated, plant=calibrated.plant.with_initial_state(nominal))
+
+
 def _segments_of(
     system: System, recordings: Sequence[AlignedRecording], free_starts: bool
 ) -> tuple[tuple[Segment, ...], Array]:
@@ -706,7 +724,7 @@ def _segments_of(
 
     by_theta = parameters.initial_state_derivative(system.space.nx)
     directions = by_theta[:, parameters.initial_deviations]
-    return whole_recordings(recordings, system.plant.nominal_initial_state), directions
+    return whole_recordings(system, recordings), directions
 
 
 def _require_measured_starts(system: System) -> None:

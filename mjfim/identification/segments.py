@@ -48,12 +48,12 @@ class Segment:
     start: Array
 
 
-def whole_recordings(recordings: Sequence[AlignedRecording], start: Array) -> tuple[Segment, ...]:
-    """One segment for every recording, which begins at the stated initial state.
+def whole_recordings(system: System, recordings: Sequence[AlignedRecording]) -> tuple[Segment, ...]:
+    """One segment for every recording, which begins at the stated or recorded initial state.
 
     Args:
+        system: System that was recorded.
         recordings: The recordings.
-        start: (ns,) initial state.
 
     Returns:
         The segments.
@@ -64,10 +64,37 @@ def whole_recordings(recordings: Sequence[AlignedRecording], start: Array) -> tu
             begin=0,
             samples=len(recording.ctrl),
             rows=slice(0, len(recording.t)),
-            start=start,
+            start=recorded_release(system, recording),
         )
         for i, recording in enumerate(recordings)
     )
+
+
+def free_release(system: System) -> bool:
+    """Whether recordings begin at releases that only they show, and nothing else moves the start.
+
+    The whole initial state of a recording is then unknown.
+    """
+    if not system.experiment.initial.free:
+        return False
+    return not system.parameters.initial_state_derivative(system.space.nx).any()
+
+
+def recorded_release(system: System, recording: AlignedRecording) -> Array:
+    """(ns,) nominal initial state of a recording.
+
+    Coordinates of `initial.free` are measured at its begin; the others are stated.
+    """
+    space, nominal = system.space, system.plant.nominal_initial_state
+    names = system.experiment.initial.free
+    if not names:
+        return nominal
+
+    measured = measured_initial_states(system, recording, np.zeros(1, dtype=np.intp))[0]
+    chosen = [c.address for c in system.source.coordinates.deviations if c.name in names]
+    move = np.zeros(space.nx)
+    move[chosen] = space.minus(measured, nominal)[chosen]
+    return space.plus(nominal, move)
 
 
 def cut_into_segments(

@@ -153,12 +153,15 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
         terminal: (nx, nx) weight of the last state.
 
     Returns:
-        (N, nu, nx) gain K.
+        (N, nu, nx) gain K; it has no rows without controls.
 
     Raises:
         numpy.linalg.LinAlgError: `R + B'PB` is not positive definite.
     """
-    K = np.empty((len(A), B.shape[2], A.shape[1]))
+    K = np.zeros((len(A), B.shape[2], A.shape[1]))
+    if not K.size:
+        return K
+
     P = terminal
 
     for k in range(len(A) - 1, -1, -1):

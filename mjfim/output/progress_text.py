@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
@@ -46,10 +47,10 @@ def design_text(event: DesignEvent) -> str:
         event: The event.
     """
     row = event.row
-    return (
-        f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  "
-        f"slope {row.slope:.1e}"
-    )
+    text = f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}"
+
+    # The search for a release has no slope.
+    return text if math.isnan(row.slope) else f"{text}  slope {row.slope:.1e}"
 
 
 def fit_text(event: FitEvent) -> str:

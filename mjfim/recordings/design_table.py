@@ -51,7 +51,9 @@ def read_playback(path: Path, channels: Channels) -> Playback:
     ctrl = _stacked(path, table, controls, len(t) - 1)
     gain = _stacked(path, table, gains, len(t) - 1)
 
-    return Playback(t=t, state=state, ctrl=ctrl, gain=gain.reshape(len(ctrl), len(controls), -1))
+    # Gains have one column for each deviation of the state; without controls there are none.
+    nx = 2 * channels.model.nv + channels.model.na
+    return Playback(t=t, state=state, ctrl=ctrl, gain=gain.reshape(len(ctrl), len(controls), nx))
 
 
 def _grid(path: Path, t: Array, timestep: float) -> Array:
@@ -76,6 +78,8 @@ def _grid(path: Path, t: Array, timestep: float) -> Array:
 
 def _stacked(path: Path, table: Mapping[str, Array], names: Sequence[str], rows: int) -> Array:
     """(rows, len(names)) numbers of some columns, all of which must be finite."""
+    if not names:
+        return np.zeros((rows, 0))
     values = np.column_stack([table[name][:rows] for name in names])
 
     if not np.isfinite(values).all():

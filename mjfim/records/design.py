@@ -78,6 +78,7 @@ class Status(Enum):
     SMOOTHED = (
         "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
     )
+    RELEASE_FOUND = "converged: no release nearby tells more, the best of a search over all ranges"
     ROUGH = (
         "ended where derivatives are unreliable (contact, dry friction or saturated actuators): "
         "the numbers are only approximate, see warnings"
@@ -104,7 +105,7 @@ class Status(Enum):
     @property
     def success(self) -> bool:
         """True if the result is a (local) optimum to the requested tolerance."""
-        return self in (Status.CONVERGED, Status.SMOOTHED)
+        return self in (Status.CONVERGED, Status.SMOOTHED, Status.RELEASE_FOUND)
 
     @property
     def ended_as_planned(self) -> bool:
@@ -360,7 +361,9 @@ class Design(ShownRecord):
         The optimisation converged, or it used up its budget and found a trajectory other than the
         initial one. The trajectory keeps all limits, and derivatives exist along it.
         """
-        has_moved = not np.array_equal(self.final.trajectory.ctrl, self.initial.trajectory.ctrl)
+        final, initial = self.final.trajectory, self.initial.trajectory
+        same_control = np.array_equal(final.ctrl, initial.ctrl)
+        has_moved = not same_control or not np.array_equal(final.state[0], initial.state[0])
         is_useful = self.status.success or has_moved
         return self.status.ended_as_planned and self.within_limits and is_useful
 

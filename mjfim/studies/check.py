@@ -14,6 +14,7 @@ from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import RecordingError, SimulationDivergedError, first_ones, shortened
 from mjfim.excitation.objective import DesignPoint, DesignProblem
+from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.schema import Experiment
@@ -22,6 +23,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.fit_memory import require_memory_for_recordings
 from mjfim.identification.residuals import FitProblem
 from mjfim.identification.same_data import refuse_same_data
+from mjfim.identification.segments import recorded_release
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability
 from mjfim.information.marginal import shared
@@ -96,7 +98,10 @@ def check_task(
 
     See `check`.
     """
-    curve, source = task.initial, "the initial control" if task.controls else "the initial state"
+    source = "the initial control" if task.controls else "the initial state"
+    if trajectory is not None:
+        task = replace(task.released_as(trajectory.state[0]), release=task.release)
+    curve = task.initial
     if trajectory is not None:
         curve, source = task.plant.simulate(task.theta, trajectory.ctrl), "the given trajectory"
 
@@ -132,7 +137,7 @@ def check_recordings(
     require_memory_for_recordings(system, recordings, fit=False)
     fit = FitProblem.of(system, recordings, data_only=True)
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
-    task = DesignTask.along(system, longest.ctrl[:MAX_TESTED_SAMPLES])
+    task = _task_along(recorded_release(system, longest), system, longest.ctrl[:MAX_TESTED_SAMPLES])
 
     problem, point = _evaluate(task, task.initial)
     if point.information is None or point.sensitivity is None:
@@ -157,6 +162,15 @@ def check_recordings(
             tested=stage.test_derivatives(task, problem, point, identifiability),
             missing=tuple(stage.missing),
         ).check()
+
+
+def _task_along(start: Array, system: System, control: Array) -> DesignTask:
+    """Task along a recorded control: (N, nu), from the release: (ns,) of the recording."""
+    if not system.experiment.initial.free:
+        return DesignTask.along(system, control)
+
+    task = DesignTask.along(system.released(start), control)
+    return replace(task, release=ReleaseSpace.of(system, task.limits))
 
 
 def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:

@@ -133,10 +133,9 @@ def monte_carlo_system(
 
     # Fail before the first trial where a trajectory cannot be simulated.
     for curve in named.values():
-        _exact_outputs(system, curve)
+        _exact_outputs(system.released_as(curve.state[0]), curve)
 
-    first_control = next(iter(named.values())).ctrl
-    system = system.calibrated(system.theta, first_control)
+    systems = _calibrated_systems(system, named)
     generators = np.random.default_rng(seed).spawn(len(named))
 
     sets: dict[str, TrialStatistics] = {}
@@ -145,7 +144,7 @@ def monte_carlo_system(
         budget = Budget(stop=token)
         for i, (name, curve) in enumerate(named.items()):
             progress = _Progress(callback=callback, part=name, index=i, count=len(named))
-            found = _trial_set(system, curve, trials, generators[i], progress, budget)
+            found = _trial_set(systems[name], curve, trials, generators[i], progress, budget)
 
             # An interrupted set holds the trials that are finished.
             if found is not None:
@@ -161,6 +160,21 @@ def monte_carlo_system(
         information=information,
         labels=labels_of_system(system),
     )
+
+
+def _calibrated_systems(system: System, named: Mapping[str, Trajectory]) -> dict[str, System]:
+    """The system of each trajectory by name, with difference steps that suit the first one.
+
+    Trajectories with releases of their own are systems of their own.
+    """
+    first = next(iter(named.values()))
+    if not system.experiment.initial.free:
+        return dict.fromkeys(named, system.calibrated(system.theta, first.ctrl))
+
+    return {
+        name: system.released_as(curve.state[0]).calibrated(system.theta, curve.ctrl)
+        for name, curve in named.items()
+    }
 
 
 def require_memory_for_trials(

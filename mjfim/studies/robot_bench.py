@@ -91,8 +91,9 @@ class RobotBench:
         """
         _require_finite(conditions)
         self.conditions = conditions
-        self.stated = DesignTask.resolve(experiment, threads=1)
-        self.plan = read_playback(table, self.stated.system.channels)
+        stated = DesignTask.resolve(experiment, threads=1)
+        self.plan = read_playback(table, stated.system.channels)
+        self.stated = stated.released_as(self.plan.state[0])
         self.timestep = float(self.stated.system.model.opt.timestep)
 
         duration = float(self.plan.t[-1])
@@ -145,7 +146,8 @@ class RobotBench:
         # Robots are first drawn with the stated unknowns, to find the initial positions that depend
         # on the parameters. These become unknowns of the task for the recordings.
         self.task = self.stated
-        self.task = DesignTask.resolve(self._experiment_of_recordings(experiment), threads=1)
+        recorded = DesignTask.resolve(self._experiment_of_recordings(experiment), threads=1)
+        self.task = recorded.released_as(self.plan.state[0])
 
     # ---- the experiment for the recordings
 
@@ -153,11 +155,14 @@ class RobotBench:
         """Control before the motion begins.
 
         Returns:
-            (nu,) control [unit of the actuator]; None where the experiment begins in motion.
+            (nu,) control [unit of the actuator]; None where the experiment begins in motion, and
+            where there are no actuators.
 
         Raises:
             ExperimentError: The experiment begins in motion, but the conditions have a latency.
         """
+        if not self.stated.controls:
+            return None
         try:
             return self.stated.initial_hold
         except ExperimentError as error:

@@ -129,9 +129,13 @@ def default_latency(experiment: Experiment) -> float:
         experiment: The experiment.
 
     Returns:
-        5 ms, rounded up to whole timesteps of the engine [s].
+        5 ms, rounded up to whole timesteps of the engine [s]; 0 without actuators, because there is
+        no control that could be late.
     """
-    timestep = float(System.resolve(experiment, threads=1).model.opt.timestep)
+    system = System.resolve(experiment, threads=1)
+    if not system.controls:
+        return 0.0
+    timestep = float(system.model.opt.timestep)
     return float(np.ceil(LATENCY / timestep - 1e-6) * timestep)
 
 

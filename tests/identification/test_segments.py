@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -152,7 +153,8 @@ def test_segments_that_are_too_short_are_refused(task: DesignTask) -> None:
 def test_whole_recordings_start_as_stated(task: DesignTask) -> None:
     recordings = [aligned_log(task), aligned_log(task, rows=np.arange(80))]
     start = np.array([0.1, 3.0, 0.0, 0.4])
-    segments = whole_recordings(recordings, start)
+    system = replace(task.system, plant=task.plant.with_initial_state(start))
+    segments = whole_recordings(system, recordings)
     require_rows_covered_once(segments, recordings)
     assert [(p.recording, p.begin, p.samples) for p in segments] == [(0, 0, 200), (1, 0, 79)]
     for p in segments:

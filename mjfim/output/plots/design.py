@@ -361,21 +361,26 @@ def convergence(design: Design) -> Figure:
     slope = np.abs(np.array([row.slope for row in history], dtype=np.float64))
     eigenvalue = np.array([row.min_eigenvalue for row in history], dtype=np.float64)
 
-    # With a barrier the slope is that of log J, which is relative already.
+    # With a barrier the slope is that of log J, which is relative already. The search for a release
+    # has no slope.
     has_barrier = any(row.mu for row in history)
+    has_slope = not history or bool(np.isfinite(slope).any())
     relative_slope = None
-    if not has_barrier:
+    if has_slope and not has_barrier:
         relative_slope = slope / np.where(cost == 0.0, np.nan, np.abs(cost))
 
     figure = new_figure(10.0, 3.3)
-    panels = figure.subplots(1, 3)
+    panels = figure.subplots(1, 3 if has_slope else 2)
     _draw_history(panels[0], iterations, cost)
-    _draw_history(panels[1], iterations, slope, relative_slope)
-    _draw_history(panels[2], iterations, eigenvalue)
+    if has_slope:
+        _draw_history(panels[1], iterations, slope, relative_slope)
+    _draw_history(panels[-1], iterations, eigenvalue)
     _mark_rates(panels, design, iterations)
     _mark_barrier_stages(panels, design, iterations)
 
-    names = ("cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]")
+    names = ["cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]"]
+    if not has_slope:
+        names.pop(1)
     for axes, name in zip(panels, names, strict=True):
         format_axes(axes, "iteration [–]", name)
         axes.xaxis.get_major_locator().set_params(integer=True)
