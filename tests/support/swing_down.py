@@ -22,7 +22,7 @@ SIGMA = 0.002
 MODEL = """
 <mujoco model="swing-down">
   <compiler angle="radian" autolimits="true"/>
-  <option timestep="0.002" integrator="RK4" gravity="0 0 -{gravity}"/>
+  <option timestep="0.004" integrator="RK4" gravity="0 0 -{gravity}"/>
   <worldbody>
     <body name="rod">
       <inertial pos="0 0 -{centre}" mass="{mass}" diaginertia="{inertia} {inertia} {inertia}"/>
@@ -34,13 +34,15 @@ MODEL = """
 """
 
 
-def swing_down(folder: Path, angle: float = 0.5, limits: str = "", **tables: Any) -> Experiment:
+def swing_down(
+    folder: Path, angle: float = 0.5, joint_range: str = "", **tables: Any
+) -> Experiment:
     """Write the model, and return an experiment about its damping and its centre of mass.
 
     Args:
         folder: Folder of the model.
         angle: Angle from which the pendulum is released at rest [rad].
-        limits: Attribute `range` of the hinge, or nothing.
+        joint_range: Attribute `range` of the hinge, or nothing.
         **tables: Further keys and tables of the experiment.
     """
     text = MODEL.format(
@@ -48,7 +50,7 @@ def swing_down(folder: Path, angle: float = 0.5, limits: str = "", **tables: Any
         centre=CENTRE,
         mass=MASS,
         inertia=INERTIA_AT_CENTRE,
-        range=limits,
+        range=joint_range,
         damping=DAMPING,
         length=LENGTH,
     )

@@ -1,0 +1,257 @@
+"""Designs of the release: the initial state within ranges whose motion tells most."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.excitation.release_space import ReleaseSpace
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.model.coordinates import tangent_components
+from mjfim.output.plots.design import convergence, trajectories
+from mjfim.records.design import Status
+from mjfim.studies.monte_carlo import monte_carlo_system
+from tests.support.cli import run
+from tests.support.paths import MODELS
+from tests.support.swing_down import swing_down
+
+HINGE = {"free": {"qpos:hinge": (0.1, 3.1)}}
+
+
+def short(folder: Path, angle: float = 0.5, **tables: Any) -> Experiment:
+    """A swing-down of one second, whose best release is within the range of the angle."""
+    return swing_down(folder, angle, **{"horizon": 1.0, "initial": HINGE, **tables})
+
+
+def cost_of(task: DesignTask, angle: float) -> float:
+    """Cost of a release at rest."""
+    released = task.released_as(np.array([angle, 0.0]))
+    return released.problem.point(released.initial).cost
+
+
+@pytest.mark.slow
+def test_the_designed_release_is_the_best_of_a_fine_grid(tmp_path: Path) -> None:
+    experiment = short(tmp_path)
+    task = DesignTask.resolve(experiment)
+    angles = np.linspace(0.1, 3.1, 61)
+    costs = [cost_of(task, angle) for angle in angles]
+    best = angles[int(np.argmin(costs))]
+    assert 0.1 < best < 3.1
+
+    events = []
+    design = mjfim.design(experiment, callback=events.append)
+    assert design.status is Status.RELEASE_FOUND
+    assert design.sound
+    assert design.final.cost <= min(costs)
+    assert design.trajectory.qpos[0, 0] == pytest.approx(best, abs=0.05)
+    assert design.trajectory.qvel[0, 0] == 0.0
+    assert design.warnings == ()
+
+    # The initial trajectory is that of the stated release, and the improvements lead to the last.
+    assert design.initial.trajectory.qpos[0, 0] == 0.5
+    assert design.initial.cost == pytest.approx(cost_of(task, 0.5))
+    assert [event.row for event in events][0].cost == pytest.approx(design.initial.cost)
+    assert np.all(np.diff([row.cost for row in design.history]) < 0.0)
+    assert design.history[-1].cost == pytest.approx(design.final.cost)
+
+
+@pytest.mark.slow
+def test_a_limit_of_the_velocity_holds_at_every_engine_step(tmp_path: Path) -> None:
+    experiment = short(tmp_path, limits={"velocity": {"hinge": 6.0}})
+    design = mjfim.design(experiment)
+    assert design.success
+    assert 0.0 <= design.limits["velocity"] < 0.01
+
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "swing_down.xml"))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = design.trajectory.qpos[0], design.trajectory.qvel[0]
+    fastest = 0.0
+    while data.time < 1.0 - 1e-9:
+        mujoco.mj_step(model, data)
+        fastest = max(fastest, abs(float(data.qvel[0])))
+    assert 5.9 < fastest <= 6.0
+
+
+def test_an_optimum_at_the_end_of_a_range_is_said(tmp_path: Path) -> None:
+    design = mjfim.design(
+        short(tmp_path, horizon=0.3, initial={"free": {"qpos:hinge": (-1.0, 1.0)}})
+    )
+    assert design.trajectory.qpos[0, 0] == 1.0
+    assert [w for w in design.warnings if "upper end of the range of qpos:hinge, 1 rad" in w]
+    assert design.sound
+
+
+def test_the_ranges_of_the_model_narrow_those_of_the_release(tmp_path: Path) -> None:
+    task = DesignTask.resolve(short(tmp_path, limits={"position": {"hinge": (-2.0, 1.5)}}))
+    assert task.release is not None
+    assert (task.release.lower[0], task.release.upper[0]) == (0.1, 1.5)
+
+    with pytest.raises(
+        ExperimentError, match=r"initial\.free\.qpos:hinge.*outside of the position"
+    ):
+        DesignTask.resolve(short(tmp_path, 0.0, limits={"position": {"hinge": (-1.0, 0.1)}}))
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        ({"hinge": (0.0, 1.0)}, r"initial\.free: .*'hinge'.*qpos:hinge"),
+        ({"qpos:hinge": (1.0, 0.5)}, "lower"),
+        ({}, r"no actuators.*initial\.free.*\"qpos:hinge\" = "),
+    ],
+)
+def test_faults_are_named(free: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match=message):
+        mjfim.design(short(tmp_path, initial={"free": free}))
+
+
+@pytest.mark.slow
+def test_a_pendulum_at_rest_is_released_where_it_moves(tmp_path: Path) -> None:
+    """The stated release tells nothing; position and velocity are chosen together."""
+    free = {"qpos:hinge": (-1.0, 1.0), "qvel:hinge": (-2.0, 2.0)}
+    experiment = short(tmp_path, 0.0, initial={"free": free}, horizon=0.5)
+    design = mjfim.design(experiment)
+    assert design.initial.cost == np.inf
+    assert np.isfinite(design.final.cost)
+    assert abs(design.trajectory.state[0]).max() > 0.5
+
+
+def test_rotations_of_a_free_body_are_relative_to_the_stated_state(tmp_path: Path) -> None:
+    text = (
+        '<mujoco><worldbody><body name="b" pos="0 0 1"><freejoint name="base"/>'
+        '<geom name="g" type="box" size="0.1 0.2 0.3" mass="1"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "box.xml").write_text(text, encoding="utf-8")
+    experiment = Experiment(
+        model="box.xml",
+        rate=100.0,
+        horizon=0.2,
+        initial={
+            "qpos": (0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0),
+            "free": {"qpos:base.z": (1.0, 3.0), "qpos:base.rx": (-0.5, 0.5), "qvel:base.x": (0, 1)},
+        },
+        parameters={"mass": {"target": "body/b:mass"}},
+        noise={"state": 0.01},
+        directory=tmp_path,
+    )
+    system = System.resolve(experiment)
+    space = ReleaseSpace.of(system, ())
+    assert space is not None
+    np.testing.assert_allclose(space.state(np.array([0.0, 0.5, 0.0]))[:7], [0, 0, 1, 0, 1, 0, 0])
+
+    # A rotation of 0.5 rad about the same axis as the stated one, which is half a turn.
+    state = space.state(np.array([1.0, 1.0, 1.0]))
+    expected = [0.0, 0.0, 3.0, np.cos((np.pi + 0.5) / 2), np.sin((np.pi + 0.5) / 2), 0.0, 0.0]
+    np.testing.assert_allclose(state[:7], expected, atol=1e-12)
+    assert state[7] == 1.0
+    names = [c.name for c in tangent_components(system.model)]
+    assert set(space.names) <= set(names)
+
+
+@pytest.mark.slow
+def test_with_actuators_the_stated_control_is_played(tmp_path: Path) -> None:
+    experiment = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
+        horizon=0.5,
+        cost={"tracking": {}},
+        initial={"free": {"qvel:hinge": (-1.0, 1.0)}},
+    )
+    design = mjfim.design(experiment)
+    np.testing.assert_array_equal(design.trajectory.ctrl, design.initial.trajectory.ctrl)
+    assert abs(design.trajectory.qvel[0]).max() > 0.0
+    assert design.final.cost < design.initial.cost
+
+
+def test_a_recording_begins_where_the_design_does(tmp_path: Path) -> None:
+    experiment = short(tmp_path)
+    trajectory = DesignTask.resolve(experiment).released_as(np.array([2.0, 0.0])).initial
+    recording = mjfim.simulate(experiment, trajectory, seed=1)
+    assert recording.y[0, 0] == pytest.approx(2.0, abs=0.02)
+    evaluated = mjfim.evaluate(experiment, trajectory)
+    np.testing.assert_allclose(evaluated.trajectory.qpos, trajectory.qpos)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nuisance", [{}, {"initial": {"qpos:hinge": True}}])
+def test_recordings_from_several_releases_are_identified_together(
+    nuisance: dict[str, Any], tmp_path: Path
+) -> None:
+    true = {"damping": {"true": 0.013}, "centre": {"true": -0.28}}
+    tables = {"horizon": 2.0, "nuisance": nuisance, "fit": {"bootstrap": 0}}
+    experiment = short(tmp_path, **tables).replace(parameters=true)
+    task = DesignTask.resolve(experiment)
+    recordings = []
+    for seed, angle in enumerate((0.7, 1.6, 2.4)):
+        trajectory = task.released_as(np.array([angle, 0.0])).initial
+        recordings.append(mjfim.simulate(experiment, trajectory, seed=seed))
+
+    estimate = mjfim.identify(experiment, recordings)
+    error = np.abs(estimate.theta[:2] - [0.013, -0.28])
+    assert (error < 4.0 * estimate.std[:2]).all()
+    assert not estimate.misfit
+    assert mjfim.check(experiment, recordings).ok
+
+
+@pytest.mark.slow
+def test_estimates_of_a_designed_release_reach_the_cramer_rao_bound(tmp_path: Path) -> None:
+    experiment = short(tmp_path)
+    design = mjfim.design(experiment)
+    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+    study = monte_carlo_system(System.resolve(experiment), curves, trials=100, seed=3)
+    for name, evaluation in (("initial", design.initial), ("final", design.final)):
+        found = study.sets[name]
+        assert found.failed == 0
+        np.testing.assert_allclose(np.sqrt(np.diag(found.crlb)), evaluation.std, rtol=1e-2)
+        assert (found.efficiency_interval[:, 0] < 1.05).all()
+        assert (found.efficiency_interval[:, 1] > 0.95).all()
+
+
+@pytest.mark.slow
+def test_figures_of_a_release_have_no_empty_panel(tmp_path: Path) -> None:
+    design = mjfim.design(short(tmp_path, horizon=0.4))
+    assert design.trajectory.ctrl.shape == (20, 0)
+    for figure in (convergence(design), trajectories(design, design.labels)):
+        for axes in figure.axes:
+            assert axes.lines
+    assert len(convergence(design).axes) == 2
+
+
+FILE = """
+model = "swing_down.xml"
+rate = 50.0
+horizon = 1.0
+initial = { qpos = ["30 deg"], free = { "qpos:hinge" = ["-120 deg", "120 deg"] } }
+parameters.damping = { target = "joint/hinge:damping", guess = 0.012, true = 0.01 }
+parameters.centre = { target = "body/rod:ipos[2]", guess = -0.25, true = -0.3 }
+nuisance.initial = { "qpos:hinge" = true }
+noise = { "qpos:hinge" = 0.002 }
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
+def test_every_verb_follows_the_designed_release(tmp_path: Path) -> None:
+    swing_down(tmp_path)
+    file, log, out = tmp_path / "swing.toml", tmp_path / "log.csv", tmp_path / "out"
+    file.write_text(FILE, encoding="utf-8")
+    for arguments in (
+        ("validate", file),
+        ("design", file, "-o", out),
+        ("simulate", file, out, "-o", log),
+        ("identify", file, log, "-o", tmp_path / "fit"),
+        ("check", file, "--design", out),
+        ("montecarlo", file, out, "-o", tmp_path / "study", "--trials", "4"),
+        ("robustness", file, out, "-o", tmp_path / "robots", "--runs", "1"),
+        ("replay", out, "--save", tmp_path / "replay.rrd"),
+    ):
+        result = run(*arguments)
+        assert result.exit_code == 0, result.output
+    angle = float(log.read_text(encoding="utf-8").splitlines()[1].split(",")[1])
+    assert abs(angle) == pytest.approx(np.deg2rad(120.0), abs=0.02)
