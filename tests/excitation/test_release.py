@@ -58,7 +58,7 @@ def test_the_designed_release_is_the_best_of_a_fine_grid(tmp_path: Path) -> None
     # The initial trajectory is that of the stated release, and the improvements lead to the last.
     assert design.initial.trajectory.qpos[0, 0] == 0.5
     assert design.initial.cost == pytest.approx(cost_of(task, 0.5))
-    assert [event.row for event in events][0].cost == pytest.approx(design.initial.cost)
+    assert events[0].row.cost == pytest.approx(design.initial.cost)
     assert np.all(np.diff([row.cost for row in design.history]) < 0.0)
     assert design.history[-1].cost == pytest.approx(design.final.cost)
 
