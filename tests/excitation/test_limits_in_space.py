@@ -12,6 +12,7 @@ import pytest
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import open_boundary_warnings
 from mjfim.excitation.limits import limits_of
 from mjfim.excitation.magnitudes import Magnitude, VectorBarrier
@@ -20,6 +21,7 @@ from mjfim.excitation.verification import require_feasible_start, verify
 from mjfim.excitation.violations import violations_of
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
+from mjfim.output import plots
 from tests.support.limits import barrier_check
 from tests.support.numerics import Array, make_task
 
@@ -457,3 +459,142 @@ def test_a_start_outside_is_refused_with_its_unit(tmp_path: Path) -> None:
 def test_nothing_is_said_about_joints_that_all_have_the_limit(tmp_path: Path) -> None:
     task = ship_task(tmp_path, limits={"velocity": 9.0, "force": 50.0, "acceleration": 99.0})
     assert [w for w in open_boundary_warnings(task) if "limits." in w] == []
+
+
+# A quadrotor: a box with a thruster at each corner, whose drag turns it about its axis.
+QUADROTOR = """
+<mujoco model="quadrotor">
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="drone" pos="0 0 1" euler="0 0 30">
+      <freejoint name="float"/>
+      <geom type="box" size="0.12 0.12 0.03" mass="0.6" contype="0" conaffinity="0"/>
+      <site name="front" pos="0.15 0.15 0"/>
+      <site name="left" pos="-0.15 0.15 0"/>
+      <site name="back" pos="-0.15 -0.15 0"/>
+      <site name="right" pos="0.15 -0.15 0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="front" site="front" gear="0 0 1 0 0 0.02" ctrlrange="0 4"/>
+    <motor name="left" site="left" gear="0 0 1 0 0 -0.02" ctrlrange="0 4"/>
+    <motor name="back" site="back" gear="0 0 1 0 0 0.02" ctrlrange="0 4"/>
+    <motor name="right" site="right" gear="0 0 1 0 0 -0.02" ctrlrange="0 4"/>
+  </actuator>
+</mujoco>
+"""
+HOVER = 0.6 * 9.81 / 4
+
+
+def flight(folder: Path, **tables: Any) -> DesignTask:
+    """The quadrotor flies for a second; its mass, centre of mass and inertia are unknown."""
+    defaults: dict[str, Any] = {
+        "rate": 50.0,
+        "horizon": 1.0,
+        "parameters": {
+            "mass": {"target": "body/drone:mass"},
+            "centre": {"target": "body/drone:ipos[0]", "scale": 0.01},
+            "inertia": {"target": "body/drone:inertia[0]"},
+        },
+        "noise": {"qpos:float": 0.005, "qvel:float": 0.05},
+        "control": {"kind": "multisine", "amplitude": 0.05, "offset": HOVER},
+        "cost": {"control": 0.0},
+        "descent": {"max_iterations": 25},
+    }
+    return make_task(QUADROTOR, folder, **{**defaults, **tables})
+
+
+def flown(ctrl: Array) -> dict[str, Array]:
+    """Place, speeds and tilt of the quadrotor at every engine step in plain MuJoCo."""
+    model = mujoco.MjModel.from_xml_string(QUADROTOR)
+    data = mujoco.MjData(model)
+    rows: dict[str, list[Any]] = {"place": [], "speed": [], "spin": [], "tilt": []}
+    for held in ctrl:
+        data.ctrl[:] = held
+        for _ in range(4):
+            mujoco.mj_step(model, data)
+            mujoco.mj_kinematics(model, data)
+            rows["place"].append(data.qpos[:3].copy())
+            rows["speed"].append(np.linalg.norm(data.qvel[:3]))
+            rows["spin"].append(np.linalg.norm(data.qvel[3:6]))
+            rows["tilt"].append(np.arccos(min(1.0, data.body("drone").xmat[8])))
+    return {name: np.array(values) for name, values in rows.items()}
+
+
+@pytest.mark.slow
+def test_a_quadrotor_flies_inside_its_box_speeds_and_tilt(tmp_path: Path) -> None:
+    """The initial control leaves them; the design comes near them and keeps them everywhere."""
+    box = np.array([[-0.4, 0.4], [-0.4, 0.4], [0.7, 1.3]])
+    task = flight(
+        tmp_path,
+        limits={
+            "position": {"float": tuple(map(tuple, box.tolist()))},
+            "velocity": 0.8,
+            "angular_velocity": 2.0,
+            "tilt": 0.3,
+        },
+    )
+    before = flown(task.control)
+    assert before["speed"].max() > 1.5
+    assert before["tilt"].max() > 0.3
+
+    design = design_task(task)
+    found = flown(design.final.trajectory.ctrl)
+    assert (found["place"] >= box[:, 0]).all()
+    assert (found["place"] <= box[:, 1]).all()
+    assert found["speed"].max() <= 0.8
+    assert found["spin"].max() <= 2.0
+    assert found["tilt"].max() <= 0.3
+
+    # The limits are used, and the report has one margin and one curve for each of them.
+    assert found["speed"].max() > 0.7
+    assert found["tilt"].max() > 0.2
+    assert design.limits["tilt"] == pytest.approx(0.3 - found["tilt"].max(), abs=1e-9)
+    assert design.limits["velocity"] == pytest.approx(0.8 - found["speed"].max(), abs=1e-9)
+    shown = {(usage.kind, usage.name) for usage in design.usage}
+    assert shown >= {
+        *(("position", f"float.{part}") for part in "xyz"),
+        ("velocity", "float"),
+        ("angular_velocity", "float"),
+        ("tilt", "float"),
+    }
+    said = [str(violation) for violation in design.initial_violations]
+    assert any(text.startswith("tilt of float is 0.3") for text in said)
+
+    titles = [axes.get_title(loc="left") for axes in plots.limits(design).axes]
+    assert any(title.startswith("tilt: smallest margin") for title in titles)
+    assert any(title.startswith("angular velocity: smallest margin") for title in titles)
+
+
+def test_a_falling_body_exceeds_a_single_number_for_velocities(tmp_path: Path) -> None:
+    """One number for all velocities had done nothing on a free body."""
+    still = {"kind": "constant", "amplitude": 0.0}
+    task = flight(tmp_path, limits={"velocity": 1.0}, control=still)
+    found = verify(task, task.initial)
+    assert not found.is_feasible
+    assert found.margins["velocity"] == pytest.approx(1.0 - 9.81 * 1.0, rel=1e-6)
+    (violation,) = violations_of(task, found)
+    assert str(violation) == ("velocity of float is 9.81 m/s at 1 s, above 1 (first at 0.105 s)")
+
+
+def test_angles_may_be_stated_in_degrees(tmp_path: Path) -> None:
+    stated = flight(
+        tmp_path,
+        limits={
+            "tilt": "30 deg",
+            "velocity": {"float": "80 cm/s"},
+            "position": {"float": (("-40 cm", "40 cm"), (-0.4, 0.4), (0.7, 1.3))},
+        },
+    )
+    found = {(limit.kind, limit.name): limit.upper for limit in stated.limits}
+    assert found["tilt", "float"] == pytest.approx(np.pi / 6)
+    assert found["velocity", "float"] == pytest.approx(0.8)
+    assert found["position", "float.x"] == pytest.approx(0.4)
+
+    for limits, key in (
+        ({"tilt": "30 cm"}, "limits.tilt"),
+        ({"position": {"float": (("-4 deg", "4 deg"), (-1.0, 1.0), (0.0, 1.0))}}, "position.float"),
+        ({"angular_velocity": {"float.rz": "1 m/s"}}, r"angular_velocity\.float\.rz"),
+    ):
+        with pytest.raises(ExperimentError, match=key):
+            flight(tmp_path, limits=limits)
