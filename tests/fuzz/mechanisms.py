@@ -90,7 +90,8 @@ class Mechanism:
         links: Its links, from the base to the tip.
         actuators: Its actuators.
         targets: Paths of parameters that may be identified.
-        ranges: Ranges of the MJCF that a design has to keep, by kind and name.
+        ranges: Ranges of the MJCF that a design has to keep, by kind and name; the angle of a ball
+            joint has a symmetric one.
         unheld: Names of elements with a range that a design does not keep, so that it must say so.
         collides: True where geoms may collide.
         can_rest: True where it stands still in the keyframe without a force.
@@ -151,7 +152,9 @@ class _Builder:
         if self.chance(0.03):
             self.features.append("no actuator")
             self.actuators.clear()
-            self.ranges = {k: r for k, r in self.ranges.items() if k[0] in ("position",)}
+            kept = ("position", "tendon_length")
+            self.ranges = {k: r for k, r in self.ranges.items() if k[0] in kept}
+            self.unheld.clear()
             drives = ""
         xml = (
             '<mujoco model="mechanism">\n  <compiler angle="radian" autolimits="true"/>\n'
@@ -270,8 +273,9 @@ class _Builder:
             self.ranges["position", link.name] = about_zero(rng, link.reach)
             attributes["range"] = text_of(self.ranges["position", link.name])
         if link.kind == "ball" and self.chance(0.25):
-            attributes["range"] = f"0 {rng.uniform(0.5, 2.0):.17g}"
-            self.unheld.append(link.name)
+            largest = float(rng.uniform(0.5, 2.0))
+            attributes["range"] = text_of((0.0, largest))
+            self.ranges["position", link.name] = (-largest, largest)
         if link.is_scalar and self.chance(0.2):
             self.ranges["joint_force", link.name] = about_zero(rng, link.effort)
             attributes["actuatorfrcrange"] = text_of(self.ranges["joint_force", link.name])
@@ -308,11 +312,11 @@ class _Builder:
             attributes["frictionloss"] = f"{link.inertia * rng.uniform(0.01, 0.3):.17g}"
         if self.chance(0.35):
             low = -2.0 * link.reach if kind == "fixed" else 0.0
-            attributes["range"] = text_of((low, 2.0 * link.reach))
-            self.unheld.append(name)
+            self.ranges["tendon_length", name] = (low, 2.0 * link.reach)
+            attributes["range"] = text_of(self.ranges["tendon_length", name])
         if self.chance(0.35):
-            attributes["actuatorfrcrange"] = text_of(about_zero(rng, link.effort))
-            self.unheld.append(name)
+            self.ranges["tendon_force", name] = about_zero(rng, link.effort)
+            attributes["actuatorfrcrange"] = text_of(self.ranges["tendon_force", name])
         self.features.append(f"{kind} tendon ({', '.join(attributes)})")
         return f'    <{kind} name="{name}"{words_of(attributes)}>{inner}</{kind}>\n'
 
@@ -333,6 +337,8 @@ class _Builder:
         for name in tendons:
             if self.chance(0.7):
                 self._actuator(f"pull_{name}", "motor", f'tendon="{name}"', first.effort, (1.0,))
+            else:
+                self.ranges.pop(("tendon_force", name), None)
         if self.chance(0.15):
             self._at_site(len(self.links) - 1)
         return "".join(actuator.element for actuator in self.actuators)

@@ -40,10 +40,10 @@ PARTS = {
 
 
 def model_with_force_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a model with a force sensor for each actuator, slide and hinge; nothing else changes.
+    """Compile a model with sensors of forces and lengths; nothing else changes.
 
-    The sensors of the actuators come first, in the order of the actuators; then those of the
-    joints.
+    The sensors show the forces of the actuators, the forces on the slides and hinges, the forces on
+    the tendons and the lengths of the tendons, each in the order of the model.
     """
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
     for actuator in spec.actuators:
@@ -53,6 +53,10 @@ def model_with_force_sensors(spec: mujoco.MjSpec) -> mujoco.MjModel:
     for joint in (joint for joint in spec.joints if joint.type in scalar):
         sensor = spec.add_sensor(type=kinds.mjSENS_JOINTACTFRC, objtype=objects.mjOBJ_JOINT)
         sensor.objname = joint.name
+    for kind in (kinds.mjSENS_TENDONACTFRC, kinds.mjSENS_TENDONPOS):
+        for tendon in spec.tendons:
+            sensor = spec.add_sensor(type=kind, objtype=objects.mjOBJ_TENDON)
+            sensor.objname = tendon.name
     return spec.compile()
 
 
@@ -174,6 +178,88 @@ def read_reference(rows: list[dict[str, float]], ranges: dict[tuple[str, str], R
 
 
 @dataclass(frozen=True, kw_only=True)
+class TurningJoint:
+    """A ball joint or a free joint; the ranges of its speeds and angles are symmetric about 0.
+
+    Attributes:
+        name: Its name.
+        is_free: True for a free joint.
+        q: Its address in qpos.
+        v: Its address in qvel.
+        body: Number of the body that it moves.
+        reference: (3, 3) orientation of the body in its parent, in the reference position.
+        up: (3,) direction in the body that is upward there, against gravity.
+    """
+
+    name: str
+    is_free: bool
+    q: int
+    v: int
+    body: int
+    reference: np.ndarray
+    up: np.ndarray
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, joint: int) -> TurningJoint:
+        """The joint with a number."""
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        body = int(model.jnt_bodyid[joint])
+        upward = -model.opt.gravity if model.opt.gravity.any() else np.array([0.0, 0.0, 1.0])
+        return cls(
+            name=model.joint(joint).name,
+            is_free=int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_FREE),
+            q=int(model.jnt_qposadr[joint]),
+            v=int(model.jnt_dofadr[joint]),
+            body=body,
+            reference=_in_parent(model, data, body),
+            up=data.xmat[body].reshape(3, 3).T @ (upward / np.linalg.norm(upward)),
+        )
+
+    def see(self, data: mujoco.MjData, acceleration: np.ndarray, excess: Excess) -> None:
+        """Compare its motion with its limits, after `mj_kinematics`.
+
+        Args:
+            data: The simulation.
+            acceleration: (nv,) accelerations.
+            excess: The limits.
+        """
+        name = self.name
+        moved, changed = data.qvel[self.v : self.v + 3], acceleration[self.v : self.v + 3]
+        excess.see("velocity", name, float(np.linalg.norm(moved)))
+        excess.see("acceleration", name, float(np.linalg.norm(changed)))
+
+        turned = self.reference.T @ _in_parent(data.model, data, self.body)
+        excess.see("tilt", name, _angle_between(turned @ self.up, self.up))
+        spin = moved
+        if self.is_free:
+            spin = data.qvel[self.v + 3 : self.v + 6]
+            for i, part in enumerate(PLACE):
+                excess.see("position", f"{name}{part}", float(data.qpos[self.q + i]))
+                excess.see("velocity", f"{name}{part}", float(moved[i]))
+                excess.see("acceleration", f"{name}{part}", float(changed[i]))
+        else:
+            # The antisymmetric part of a rotation has the norm of its sine, the trace its cosine.
+            sine = np.linalg.norm(turned - turned.T) / np.sqrt(8.0)
+            angle = np.arctan2(sine, 0.5 * (np.trace(turned) - 1.0))
+            excess.see("position", name, float(angle))
+        excess.see("angular_velocity", name, float(np.linalg.norm(spin)))
+        for i, part in enumerate(TURN):
+            excess.see("angular_velocity", f"{name}{part}", float(spin[i]))
+
+
+def _in_parent(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
+    """(3, 3) orientation of a body in its parent."""
+    parent = data.xmat[model.body_parentid[body]].reshape(3, 3)
+    return parent.T @ data.xmat[body].reshape(3, 3)
+
+
+def _angle_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle between two unit vectors [rad]."""
+    return float(2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b)))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Layout:
     """Names of the columns of design.csv, and where MuJoCo keeps them.
 
@@ -181,6 +267,8 @@ class Layout:
         model: The model.
         drives: Names of the controls.
         scalar: Names of the slides and hinges, with their numbers.
+        turning: The ball and free joints.
+        tendons: Names of the tendons.
         freedoms: Names of the degrees of freedom.
         columns: Columns of qpos, of qvel and of act.
     """
@@ -188,6 +276,8 @@ class Layout:
     model: mujoco.MjModel
     drives: list[str]
     scalar: list[tuple[str, int]]
+    turning: list[TurningJoint]
+    tendons: list[str]
     freedoms: list[str]
     columns: tuple[list[str], list[str], list[str]]
 
@@ -206,6 +296,10 @@ class Layout:
             model=model,
             drives=drives,
             scalar=[(name, i) for name, i in joints if int(model.jnt_type[i]) not in PARTS],
+            turning=[
+                TurningJoint.of(model, i) for _, i in joints if int(model.jnt_type[i]) in PARTS
+            ],
+            tendons=[model.tendon(i).name for i in range(model.ntendon)],
             freedoms=freedoms,
             columns=(
                 positions,
@@ -255,15 +349,26 @@ def _step(
         excess.see("position", name, float(data.qpos[q]))
         excess.see("velocity", name, float(data.qvel[v]))
         excess.see("acceleration", name, float(acceleration[v]))
+    if layout.turning:
+        mujoco.mj_kinematics(model, data)
+    for joint in layout.turning:
+        joint.see(data, acceleration, excess)
 
     after.qpos[:], after.qvel[:], after.act[:] = data.qpos, data.qvel, data.act
     after.ctrl[:] = data.ctrl
     mujoco.mj_forward(model, after)
 
     dofs = [int(model.jnt_dofadr[i]) for _, i in layout.scalar]
-    fields = np.concatenate([data.actuator_force, data.qfrc_actuator[dofs]])
+    pulled = np.zeros(model.ntendon)
+    for i in np.flatnonzero(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)):
+        pulled[model.actuator_trnid[i, 0]] += data.actuator_force[i]
+    fields = np.concatenate(
+        [data.actuator_force, data.qfrc_actuator[dofs], pulled, data.ten_length]
+    )
     limited = [("force", name) for name in layout.drives]
     limited += [("joint_force", name) for name, _ in layout.scalar]
+    limited += [("tendon_force", name) for name in layout.tendons]
+    limited += [("tendon_length", name) for name in layout.tendons]
     for shown in (fields, data.sensordata, after.sensordata):
         for (kind, name), value in zip(limited, shown.tolist(), strict=True):
             excess.see(kind, name, value)

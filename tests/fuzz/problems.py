@@ -221,7 +221,7 @@ def state_some(
 ) -> None:
     """State each limit of a joint or an actuator with a chance."""
     for (kind, value), chance in zip(wanted.items(), chances, strict=True):
-        if rng.random() < chance:
+        if rng.random() < chance and isinstance(limits.get(kind, {}), dict):
             stated = value if isinstance(value, tuple) else float(value)
             limits.setdefault(kind, {})[name] = stated
 

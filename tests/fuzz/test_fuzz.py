@@ -98,24 +98,28 @@ def test_random_mechanisms_compile_with_their_ranges(seed: int) -> None:
     assert (model.njnt, model.nu) == (len(mechanism.links), len(mechanism.actuators))
     for (kind, name), bounds in mechanism.ranges.items():
         if kind == "position":
-            assert tuple(model.joint(name).range) == bounds
+            is_ball = int(model.joint(name).type[0]) == int(mujoco.mjtJoint.mjJNT_BALL)
+            lower = 0.0 if is_ball else bounds[0]
+            assert tuple(model.joint(name).range) == (lower, bounds[1])
         if kind == "force":
             assert tuple(model.actuator(name).forcerange) == bounds
+        if kind == "tendon_length":
+            assert tuple(model.tendon_range[model.tendon(name).id]) == bounds
+        if kind == "tendon_force":
+            assert tuple(model.tendon_actfrcrange[model.tendon(name).id]) == bounds
 
 
 def test_ranges_that_a_design_does_not_mention_are_noticed() -> None:
     rng = np.random.default_rng(18)
     mechanism = random_mechanism(rng)
-    while not mechanism.unheld or all(link.is_scalar for link in mechanism.links):
+    while not mechanism.unheld:
         mechanism = random_mechanism(rng)
-    tables = {"limits": {"velocity": 1.0}}
 
     silent: Any = SimpleNamespace(warnings=())
-    names = {*mechanism.unheld, *(k.name for k in mechanism.links if not k.is_scalar)}
-    found = "; ".join(omissions(mechanism, tables, silent))
-    assert [name for name in names if name not in found] == []
-    told: Any = SimpleNamespace(warnings=(f"limits.velocity does not apply to {' '.join(names)}",))
-    assert omissions(mechanism, tables, told) == []
+    found = "; ".join(omissions(mechanism, silent))
+    assert [name for name in mechanism.unheld if name not in found] == []
+    told: Any = SimpleNamespace(warnings=(f"ranges of {' '.join(mechanism.unheld)}",))
+    assert omissions(mechanism, told) == []
 
 
 @pytest.mark.parametrize("make", [make for make, _ in FAULTS if make is not packed_bomb])
@@ -259,6 +263,70 @@ def test_the_player_measures_distances() -> None:
             limit = {("clearance", NEAREST): (least, 2.0 * least)}
             found = play(model, floating_rows(), limit, period=0.1)
             assert bool(found.sentences(ROUNDING)) is is_violated
+
+
+# A body on a free joint with another one on a ball joint and a tendon to the world. They move at
+# constant speeds; the hull turns about z by 0.6 rad, which is no tilt, the mast about x.
+TUMBLING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody>
+<site name="post" pos="3 0 0"/>
+<body name="hull" pos="1 0 0"><freejoint name="free"/><geom size="0.1" mass="1"/>
+<body name="mast"><joint name="ball" type="ball"/><geom size="0.1" mass="1"/>
+<site name="tip"/></body></body></worldbody>
+<tendon><spatial name="rope"><site site="post"/><site site="tip"/></spatial></tendon>
+<actuator><motor name="pull" tendon="rope"/><motor name="help" tendon="rope"/></actuator>
+</mujoco>"""
+
+# Largest values within 0.2 s without forces. Both bodies turn about their common centre of mass.
+LARGEST_IN_SPACE = {
+    ("position", "free.x"): 1.0,
+    ("position", "free.y"): 0.1,
+    ("position", "ball"): 0.4,
+    ("velocity", "free"): 0.5,
+    ("velocity", "free.y"): 0.5,
+    ("velocity", "ball"): 2.0,
+    ("angular_velocity", "free"): 3.0,
+    ("angular_velocity", "free.rz"): 3.0,
+    ("angular_velocity", "ball"): 2.0,
+    ("tilt", "ball"): 0.4,
+    ("tendon_length", "rope"): float(np.hypot(2.0, 0.1)),
+}
+
+
+@pytest.mark.parametrize("limit", LARGEST_IN_SPACE)
+def test_the_player_notices_every_kind_of_violation_in_space(limit: tuple[str, str]) -> None:
+    """A limit just above the largest value holds; just below it is violated."""
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(TUMBLING))
+    names = [f"free{part}" for part in (*PLACE, *TURN)] + [f"ball{part}" for part in TURN]
+    row = {f"qvel:{name}": 0.0 for name in names} | {"ctrl:pull": 0.0, "ctrl:help": 0.0}
+    row |= {f"qpos:free{part}": 0.0 for part in (*PLACE, *QUATERNION)}
+    row |= {f"qpos:ball{part}": 0.0 for part in QUATERNION}
+    row |= {"qpos:free.x": 1.0, "qpos:free.qw": 1.0, "qpos:ball.qw": 1.0}
+    moving = {"qvel:free.y": 0.5, "qvel:free.rz": 3.0}
+    if limit[1] == "ball":
+        moving = {"qvel:ball.rx": 2.0}
+    rows = [{**row, **moving, "t": 0.0}, {**row, "t": 0.2}]
+
+    for factor, is_violated in ((1.0001, False), (0.9999, True)):
+        bound = factor * LARGEST_IN_SPACE[limit]
+        found = play(model, rows, {limit: (-bound, bound)}, period=0.2)
+        assert bool(found.sentences(ROUNDING)) is is_violated
+
+
+def test_the_player_adds_the_forces_on_a_tendon_and_sees_no_tilt_of_a_turn_about_z() -> None:
+    model = model_with_force_sensors(mujoco.MjSpec.from_string(TUMBLING))
+    names = [f"free{part}" for part in (*PLACE, *TURN)] + [f"ball{part}" for part in TURN]
+    row = {f"qvel:{name}": 0.0 for name in names} | {"ctrl:pull": 2.0, "ctrl:help": -0.5}
+    row |= {f"qpos:free{part}": 0.0 for part in (*PLACE, *QUATERNION)}
+    row |= {f"qpos:ball{part}": 0.0 for part in QUATERNION}
+    row |= {"qpos:free.qw": 1.0, "qpos:ball.qw": 1.0, "qvel:free.rz": 3.0}
+    rows = [{**row, "t": 0.0}, {**row, "t": 0.1}]
+    for limit, bound, is_violated in (
+        (("tendon_force", "rope"), 1.501, False),
+        (("tendon_force", "rope"), 1.499, True),
+        (("tilt", "free"), 1e-6, False),
+    ):
+        found = play(model, rows, {limit: (-bound, bound)}, period=0.1)
+        assert bool(found.sentences(ROUNDING)) is is_violated
 
 
 def test_a_state_that_is_not_a_number_is_a_violation() -> None:
