@@ -40,6 +40,12 @@ NUMERIC = re.compile(r"(float|int|uint)(8|16|32|64)|bool")
 # Largest number of names in a list of a feature; more are not components of a state.
 MAX_COMPONENTS = 4096
 
+# Largest number of episodes that are listed without a choice; more would take days to fit.
+MAX_EPISODES = 10_000
+
+# Deepest nesting of the lists of names.
+MAX_DEPTH = 3
+
 # Errors that pyarrow raises for a damaged file.
 DAMAGED = (pyarrow.ArrowException, OSError, EOFError, ValueError)
 
@@ -84,13 +90,17 @@ def lerobot_episodes(path: Path, spec: RecordingSpec) -> list[Path]:
     Raises:
         RecordingError: The dataset cannot be read, or a chosen episode does not exist.
     """
-    count = _count(path, read_json(path / INFO_FILE), "total_episodes")
+    count = _count(path, _read_info(path), "total_episodes")
     for episode in spec.episodes:
         if episode >= count:
             raise RecordingError(
                 f"{path}: recording.episodes: there is no episode {episode}; the dataset has the "
                 f"episodes 0 to {count - 1}"
             )
+    if not spec.episodes and count > MAX_EPISODES:
+        raise RecordingError(
+            f"{path}: has {count} episodes; choose some of them by recording.episodes"
+        )
     return [path / f"episode_{episode:06d}" for episode in spec.episodes or range(count)]
 
 
@@ -120,14 +130,14 @@ def read_lerobot(path: Path, spec: RecordingSpec) -> Table:
 
     named = lerobot_episode(path)
     folder, episode = named or (path, _only_episode(path, spec))
-    info = read_json(folder / INFO_FILE)
+    info = _read_info(folder)
     features = _features(folder, info)
     wanted = [EPISODE_COLUMN, "timestamp", "frame_index", *features]
     rows = _episode_rows(folder, _version(folder, info), episode, wanted)
     if not rows.num_rows:
         raise RecordingError(f"{folder}: has no frame of episode {episode}")
 
-    columns: dict[str, Array] = {"t": _times(folder, info, rows)}
+    columns: dict[str, Array] = {}
     faults: dict[str, str] = {}
     for feature, names in features.items():
         values = _matrix(rows, feature, len(names))
@@ -135,7 +145,16 @@ def read_lerobot(path: Path, spec: RecordingSpec) -> Table:
             faults |= dict.fromkeys(names, f"{NOT_NUMERIC}, or not {len(names)} numbers per frame")
         else:
             columns |= dict(zip(names, values.T, strict=True))
+    columns["t"] = _times(folder, info, rows)
     return Table(source=path, columns=columns, faults=faults, unit_hint=UNIT_HINT)
+
+
+def _read_info(folder: Path) -> dict[str, Any]:
+    """The contents of info.json."""
+    try:
+        return read_json(folder / INFO_FILE)
+    except RecursionError:
+        raise RecordingError(f"{folder}: {INFO_FILE}: nested too deeply") from None
 
 
 def _only_episode(path: Path, spec: RecordingSpec) -> int:
@@ -201,19 +220,20 @@ def _names(feature: str, stated: Any, count: int) -> list[str]:
     return [feature] if count == 1 else [f"{feature}[{i}]" for i in range(count)]
 
 
-def _flat(stated: Any) -> Iterator[str]:
+def _flat(stated: Any, depth: int = 0) -> Iterator[str]:
     """Names inside lists, and inside the lists of a table such as `{motors = [...]}`."""
+    if depth > MAX_DEPTH:
+        return
     if isinstance(stated, str):
         yield stated
     elif isinstance(stated, list):
         for part in stated:
-            yield from _flat(part)
+            yield from _flat(part, depth + 1)
     elif isinstance(stated, Mapping):
         # A table of numbers gives the place of each name.
         is_places = all(isinstance(value, int) for value in stated.values())
-        yield from _flat(
-            sorted(stated, key=stated.__getitem__) if is_places else [*stated.values()]
-        )
+        inner = sorted(stated, key=stated.__getitem__) if is_places else [*stated.values()]
+        yield from _flat(inner, depth + 1)
 
 
 def _episode_rows(folder: Path, version: int, episode: int, names: Sequence[str]) -> Any:
