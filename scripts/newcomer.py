@@ -247,19 +247,25 @@ def violations(
     unclamped = copy.copy(model)
     unclamped.actuator_forcelimited[:] = 0
     unclamped.jnt_actfrclimited[:] = 0
+    unclamped.tendon_actfrclimited[:] = 0
     data, shown = mujoco.MjData(model), mujoco.MjData(unclamped)
     data.qpos[:], data.qvel[:] = trajectory["qpos"][0], trajectory["qvel"][0]
     data.act[:] = trajectory["act"][0]
     times, worst = trajectory["t"], dict[str, tuple[float, float]]()
 
+    def look() -> None:
+        """Compare the present state with all limits."""
+        for name, excess in _excesses(model, unclamped, (data, shown), stated):
+            if excess > worst.get(name, (ROUNDING, 0.0))[0] or np.isnan(excess):
+                worst[name] = (excess, float(data.time))
+
     for k, ctrl in enumerate(trajectory["ctrl"]):
         data.ctrl[:] = ctrl
         steps = round((times[k + 1] - times[k]) / model.opt.timestep)
         for _ in range(steps):
-            for name, excess in _excesses(model, unclamped, (data, shown), stated):
-                if excess > worst.get(name, (ROUNDING, 0.0))[0] or np.isnan(excess):
-                    worst[name] = (excess, float(data.time))
+            look()
             mujoco.mj_step(model, data)
+        look()
     return [
         f"{name} by {100.0 * excess:.3g} % of half its range at {moment:.3g} s"
         for name, (excess, moment) in worst.items()
@@ -275,9 +281,20 @@ def _excesses(
     shown.ctrl[:] = data.ctrl
     mujoco.mj_forward(unclamped, shown)
 
+    yield from _joints(model, simulations, stated)
+    yield from _tendons(model, shown)
+    yield from _actuators(model, simulations, stated)
+
+
+def _joints(
+    model: Any, simulations: tuple[Any, Any], stated: Mapping[str, Any]
+) -> Iterator[tuple[str, float]]:
+    """Name and excess of positions, velocities and forces of joints."""
+    data, shown = simulations
     scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     for i in range(model.njnt):
         if int(model.jnt_type[i]) not in scalar:
+            yield from _ball(model, data, i)
             continue
         name, v = model.joint(i).name or str(i), int(model.jnt_dofadr[i])
         if model.jnt_limited[i]:
@@ -290,6 +307,35 @@ def _excesses(
             ends = bound if isinstance(bound, list) else (-bound, bound)
             yield f"velocity of {name}", _excess(data.qvel[v], ends)
 
+
+def _ball(model: Any, data: Any, joint: int) -> Iterator[tuple[str, float]]:
+    """Name and excess of the angle of a ball joint."""
+    if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_BALL) and model.jnt_limited[joint]:
+        first = int(model.jnt_qposadr[joint])
+        w, *xyz = data.qpos[first : first + 4]
+        angle = 2.0 * np.arctan2(np.linalg.norm(xyz), abs(w))
+        name = model.joint(joint).name or str(joint)
+        yield f"angle of {name}", _excess(angle, (-np.inf, float(model.jnt_range[joint].max())))
+
+
+def _tendons(model: Any, shown: Any) -> Iterator[tuple[str, float]]:
+    """Name and excess of lengths of tendons, and of the sums of the forces on them."""
+    on_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    for i in range(model.ntendon):
+        name = model.tendon(i).name or str(i)
+        if model.tendon_limited[i]:
+            yield f"length of {name}", _excess(shown.ten_length[i], model.tendon_range[i])
+        if model.tendon_actfrclimited[i]:
+            outputs = model.actuator_outadr[on_tendon & (model.actuator_trnid[:, 0] == i)]
+            force = shown.actuator_force[outputs] @ model.actuator_gear[outputs, 0]
+            yield f"force on {name}", _excess(force, model.tendon_actfrcrange[i])
+
+
+def _actuators(
+    model: Any, simulations: tuple[Any, Any], stated: Mapping[str, Any]
+) -> Iterator[tuple[str, float]]:
+    """Name and excess of controls and of forces of actuators with one control."""
+    data, shown = simulations
     for i in range(model.nactuator):
         name = model.actuator(i).name or str(i)
         control, force = int(model.actuator_ctrladr[i]), int(model.actuator_outadr[i])
@@ -306,9 +352,13 @@ def _excesses(
 
 
 def _excess(value: float, ends: Sequence[float]) -> float:
-    """Excess of a value beyond a range, as a fraction of half of the range; negative inside."""
+    """Excess of a value beyond a range, as a fraction of half of the range; negative inside.
+
+    With an upper end alone, it is a fraction of this end.
+    """
     low, high = ends
-    return float(max(low - value, value - high) / (0.5 * (high - low)))
+    size = 0.5 * (high - low) if np.isfinite(low) else high
+    return float(max(low - value, value - high) / size)
 
 
 def _names(models: Sequence[Path]) -> list[str]:

@@ -50,6 +50,42 @@ def test_the_judge_sees_each_kind_of_limit() -> None:
     assert {"force of servo", "control of servo", "position of hinge"} == kinds
 
 
+def test_the_judge_sees_ball_joints_and_tendons() -> None:
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco>
+      <option timestep="0.01" gravity="0 0 0"/>
+      <worldbody>
+        <body><joint name="ball" type="ball" limited="true" range="0 30" damping="1"/>
+          <geom size="0.1" mass="1" pos="0.5 0 0"/></body>
+        <body pos="3 0 0"><joint name="slide" type="slide" damping="1"/>
+          <geom size="0.1" mass="1"/></body>
+      </worldbody>
+      <tendon><fixed name="rope" limited="true" range="-0.2 0.2" actuatorfrcrange="-0.5 0.5"
+        actuatorfrclimited="true"><joint joint="slide" coef="1"/></fixed></tendon>
+      <actuator><motor name="turn" joint="ball" gear="0 1 0"/>
+        <motor name="pull" tendon="rope" gear="2"/></actuator>
+    </mujoco>
+    """)
+    t = 0.01 * np.arange(301)
+    start = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+
+    def found(turn: float, pull: float) -> set[str]:
+        """Kinds of violations under constant controls."""
+        trajectory = {
+            "t": t,
+            "qpos": np.tile(start, (301, 1)),
+            "qvel": np.zeros((301, 4)),
+            "act": np.zeros((301, 0)),
+            "ctrl": np.tile([turn, pull], (300, 1)),
+        }
+        return {text.split(" by ")[0] for text in violations(model, trajectory, {})}
+
+    assert found(0.01, 0.01) == set()
+    assert found(0.6, 0.01) == {"angle of ball"}
+    assert found(0.01, 0.2) == {"length of rope"}
+    assert found(0.01, 0.3) == {"length of rope", "force on rope"}
+
+
 def test_the_table_has_a_row_for_each_model() -> None:
     done = Walk(
         model="arm",
