@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
 from mjfim.excitation.holding_control import holding_control, least_drift_control
+from tests.support.numerics import make_task
 from tests.support.stiff_servos import START, stiff_arm_task
 
 # A servo that holds the arm is this far from the angle, because the arm is heavy [rad].
@@ -33,3 +35,39 @@ def test_a_stiff_servo_is_found_that_holds_a_state_far_from_the_guess(
         task.system, start, np.array([3.0, 3.0]), key="boundary.start", place="the start"
     )
     assert np.allclose(found, hold, atol=1e-9)
+
+
+BOX = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1" solref="0.005 1"/>
+    <body name="box" pos="0 0 0.1">
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+      <geom type="box" size="0.1 0.1 0.1" mass="10" solref="0.005 1" friction="0.01"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="x" ctrlrange="-5 5"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_contact_that_a_longer_timestep_softens_holds_the_start_all_the_same(
+    tmp_path: Path,
+) -> None:
+    model = mujoco.MjModel.from_xml_string(BOX)
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 2000)
+    task = make_task(
+        BOX,
+        tmp_path,
+        rate=50.0,
+        horizon=1.0,
+        initial={"qpos": data.qpos.tolist(), "control": {"kind": "constant", "amplitude": 1.0}},
+        parameters={"mass": {"target": "body/box:mass"}},
+        noise={"state": 0.01},
+        boundary={"start": "rest", "velocity": 1e-3},
+    )
+    assert task.initial_hold == pytest.approx([0.0], abs=1e-6)
+    assert task.stretched(10).initial_hold == pytest.approx([0.0], abs=1e-6)
