@@ -18,6 +18,12 @@ from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
 from mjfim.identification.fit_quality import FitQuality, fit_quality
+from mjfim.identification.flipped_signs import (
+    POOR_FIT,
+    flipped_signs,
+    sentence_about_signs,
+    sufficient_squares,
+)
 from mjfim.identification.missing_terms import find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
@@ -87,6 +93,7 @@ class _Findings:
         outside: True where a parameter is beyond a bound.
         interrupted: True after a request to stop.
         unpredictable: A motion that is too unstable for the segments of a poor fit, or None.
+        flipped: Signals whose sign looks flipped, in words.
     """
 
     result: FitResult
@@ -98,6 +105,7 @@ class _Findings:
     outside: bool
     interrupted: bool
     unpredictable: UnpredictableMotion | None
+    flipped: tuple[str, ...]
 
 
 def estimate_from(result: FitResult, budget: Budget) -> Estimate:
@@ -144,6 +152,7 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
         outside=outside,
         interrupted=budget.stop.requested,
         unpredictable=_unpredictable(result, bool(reasons or quality.unexplained)),
+        flipped=_flipped_signs(result, quality, budget),
     )
     return _estimate(findings, predictions)
 
@@ -177,6 +186,23 @@ def _missing_terms(
     problem = result.problem.of_segments(result.subset)
     missing = find_missing_terms(problem, result.task.recordings, result.subset, at)
     return () if budget.stop.requested else missing
+
+
+def _flipped_signs(result: FitResult, quality: FitQuality, budget: Budget) -> tuple[str, ...]:
+    """Signals whose sign looks flipped; only a very poor fit can have any."""
+    noise_is_stated = result.task.noise_is_stated
+    is_poor = noise_is_stated and quality.chi2 > POOR_FIT * quality.dof
+    if budget.stop.requested or not (is_poor or quality.unexplained):
+        return ()
+
+    unknowns = result.solution.unknowns
+    at = replace(unknowns, private=unknowns.private[result.subset])
+    problem = result.problem.of_segments(result.subset)
+    squares = 2.0 * problem.cost(at)
+    enough = sufficient_squares(squares, problem.value_count, noise_is_stated=noise_is_stated)
+    return flipped_signs(
+        result.task, result.problem, enough, result.subset, result.null_space, budget
+    )
 
 
 def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
@@ -278,6 +304,8 @@ def _fitted_recordings(result: FitResult) -> tuple[Recording, ...]:
 def _warnings(findings: _Findings) -> Iterator[str]:
     """Sentences that a user should read besides the numbers, the most serious ones first."""
     result = findings.result
+    if findings.flipped:
+        yield sentence_about_signs(findings.flipped)
     yield from _warnings_of_search(findings)
     yield from _warnings_of_misfit(findings)
     yield from _warnings_of_recordings(findings)
