@@ -29,6 +29,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_recording
 from mjfim.output.campaign_folder import CampaignFolder, accuracy_sentence
+from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.campaign_settings import (
     campaign_settings,
     require_same_settings,
@@ -101,7 +102,8 @@ def campaign(
     warning = run.folder.write_campaign(found, simulated=simulated)
     if warning:
         errors.print(f"warning: {warning}", markup=False)
-    out.print(render(describe_campaign(found, run.task.parameters, simulated=simulated)))
+    parameters = CampaignParameters.stated(run.task.parameters, simulated=simulated)
+    out.print(render(describe_campaign(found, parameters)))
     if found.status is CampaignStatus.WAITING:
         waiting = run.folder.round(run.folder.designed)
         out.print(

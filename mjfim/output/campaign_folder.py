@@ -19,6 +19,7 @@ from mjfim.experiment.system import System
 from mjfim.interruption import run_optional
 from mjfim.output import plots
 from mjfim.output.archive import check_fits, write_design
+from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.campaign_settings import SETTINGS_FILE
 from mjfim.output.folders import DESIGN_ARCHIVE, IDENTIFIED, parts_of_identified
 from mjfim.output.mjcf.write import write_identified
@@ -252,7 +253,8 @@ class CampaignFolder:
 
     def _write_figure(self, campaign: Campaign, *, simulated: bool) -> None:
         """Write campaign.png."""
-        figure = plots.campaign_figure(campaign, self.system.parameters, simulated=simulated)
+        parameters = CampaignParameters.stated(self.system.parameters, simulated=simulated)
+        figure = plots.campaign_figure(campaign, parameters)
         plots.save(figure, self.path / "campaign.png")
 
     def _summary(self, campaign: Campaign, *, simulated: bool) -> dict[str, Any]:

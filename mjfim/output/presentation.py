@@ -9,7 +9,9 @@ from functools import singledispatch
 
 from mjfim.errors import MjfimError
 from mjfim.output import html
+from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.labels import complete_labels
+from mjfim.output.summaries.campaign import describe_campaign
 from mjfim.output.summaries.check import describe_check
 from mjfim.output.summaries.comparison import describe_comparison
 from mjfim.output.summaries.design import describe_design
@@ -17,6 +19,7 @@ from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summaries.monte_carlo import describe_study
 from mjfim.output.summaries.robustness import describe_robustness
 from mjfim.output.summary_parts import Summary
+from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
@@ -55,6 +58,14 @@ def _(record: Design) -> Summary:
 def _(record: MonteCarloStudy) -> Summary:
     """Describe a Monte Carlo study."""
     return describe_study(record, complete_labels(record).parameter_units)
+
+
+@describe.register
+def _(record: Campaign) -> Summary:
+    """Describe a campaign; before its first round, only how it ended."""
+    if not record.rounds:
+        return Summary(title="Campaign", outcome=str(record), parts=(), warnings=record.warnings)
+    return describe_campaign(record, CampaignParameters.recorded(record))
 
 
 describe.register(Check, describe_check)

@@ -14,7 +14,7 @@ from mjfim.errors import first_ones
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
-from mjfim.records.serialization import SavedRecord
+from mjfim.records.shown import ShownRecord
 
 
 class CampaignStatus(Enum):
@@ -102,7 +102,7 @@ class Round:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Campaign(SavedRecord):
+class Campaign(ShownRecord):
     """Result of a campaign: all rounds.
 
     Attributes:

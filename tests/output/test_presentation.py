@@ -95,7 +95,22 @@ def robustness() -> Robustness:
     )
 
 
-@pytest.fixture(params=["check", "design", "estimate", "comparison", "study", "robustness"])
+@pytest.fixture(scope="module")
+def campaign(experiment: mjfim.Experiment) -> mjfim.Campaign:
+    """One round."""
+    wanted = experiment.replace(parameters={"m": {"wanted": 1e-6}}, descent={"max_iterations": 0})
+
+    def measure(design: Design, number: int) -> mjfim.Recording:
+        """Simulate a recording."""
+        return mjfim.simulate(wanted, design.trajectory, seed=number)
+
+    return mjfim.run_campaign(wanted, measure, rounds=1)
+
+
+RESULTS = ["check", "design", "estimate", "comparison", "study", "robustness", "campaign"]
+
+
+@pytest.fixture(params=RESULTS)
 def record(request: pytest.FixtureRequest) -> ShownRecord:
     """Each kind of result in turn."""
     found: ShownRecord = request.getfixturevalue(request.param)
@@ -132,6 +147,14 @@ def test_a_figure_is_drawn_and_shown_as_png(record: ShownRecord) -> None:
 def test_an_unknown_figure_is_an_error_that_lists_the_names(design: Design) -> None:
     with pytest.raises(MjfimError, match=r"trajectorys.*did you mean 'trajectories'"):
         design.plot("trajectorys")
+
+
+def test_a_campaign_before_its_first_round_is_shown_in_words(campaign: mjfim.Campaign) -> None:
+    begun = replace(campaign, rounds=())
+    assert "Campaign" in texts(begun._repr_html_())
+    assert begun.pictures == ()
+    with pytest.raises(MjfimError, match="no results yet"):
+        begun.plot()
 
 
 def test_figures_have_the_names_of_the_files_that_verbs_write(

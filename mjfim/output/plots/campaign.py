@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from mjfim.model.parameters import ParameterSet
+from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.plots import style
 from mjfim.records.campaign import Campaign
 
@@ -23,24 +23,23 @@ TICK_DIGITS = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8))
 
 
 @style.own_style
-def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: bool) -> Figure:
+def campaign_figure(campaign: Campaign, parameters: CampaignParameters) -> Figure:
     """Draw standard deviation and estimate of each parameter over the rounds.
 
     Args:
         campaign: The campaign.
-        parameters: The parameters of the experiment.
-        simulated: True where the true values are known.
+        parameters: Its parameters.
     """
     shown = _shown_parameters(campaign, parameters)
     figure = style.new_figure(9.0, 1.2 + 1.75 * len(shown))
     panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
     for (left, right), j in zip(panels, shown, strict=True):
         name = style.shorten(parameters.names[j], PARAMETER_NAME_WIDTH)
-        unit = parameters.parameters[j].unit or "model unit"
+        unit = parameters.units[j] or "model unit"
         style.format_axes(left, ylabel=f"σ of {name} [{unit}]")
         style.format_axes(right, ylabel=f"{name} [{unit}]")
 
-        true = float(parameters.true[j]) if simulated else None
+        true = None if parameters.true is None else float(parameters.true[j])
         _draw_std(left, campaign, j)
         _draw_estimate(right, campaign, j, true)
 
@@ -56,14 +55,14 @@ def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: 
         f"{style.as_sentence(campaign.status.value)} Bars, and the band of the last round: ± 1 "
         "and ± 2 formal σ, which are the true accuracy only if the model and the noise are right."
     )
-    style.add_title(figure, title, _handles(simulated=simulated), note)
+    style.add_title(figure, title, _handles(simulated=parameters.true is not None), note)
     return figure
 
 
-def _shown_parameters(campaign: Campaign, parameters: ParameterSet) -> list[int]:
+def _shown_parameters(campaign: Campaign, parameters: CampaignParameters) -> list[int]:
     """Return the numbers of the parameters that are drawn, those with a target accuracy first."""
     has_target = np.isfinite(campaign.wanted)
-    order = sorted(parameters.interest.tolist(), key=lambda j: not has_target[j])
+    order = sorted(parameters.interest, key=lambda j: not has_target[j])
     return order[:MAX_PARAMETERS]
 
 

@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 
 from mjfim.errors import MjfimError, unknown
 from mjfim.output import plots
+from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.labels import complete_labels
+from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
@@ -43,6 +45,9 @@ def draw(record: ShownRecord, picture: str | None = None) -> Figure:
         MjfimError: The record has no such figure.
     """
     pictures = pictures_of(record)
+    if not pictures:
+        raise MjfimError(f"this {type(record).__name__} has no results yet that can be drawn")
+
     name = next(iter(pictures)) if picture is None else picture
     if name not in pictures:
         raise MjfimError(unknown(f"picture of a {type(record).__name__}", name, pictures))
@@ -123,6 +128,15 @@ def _(comparison: Comparison) -> Pictures:
 def _(result: Robustness) -> Pictures:
     """The figure of a robustness study."""
     return {"playback": partial(plots.robustness_figure, result)}
+
+
+@pictures_of.register
+def _(campaign: Campaign) -> Pictures:
+    """The figure of a campaign; none before its first round."""
+    if not campaign.rounds:
+        return {}
+    parameters = CampaignParameters.recorded(campaign)
+    return {"campaign": partial(plots.campaign_figure, campaign, parameters)}
 
 
 def fit_names(count: int) -> tuple[str, ...]:

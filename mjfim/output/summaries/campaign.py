@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.model.parameters import ParameterSet
+from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.summary_parts import Emphasis, Paragraph, Row, Summary, SummaryTable, columns
 from mjfim.records.campaign import Campaign
 from mjfim.records.estimate import Estimate
 
 
-def describe_campaign(campaign: Campaign, parameters: ParameterSet, *, simulated: bool) -> Summary:
+def describe_campaign(campaign: Campaign, parameters: CampaignParameters) -> Summary:
     """Describe the estimate after the last round of a campaign.
 
     Args:
         campaign: The campaign.
-        parameters: The parameters of the experiment.
-        simulated: True if the recordings were simulated at the true values.
+        parameters: Its parameters.
 
     Returns:
         The estimates and the status; before the first estimate, the status alone.
@@ -26,12 +25,12 @@ def describe_campaign(campaign: Campaign, parameters: ParameterSet, *, simulated
         return Summary(title="Campaign", outcome="", parts=(status,))
 
     headings = ["parameter", "guess", "estimate", "formal σ", "wanted σ"]
-    if simulated:
+    if parameters.true is not None:
         headings.append("error")
 
     rows = []
-    for j in parameters.interest.tolist():
-        true = float(parameters.true[j]) if simulated else None
+    for j in parameters.interest:
+        true = None if parameters.true is None else float(parameters.true[j])
         rows.append(_campaign_row(campaign, campaign.estimate, parameters, j=j, true=true))
 
     table = SummaryTable(
@@ -43,7 +42,7 @@ def describe_campaign(campaign: Campaign, parameters: ParameterSet, *, simulated
 def _campaign_row(
     campaign: Campaign,
     estimate: Estimate,
-    parameters: ParameterSet,
+    parameters: CampaignParameters,
     *,
     j: int,
     true: float | None,
