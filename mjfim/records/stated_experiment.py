@@ -48,15 +48,17 @@ class StatedLimit:
 
     Attributes:
         quantity: What is limited, as the key of the table `limits`.
-        name: Name of the joint or the actuator.
+        name: Name of the joint, the actuator or the tendon.
         lower: Lower bound [unit of the quantity].
         upper: Upper bound [unit of the quantity].
+        unit: Unit of the quantity; empty where the model does not determine it.
     """
 
     quantity: str
     name: str
     lower: float
     upper: float
+    unit: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,7 +62,13 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
         ),
         controls=system.controls,
         limits=tuple(
-            StatedLimit(quantity=limit.kind, name=limit.name, lower=limit.lower, upper=limit.upper)
+            StatedLimit(
+                quantity=limit.kind,
+                name=limit.name,
+                lower=limit.lower,
+                upper=limit.upper,
+                unit=limit.unit,
+            )
             for limit in limits
         ),
         missing=tuple(missing),

@@ -10,10 +10,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjfim.cli.robustness import tightened
 from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import open_boundary_warnings
+from mjfim.excitation.interior_problem import InteriorProblem
 from mjfim.excitation.limits import limits_of
 from mjfim.excitation.magnitudes import Magnitude, VectorBarrier
 from mjfim.excitation.task import DesignTask
@@ -22,6 +24,9 @@ from mjfim.excitation.violations import violations_of
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names
 from mjfim.output import plots
+from mjfim.output.summaries.stated_experiment import describe_experiment
+from mjfim.output.summary_parts import SummaryTable
+from mjfim.studies.stated_experiment import stated_experiment
 from tests.support.limits import barrier_check
 from tests.support.numerics import Array, make_task
 
@@ -564,6 +569,103 @@ def test_a_quadrotor_flies_inside_its_box_speeds_and_tilt(tmp_path: Path) -> Non
     titles = [axes.get_title(loc="left") for axes in plots.limits(design).axes]
     assert any(title.startswith("tilt: smallest margin") for title in titles)
     assert any(title.startswith("angular velocity: smallest margin") for title in titles)
+
+
+def test_a_reserve_narrows_boxes_speeds_and_tilt(tmp_path: Path) -> None:
+    """The file keeps its box; the ranges of the coordinates are narrower."""
+    box = ((-0.4, 0.4), (-0.4, 0.4), (0.7, 1.3))
+    limits = {"position": {"float": box}, "velocity": 0.8, "tilt": {"float": 0.3}}
+    task = flight(tmp_path, limits=limits)
+
+    narrower = tightened(task.experiment, {"position": 0.1, "velocity": 0.25, "tilt": 0.5})
+    found = {
+        (limit.kind, limit.name): (limit.lower, limit.upper)
+        for limit in DesignTask.resolve(narrower).limits
+        if limit.kind != "control"
+    }
+    assert found == {
+        ("position", "float.x"): pytest.approx((-0.36, 0.36)),
+        ("position", "float.y"): pytest.approx((-0.36, 0.36)),
+        ("position", "float.z"): pytest.approx((0.73, 1.27)),
+        ("velocity", "float"): pytest.approx((0.0, 0.6)),
+        ("tilt", "float"): pytest.approx((0.0, 0.15)),
+    }
+
+
+def test_a_file_that_is_validated_shows_every_limit_with_its_unit(tmp_path: Path) -> None:
+    task = flight(tmp_path, limits={"velocity": 0.8, "tilt": "30 deg"})
+    parts = describe_experiment(stated_experiment(task.experiment)).parts
+    (table,) = [part for part in parts if isinstance(part, SummaryTable) and part.key == "limits"]
+    cells = {(row.cells[0], row.cells[1]): row.cells[-1] for row in table.rows}
+    assert cells["velocity", "float"] == "m/s"
+    assert cells["tilt", "float"] == "rad"
+
+
+@pytest.mark.parametrize(
+    ("length", "mass", "time"), [(1e3, 1.0, 1.0), (1.0, 1e-3, 1.0), (1.0, 1.0, 1e2)]
+)
+def test_limits_of_a_free_body_do_not_depend_on_units(
+    length: float, mass: float, time: float, tmp_path: Path
+) -> None:
+    """Margins over the bounds, and the barrier with its slope, are those in other units."""
+
+    def stated(length: float, mass: float, time: float) -> tuple[dict[str, float], float, float]:
+        """Relative margins, the barrier and its slope along a change of the control."""
+        force = mass * length / time**2
+        text = re.sub(
+            r'(pos|size)="([^"]*)"',
+            lambda found: f'{found[1]}="{_times(found[2], length)}"',
+            QUADROTOR.replace('mass="0.6"', f'mass="{0.6 * mass!r}"'),
+        )
+        text = re.sub(r'(0\.02)"', lambda found: f'{0.02 * length!r}"', text)
+        text = text.replace('ctrlrange="0 4"', f'ctrlrange="0 {4 * force!r}"').replace(
+            'timestep="0.005"',
+            f'timestep="{0.005 * time!r}" gravity="0 0 {-9.81 * length / time**2!r}"',
+        )
+        box = tuple((length * low, length * high) for low, high in ((-0.4, 0.4),) * 2 + ((0.7, 2),))
+        task = make_task(
+            text,
+            tmp_path,
+            rate=50.0 / time,
+            horizon=1.0 * time,
+            parameters={"mass": {"target": "body/drone:mass"}},
+            noise={"qpos:float": 0.005},
+            control={
+                "kind": "multisine",
+                "amplitude": 0.05 * force,
+                "frequency": 1.0 / time,
+                "offset": HOVER * force,
+            },
+            limits={
+                "position": {"float": box},
+                "velocity": 0.8 * length / time,
+                "angular_velocity": 2.0 / time,
+                "acceleration": 9.0 * length / time**2,
+                "tilt": 0.3,
+            },
+        ).relaxed()
+        problem = InteriorProblem(
+            base=task.problem,
+            constraints=constraint_set_of(task),
+            mu=1.0,
+            delta=0.05,
+            with_cost=False,
+        )
+        point = problem.point(task.control)
+        open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
+        slope = float(np.sum(problem.expand(point).gradient(open_loop)[:, 0]) * force)
+        margins = verify(task, task.initial).relative_margins
+        return margins, float(point.barrier), slope
+
+    wanted, found = stated(1.0, 1.0, 1.0), stated(length, mass, time)
+    assert found[0] == pytest.approx(wanted[0], rel=1e-6)
+    assert found[1] == pytest.approx(wanted[1], rel=1e-6)
+    assert found[2] == pytest.approx(wanted[2], rel=1e-4)
+
+
+def _times(numbers: str, factor: float) -> str:
+    """Numbers of an attribute, multiplied by a factor."""
+    return " ".join(repr(float(number) * factor) for number in numbers.split())
 
 
 def test_a_falling_body_exceeds_a_single_number_for_velocities(tmp_path: Path) -> None:

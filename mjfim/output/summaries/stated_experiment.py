@@ -68,7 +68,7 @@ def _limits(stated: StatedExperiment) -> SummaryTable:
     return SummaryTable(
         key="limits",
         title="Limits of a design, with the ranges of the MJCF",
-        columns=columns("quantity", "name", "lower", "upper", left=("name",)),
+        columns=columns("quantity", "name", "lower", "upper", "unit", left=("name", "unit")),
         rows=tuple(
             Row(
                 cells=(
@@ -76,6 +76,7 @@ def _limits(stated: StatedExperiment) -> SummaryTable:
                     each.name,
                     Quantity(value=each.lower, digits=5),
                     Quantity(value=each.upper, digits=5),
+                    each.unit,
                 )
             )
             for each in stated.limits

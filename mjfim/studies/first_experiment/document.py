@@ -9,6 +9,7 @@ import tomlkit
 from tomlkit.items import InlineTable, Table
 
 from mjfim.excitation.limits import limits_of_model
+from mjfim.model.orientation import QUATERNION_PLACE
 from mjfim.model.paths import unit_of
 from mjfim.studies.first_experiment.candidates import Candidate
 from mjfim.studies.first_experiment.propose import SECONDS, Proposal
@@ -163,6 +164,10 @@ def _limits(proposal: Proposal, stated: Mapping[str, Any]) -> Table:
         tomlkit.comment("Further limits: velocity, acceleration, control_rate, force, clearance,")
     )
     table.add(tomlkit.comment("for example: velocity = 2.0"))
+    if any(kind in QUATERNION_PLACE for kind in model.jnt_type.tolist()):
+        table.add(
+            tomlkit.comment("Of free and ball joints also: tilt, angular_velocity, in radians.")
+        )
     for key, value in stated.items():
         table.add(key, _inline(value))
     return table
