@@ -179,7 +179,9 @@ def test_jointly_designed_experiments_with_different_parameters_are_named_shortl
 def test_a_design_that_cannot_begin_says_why_shortly() -> None:
     parameters = [SimpleNamespace(name=name, group=None) for name in NAMES]
     task = SimpleNamespace(
-        parameters=SimpleNamespace(parameters=parameters, interest=np.arange(300)), contrast=None
+        parameters=SimpleNamespace(parameters=parameters, interest=np.arange(300)),
+        contrast=None,
+        release=None,
     )
     silent = SimpleNamespace(silent=range(300))
     unexcited = {
