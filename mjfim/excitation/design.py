@@ -19,6 +19,11 @@ from mjfim.errors import (
     listed,
 )
 from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.controls_within_limits import (
+    ControlsWithinLimits,
+    InsideControl,
+    LimitedCost,
+)
 from mjfim.excitation.evaluation import design_warnings, evaluate_point, point_at_stated_rate
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.levels import DescentLevel, coarse_level, easier_level
@@ -30,7 +35,7 @@ from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import Verification, require_feasible_start, verify
-from mjfim.excitation.violations import violations_of
+from mjfim.excitation.violations import all_violations_of
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.schema import Experiment
 from mjfim.information.identifiability import PROBES, Identifiability
@@ -40,7 +45,7 @@ from mjfim.parallel import one_blas_thread
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import GROUPS_TEXT, ParameterGroup, groups_in_words
-from mjfim.records.design import Design, Evaluation, Status
+from mjfim.records.design import Design, Evaluation, ScaledStart, Status
 from mjfim.records.events import DesignCallback
 from mjfim.records.progress import shown_progress
 
@@ -142,20 +147,35 @@ def design_task(
     if initial_control is not None:
         initial_control = _checked_control(task, initial_control)
     starts = initial_controls_of(task, initial_control)
-    identifiability = _identifiability(task, first, initial_control)
+    begin = _point_of_given(task, first, initial_control)
+    identifiability = _identifiability(task, begin)
     require_designable(task, identifiability)
 
     stage = DescentLevel(task, identifiability.basis)
-    first = stage.problem.reevaluated(first)
+    first, begin = stage.problem.reevaluated(first), stage.problem.reevaluated(begin)
 
-    search = _Search(stage=stage, first=first, executor=executor, budget=budget)
+    # Under hard limits, the design has to beat the initial control, scaled until it keeps them.
+    limited = scaled = None
+    if task.is_limited:
+        limited = LimitedCost(level=DescentLevel(task.relaxed(), identifiability.basis))
+        scaled = _scaled_start(limited, task.control, budget)
+
+    search = _Search(
+        stage=stage, first=first, executor=executor, budget=budget, limited=limited, scaled=scaled
+    )
     results = consume(search.run(starts), callback)
     interrupted = budget.stop.requested
 
     # Steps on other plants, also those of workers, are counted by the runs.
     steps = task.plant.engine_steps - steps_before + sum(result.steps for result in results)
-    best, chosen = _choose(stage, first, results, interrupted)
-    report = _Report(stage=stage, identifiability=identifiability, initial=first, final=chosen)
+    best, chosen = _choose(search, [first, begin], results, interrupted)
+    report = _Report(
+        stage=stage,
+        identifiability=identifiability,
+        initial=first,
+        final=chosen,
+        scaled_start=None if scaled is None else scaled.record,
+    )
     return report.design(best, results, budget.seconds_used, steps, interrupted)
 
 
@@ -231,19 +251,22 @@ def _checked_control(task: DesignTask, control: Array) -> Array:
     return control
 
 
-def _identifiability(
+def _point_of_given(
     task: DesignTask, first: DesignPoint, initial_control: Array | None
-) -> Identifiability:
+) -> DesignPoint:
+    """Evaluate the control with which the search begins; the initial control without another."""
+    if initial_control is None:
+        return first
+    trajectory = task.plant.simulate(task.theta, initial_control)
+    return task.problem.point(trajectory, CENTRAL_DIFFERENCES)
+
+
+def _identifiability(task: DesignTask, begin: DesignPoint) -> Identifiability:
     """Find the combinations of parameters that can be identified.
 
     They are looked for along the control with which the search begins and along random controls.
     """
-    begin = first
-    if initial_control is not None:
-        trajectory = task.plant.simulate(task.theta, initial_control)
-        begin = task.problem.point(trajectory, CENTRAL_DIFFERENCES)
-
-    if first.information is None or begin.trajectory is None or begin.sensitivity is None:
+    if begin.information is None or begin.trajectory is None or begin.sensitivity is None:
         reason = "when the parameters change slightly along the initial control"
         if task.samples_of_parameters is not None:
             reason += (
@@ -255,6 +278,13 @@ def _identifiability(
     return task.identifiability_test.along(begin.trajectory, begin.sensitivity)
 
 
+def _scaled_start(limited: LimitedCost, control: Array, budget: Budget) -> InsideControl | None:
+    """The largest share of a control that keeps all limits; None where the control keeps them."""
+    if budget.stop.requested or limited.trajectory(control) is not None:
+        return None
+    return ControlsWithinLimits(cost=limited, budget=budget).scaled(control)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Search:
     """Search for the best control from several initial controls.
@@ -264,19 +294,31 @@ class _Search:
         first: The experiment's initial control, evaluated.
         executor: Runs several starts under hard limits side by side, or None.
         budget: Time of the search and the token that stops it.
+        limited: Cost of controls that keep the hard limits; None without limits.
+        scaled: The largest share of the initial control that keeps all limits; None where the
+            initial control keeps them, or where no share does.
     """
 
     stage: DescentLevel
     first: DesignPoint
     executor: Executor | None
     budget: Budget
+    limited: LimitedCost | None = None
+    scaled: InsideControl | None = None
 
     def run(self, starts: Iterable[InitialControl]) -> Runs:
         """Yield every iterate of all runs; return their results on the stated plant."""
-        if not self.stage.task.is_limited:
+        if self.limited is None:
             return (yield from self._run_without_barrier(starts))
 
-        return (yield from self._run_within_limits(list(starts)))
+        return (yield from self._run_within_limits(list(starts), self.limited))
+
+    def keeps_limits(self, point: DesignPoint) -> bool:
+        """Check whether the trajectory of a point keeps the hard limits, if there are any."""
+        if self.limited is None:
+            return True
+        curve = point.trajectory
+        return curve is not None and self.limited.trajectory(curve.ctrl) is not None
 
     def _run_without_barrier(self, starts: Iterable[InitialControl]) -> Runs:
         """Descend from every start; under hard limits until one descent leaves them."""
@@ -292,7 +334,7 @@ class _Search:
         )
         return (yield from search.run_all(starts))
 
-    def _run_within_limits(self, starts: list[InitialControl]) -> Runs:
+    def _run_within_limits(self, starts: list[InitialControl], limited: LimitedCost) -> Runs:
         """Optimise under hard limits.
 
         The search begins without a barrier where the weights of the cost may keep the limits.
@@ -312,18 +354,42 @@ class _Search:
             if left.control is not None:
                 starts[0] = InitialControl(name=starts[0].name, control=left.control)
 
-        free = DescentLevel(self.stage.task.relaxed(), self.stage.basis)
+        # A start far outside the limits is replaced by the best control inside that is found
+        # without derivatives.
+        inside = self.scaled
+        if inside is not None and limited.is_far_outside(starts[0].control):
+            inside = ControlsWithinLimits(cost=limited, budget=self.budget).best(inside)
+            starts[0] = InitialControl(name=starts[0].name, control=inside.begin)
+
+        free = limited.level
         multistart = Multistart(
             fine=free, coarse=easier_level(free), executor=self.executor, budget=self.budget
         )
         constrained = yield from multistart.run(starts)
         constrained = yield from multistart.tighten_winner(constrained)
 
-        results += [self._on_stated_plant(result) for result in constrained]
+        found = [self._on_stated_plant(result) for result in constrained]
+        results += self._not_worse(found, inside)
         if results:
             steps = results[0].steps + steps_without_barrier
             results[0] = replace(results[0], steps=steps)
         return results
+
+    def _not_worse(self, found: list[RunResult], inside: InsideControl | None) -> list[RunResult]:
+        """Results whose first one is not worse than a control that keeps all limits."""
+        if not found or inside is None:
+            return found
+
+        first = found[0]
+        if first.is_feasible and first.cost <= inside.cost:
+            return found
+
+        # Nothing better was found from the first start.
+        status = first.status
+        if status is Status.INFEASIBLE or status.success:
+            status = Status.BEST_SEEN
+        kept = replace(first, control=inside.control, cost=inside.cost, status=status)
+        return [self._on_stated_plant(kept), *found[1:]]
 
     def _on_stated_plant(self, result: RunResult) -> RunResult:
         """Result of one start, evaluated again on the unmodified plant."""
@@ -356,13 +422,20 @@ def _is_bounded_by_weights(task: DesignTask) -> bool:
 
 
 def _choose(
-    stage: DescentLevel, first: DesignPoint, results: list[RunResult], interrupted: bool
+    search: _Search, begins: Sequence[DesignPoint], results: list[RunResult], interrupted: bool
 ) -> tuple[RunResult, DesignPoint]:
     """Choose the best run and the point of the design.
 
-    The point is that of the initial control where no run found a better one: a search that was
-    stopped early may have seen controls on a coarse level only, which are slightly worse. An
-    initial control that breaks a limit is chosen only if no run has a point.
+    The point is that of the control with which the search began, or of the initial control, where
+    no run found a better one: a search that was stopped early may have seen controls on a coarse
+    level only, which are slightly worse. One that breaks a limit is chosen only if no run has a
+    point.
+
+    Args:
+        search: The search.
+        begins: The initial control and the one with which the search began.
+        results: One result per run.
+        interrupted: True where the search was stopped.
     """
     if not results:
         results.append(RunResult(name="initial control", status=Status.INTERRUPTED))
@@ -370,7 +443,7 @@ def _choose(
     # A search that was stopped on the coarse level has no point at the stated rate yet.
     last = results[-1]
     if last.point is None and last.control is not None:
-        point = point_at_stated_rate(stage, last.control)
+        point = point_at_stated_rate(search.stage, last.control)
         cost = np.inf if point is None else point.cost
         results[-1] = replace(last, point=point, cost=cost)
 
@@ -378,18 +451,13 @@ def _choose(
     if best.point is None and not interrupted:
         raise SimulationDivergedError("the simulation diverges from every start")
 
-    if best.point is None or (best.cost > first.cost and _keeps_limits(stage.task, first)):
-        return best, first
-
-    return best, best.point
-
-
-def _keeps_limits(task: DesignTask, point: DesignPoint) -> bool:
-    """Check whether the trajectory of a point keeps the hard limits, if there are any."""
-    if not task.is_limited:
-        return True
-
-    return point.trajectory is not None and verify(task, point.trajectory).is_feasible
+    # The beginning counts where it costs less than the best run, or where that breaks a limit.
+    bound = best.cost if best.is_feasible else np.inf
+    cheaper = [begin for begin in begins if begin.cost < bound and search.keeps_limits(begin)]
+    if cheaper:
+        status = Status.BEST_SEEN if best.status is Status.INFEASIBLE else best.status
+        return replace(best, status=status), min(cheaper, key=lambda begin: begin.cost)
+    return best, begins[0] if best.point is None else best.point
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -403,6 +471,7 @@ class _Report:
         final: The designed control, evaluated.
         played: The task with the initial state of the design; None where it is the stated one.
         remarks: Warnings that belong to the search.
+        scaled_start: The largest share of an initial control outside limits that keeps them.
     """
 
     stage: DescentLevel
@@ -411,6 +480,7 @@ class _Report:
     final: DesignPoint
     played: DesignTask | None = None
     remarks: tuple[str, ...] = ()
+    scaled_start: ScaledStart | None = None
 
     def design(
         self,
@@ -498,7 +568,8 @@ class _Report:
             seconds=seconds,
             limits=found.margins,
             usage=found.usage,
-            initial_violations=violations_of(task, verify(task, initial.trajectory)),
+            initial_violations=all_violations_of(task, initial.trajectory),
+            scaled_start=self.scaled_start,
             warnings=warnings,
             found_by=best.name,
             starts=tuple(result.start_result for result in results),
@@ -526,7 +597,7 @@ def designable(task: DesignTask) -> Identifiability:
         SimulationDivergedError: The simulation diverges along the initial control.
     """
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    identifiability = _identifiability(task, first, None)
+    identifiability = _identifiability(task, first)
     require_designable(task, identifiability)
     return identifiability
 

@@ -302,9 +302,6 @@ class InteriorPointMethod:
     def _is_near_feasible(self, control: Array, violation: float) -> bool:
         """Check whether the relaxed barrier can make a control feasible.
 
-        Constraints on the final state are ignored where a violation is accepted: their tolerances
-        are narrow, so that even a usable control misses them by many times the tolerance.
-
         Args:
             control: (N, nu) control [u-unit].
             violation: Largest violation that is accepted, relative to half of the range.
@@ -313,12 +310,7 @@ class InteriorPointMethod:
         if values is None:
             return False
 
-        margins = self.constraints.relative_margins(values)
-        return all(
-            margin > -violation
-            for kind, margin in margins.items()
-            if violation == 0.0 or not kind.startswith("end_")
-        )
+        return nearly_inside(self.constraints.relative_margins(values), violation)
 
     def _steer_inside(
         self, control: Array, max_iterations: int, budget: Budget
@@ -523,6 +515,24 @@ class InteriorPointMethod:
         N = len(self.base.running.desired_state) - 1
         ridge = RIDGE / N / self.constraints.control.bounds.scale**2
         return StructuredBFGS(ridge, self.basis)
+
+
+def nearly_inside(relative_margins: Mapping[str, float], violation: float) -> bool:
+    """Check whether all limits hold, apart from a violation that the barrier can remove.
+
+    Constraints on the final state are ignored where a violation is accepted: their tolerances are
+    narrow, so that even a usable control misses them by many times the tolerance.
+
+    Args:
+        relative_margins: Smallest margin relative to half of the range, by kind; negative where
+            violated.
+        violation: Largest violation that is accepted, relative to half of the range.
+    """
+    return all(
+        margin > -violation
+        for kind, margin in relative_margins.items()
+        if violation == 0.0 or not kind.startswith("end_")
+    )
 
 
 def updated_tightening(

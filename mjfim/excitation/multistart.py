@@ -19,7 +19,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.excitation.constrained import ConstrainedSearch, run_in_worker
-from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.controls_within_limits import LimitedCost
 from mjfim.excitation.feasibility import shrink_about_each
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
@@ -289,9 +289,9 @@ class Multistart:
     # ---- properties of the task
 
     @cached_property
-    def _constraints(self) -> ConstraintSet:
-        """The limits on the plant without clamps."""
-        return constraint_set_of(self.fine.task)
+    def _limited_cost(self) -> LimitedCost:
+        """Cost of controls that keep all limits on the stated plant."""
+        return LimitedCost(level=self.fine)
 
     @property
     def _reserved_seconds(self) -> float:
@@ -362,22 +362,8 @@ class Multistart:
         return reevaluated, candidate
 
     def _cost_on_stated_plant(self, control: Array) -> float:
-        """J of a control: (N, nu); infinite where it violates a limit on the stated plant.
-
-        A force that keeps its limit only because a clamp cuts it off violates this limit.
-        """
-        task = self.fine.task
-        observed = task.plant.observe(task.theta, control, self._constraints.observations)
-        if observed is None:
-            return np.inf
-
-        values = self._constraints.evaluate(*observed, slopes=False)
-        if not self._constraints.is_feasible(values):
-            return np.inf
-        if not verify(task, values.trajectory).is_feasible:
-            return np.inf
-
-        return self.fine.problem.point(values.trajectory).cost
+        """J of a control: (N, nu); infinite where it violates a limit on the stated plant."""
+        return self._limited_cost(control)
 
     def _choose_survivors(self, candidates: Sequence[RunResult]) -> list[int]:
         """Indices of the candidates for the second round, the best one first."""

@@ -127,7 +127,7 @@ def _verify_on(
     margins = others.margins(values)
     relative_margins = others.relative_margins(values)
     usage = [
-        *_usage_within_samples(task, constraints, values.observed),
+        *usage_within_samples(task, constraints, values.observed),
         *_usage_of_controls(task, constraints, played.ctrl),
     ]
 
@@ -184,10 +184,19 @@ def _unenforced_kinds(task: DesignTask) -> frozenset[str]:
     return frozenset({"clearance", *(limit.kind for limit in task.limits)})
 
 
-def _usage_within_samples(
+def usage_within_samples(
     task: DesignTask, constraints: ConstraintSet, observed: Array
 ) -> Iterator[LimitUsage]:
-    """Position of the limited quantities in their ranges; observed: (N, rows, w)."""
+    """Find the position of the limited quantities in their ranges, at every engine step.
+
+    Args:
+        task: The task.
+        constraints: Its limits.
+        observed: (N, rows, w) observations of a simulation.
+
+    Yields:
+        The usage of every limit on a quantity within samples.
+    """
     substeps = constraints.substeps
     quantities = substeps.quantities(observed)
     N, _, count = quantities.shape

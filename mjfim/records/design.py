@@ -229,6 +229,8 @@ class LimitViolation:
         lower: Lower bound, or None [unit of the kind].
         upper: Upper bound, or None [unit of the kind].
         unit: Unit of the limited quantity; empty where it is unknown.
+        clamped: True for a force that the model clamps at its limit; the value is that without the
+            clamp.
     """
 
     kind: str
@@ -239,15 +241,17 @@ class LimitViolation:
     lower: float | None
     upper: float | None
     unit: str = ""
+    clamped: bool = False
 
     def __str__(self) -> str:
         is_above = self.upper is not None and self.value > self.upper
         side, bound = ("above", self.upper) if is_above else ("below", self.lower)
         quantity = " ".join([f"{self.value:.4g}", *([self.unit] if self.unit else [])])
         limit = "its limit" if bound is None else f"{bound:.4g}"
+        verb, clamp = ("would be", " without its clamp") if self.clamped else ("is", "")
         return (
-            f"{self.kind.replace('_', ' ')} of {self.name} is {quantity} at {self.t:.4g} s, "
-            f"{side} {limit} (first at {self.since:.4g} s)"
+            f"{self.kind.replace('_', ' ')} of {self.name} {verb} {quantity} at {self.t:.4g} s"
+            f"{clamp}, {side} {limit} (first at {self.since:.4g} s)"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -261,6 +265,32 @@ class LimitViolation:
             "lower": self.lower,
             "upper": self.upper,
             "unit": self.unit,
+            "clamped": self.clamped,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaledStart:
+    """The largest share of an initial control outside limits that keeps all of them.
+
+    The initial control is scaled about a control that holds the start, or nearly does.
+
+    Attributes:
+        share: The share, between 0 and 1.
+        cost: J along the scaled control.
+        min_eigenvalue: Smallest eigenvalue of its information per second that the cost uses.
+    """
+
+    share: float
+    cost: float
+    min_eigenvalue: float
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of `scaled_start` in design.json."""
+        return {
+            "share": self.share,
+            "cost": self.cost,
+            "min_eigenvalue": self.min_eigenvalue,
         }
 
 
@@ -296,6 +326,8 @@ class Design(ShownRecord):
         limits: Worst margin per kind of limit, positive inside [unit of the limit].
         usage: Position between the bounds of every limit, at every engine step.
         initial_violations: Limits that the initial trajectory violates.
+        scaled_start: The largest share of the initial control that keeps all limits, where the
+            initial control violates one; None where it does not, or where no share keeps them.
         warnings: Sentences for the user.
         found_by: Name of the initial control that led to the design.
         starts: Results of all initial controls.
@@ -324,6 +356,7 @@ class Design(ShownRecord):
     limits: dict[str, float] = field(default_factory=dict)
     usage: tuple[LimitUsage, ...] = ()
     initial_violations: tuple[LimitViolation, ...] = ()
+    scaled_start: ScaledStart | None = None
     warnings: tuple[str, ...] = ()
     found_by: str = "initial control"
     starts: tuple[StartResult, ...] = ()
@@ -411,6 +444,7 @@ class Design(ShownRecord):
                 "satisfied": self.within_limits,
                 "initial": [violation.summary() for violation in self.initial_violations],
             },
+            "scaled_start": None if self.scaled_start is None else self.scaled_start.summary(),
             "found_by": self.found_by,
             "starts": [start.summary() for start in self.starts],
             "warnings": list(self.warnings),

@@ -17,7 +17,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.design import Design
+from mjfim.records.design import Design, ScaledStart
 
 # Largest number of limits that the initial control violates and that a summary lists.
 MAX_VIOLATIONS = 4
@@ -145,6 +145,8 @@ def _limit_parts(design: Design) -> list[Part]:
                 "are those of a motion outside the limits."
             )
         )
+    if design.scaled_start is not None:
+        parts.append(Paragraph(text=_scaled_sentence(design, design.scaled_start)))
 
     violated = [kind for kind, margin in design.limits.items() if margin < 0.0]
     if violated:
@@ -168,6 +170,19 @@ def _limit_parts(design: Design) -> list[Part]:
         )
     )
     return parts
+
+
+def _scaled_sentence(design: Design, scaled: ScaledStart) -> str:
+    """Return how a design compares with the initial control, scaled until it keeps all limits."""
+    share = f"The initial control scaled by {scaled.share:.2g} keeps all limits"
+    if not design.within_limits:
+        return f"{share}; the design does not."
+
+    times = float(design.final.eigenvalues[0]) / max(scaled.min_eigenvalue, TINY)
+    return (
+        f"{share}; the design is {times:.3g} times better than that (λ_min "
+        f"{scaled.min_eigenvalue:.4g} → {design.final.eigenvalues[0]:.4g})."
+    )
 
 
 def _start_parts(design: Design) -> list[Part]:

@@ -1,0 +1,291 @@
+"""Controls that keep hard limits from the beginning.
+
+Where the initial control is far outside the limits, a share of it keeps them, but may tell little.
+Random controls of several bandwidths, each as large as the limits allow, often tell much more: a
+stiff servo with a weak motor, for example, can follow small, quick motions only. The search then
+begins with the best of these controls. All of them are judged by simulations without derivatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.budget import Budget
+from mjfim.excitation.bandwidth import bandwidth_basis
+from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.interior_point import MAX_START_VIOLATION, nearly_inside
+from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.task import FADE_SHARE
+from mjfim.excitation.verification import verify
+from mjfim.records.design import ScaledStart
+from mjfim.records.trajectory import Trajectory
+
+# A control outside limits is reduced by this factor until it is inside, to the least share at most.
+# The largest share is then found to a ratio.
+SHARE_STEP = 0.25
+LEAST_SHARE = 1e-6
+SHARE_RATIO = 1.05
+
+# Bandwidths of the random controls, relative to the largest one that the control can have.
+BANDWIDTHS = (0.06, 0.15, 0.35, 0.6, 1.0)
+
+# Factors by which the deviation of a single actuator is enlarged while all limits hold.
+SINGLE_FACTORS = (2.0, 1.4)
+
+# Number of random changes of the best control, and their size relative to it.
+CHANGES = 24
+CHANGE_SIZE = 0.3
+
+# Share of the budget after which no further control is tried.
+TRIAL_SHARE = 0.4
+
+# A search begins with this share of the best control, some distance away from the limits.
+BEGIN_SHARE = 0.95
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LimitedCost:
+    """Cost of controls that keep all limits.
+
+    Attributes:
+        level: The stated level, on the plant without clamps.
+    """
+
+    level: DescentLevel
+
+    @cached_property
+    def constraints(self) -> ConstraintSet:
+        """The limits on the plant without clamps."""
+        return constraint_set_of(self.level.task)
+
+    def trajectory(self, control: Array) -> Trajectory | None:
+        """Trajectory of a control: (N, nu); None where it violates a limit.
+
+        A force that keeps its limit only because a clamp cuts it off violates this limit.
+        """
+        task = self.level.task
+        observed = task.plant.observe(task.theta, control, self.constraints.observations)
+        if observed is None:
+            return None
+
+        values = self.constraints.evaluate(*observed, slopes=False)
+        if not self.constraints.is_feasible(values):
+            return None
+        return values.trajectory if verify(task, values.trajectory).is_feasible else None
+
+    def point(self, control: Array) -> DesignPoint | None:
+        """Evaluate a control: (N, nu); None where it violates a limit."""
+        trajectory = self.trajectory(control)
+        return None if trajectory is None else self.level.problem.point(trajectory)
+
+    def __call__(self, control: Array) -> float:
+        """J of a control: (N, nu); infinite where it violates a limit."""
+        point = self.point(control)
+        return np.inf if point is None else point.cost
+
+    def is_far_outside(self, control: Array) -> bool:
+        """Check whether a control violates a limit by more than the barrier can remove."""
+        task = self.level.task
+        observed = task.plant.observe(task.theta, control, self.constraints.observations)
+        if observed is None:
+            return True
+        values = self.constraints.evaluate(*observed, slopes=False)
+        return not nearly_inside(self.constraints.relative_margins(values), MAX_START_VIOLATION)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InsideControl:
+    """A control that keeps all limits.
+
+    Attributes:
+        about: (nu,) control about which it deviates [u-unit].
+        deviation: (N, nu) deviation [u-unit].
+        cost: J along the control.
+        min_eigenvalue: Smallest eigenvalue of the information per second that the cost uses.
+        share: Share of a larger deviation.
+    """
+
+    about: Array
+    deviation: Array
+    cost: float
+    min_eigenvalue: float
+    share: float = 1.0
+
+    @property
+    def control(self) -> Array:
+        """(N, nu) control [u-unit]."""
+        return np.asarray(self.about + self.deviation)
+
+    @property
+    def begin(self) -> Array:
+        """(N, nu) control with which a search begins, some distance away from the limits."""
+        return np.asarray(self.about + BEGIN_SHARE * self.deviation)
+
+    @property
+    def record(self) -> ScaledStart:
+        """The control as an entry of the design."""
+        return ScaledStart(share=self.share, cost=self.cost, min_eigenvalue=self.min_eigenvalue)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlsWithinLimits:
+    """Search for controls that keep all limits, without derivatives.
+
+    Attributes:
+        cost: Cost of controls that keep all limits.
+        budget: Time of the whole design, and the token that stops it.
+    """
+
+    cost: LimitedCost
+    budget: Budget
+
+    def scaled(self, control: Array) -> InsideControl | None:
+        """Scale a control about each control that nearly holds the start; the best one counts.
+
+        Args:
+            control: (N, nu) control outside the limits [u-unit].
+
+        Returns:
+            The largest share that keeps all limits; None where no share does.
+        """
+        found: list[InsideControl] = []
+        for centre in self.cost.level.task.centres:
+            if self.budget.stop.requested:
+                break
+            inside = self._largest(centre, self._fitted(control - centre))
+            if inside is not None:
+                found.append(inside)
+        return min(found, key=lambda inside: inside.cost, default=None)
+
+    def best(self, scaled: InsideControl) -> InsideControl:
+        """Find a control that tells more than the scaled initial control.
+
+        Args:
+            scaled: The scaled initial control.
+
+        Returns:
+            The best of it, of random controls of several bandwidths and of changes of the best one.
+        """
+        best = self._enlarged(scaled)
+        rng = np.random.default_rng(self.cost.level.task.experiment.descent.seed)
+
+        for deviation in self._random(rng):
+            best = self._better(best, deviation)
+
+        for _ in range(CHANGES):
+            if self._is_over:
+                break
+            best = self._better(best, self._changed(best.deviation, rng))
+        return best
+
+    @property
+    def _is_over(self) -> bool:
+        """Whether no further control is tried."""
+        return self.budget.exhausted is not None or self.budget.used > TRIAL_SHARE
+
+    def _better(self, best: InsideControl, deviation: Array) -> InsideControl:
+        """The best control so far, or a new one of any size where that costs less."""
+        found = self._largest(best.about, deviation)
+        if found is None or found.cost >= best.cost:
+            return best
+        return self._enlarged(found)
+
+    def _random(self, rng: np.random.Generator) -> Iterator[Array]:
+        """Random deviations, (N, nu) each, that reach the bounds of the controls."""
+        widths = self.cost.constraints.control.bounds.scale
+        for bandwidth in BANDWIDTHS:
+            if self._is_over:
+                return
+            noise = self._noise(bandwidth, rng)
+            yield self._fitted(widths * noise / np.abs(noise).max(axis=0))
+
+    def _changed(self, deviation: Array, rng: np.random.Generator) -> Array:
+        """A deviation, (N, nu), with a random change of every actuator in proportion to it."""
+        noise = self._noise(float(rng.choice(BANDWIDTHS)), rng)
+        sizes = np.sqrt((deviation**2).mean(axis=0) / (noise**2).mean(axis=0))
+        return np.asarray(deviation + self._fitted(CHANGE_SIZE * sizes * noise))
+
+    def _noise(self, bandwidth: float, rng: np.random.Generator) -> Array:
+        """Random curves that fade in, and fade out where the design ends at rest.
+
+        Args:
+            bandwidth: Their bandwidth, relative to half of the sample rate.
+            rng: Source of random numbers.
+
+        Returns:
+            (N, nu) curves.
+        """
+        task = self.cost.level.task
+        N, nu = task.control.shape
+        lines = max(round(bandwidth * (N // 2)), 1)
+        spectrum = np.zeros((N // 2 + 1, nu), dtype=np.complex128)
+        spectrum[1 : lines + 1].real = rng.standard_normal((lines, nu))
+        spectrum[1 : lines + 1].imag = rng.standard_normal((lines, nu))
+
+        # Even a motion that does not begin at rest must not jump at once.
+        begin = np.clip(np.arange(N)[:, None] / (FADE_SHARE * N), 0.0, 1.0)
+        return np.asarray(begin * task.fade(N) * np.fft.irfft(spectrum, n=N, axis=0))
+
+    def _fitted(self, deviation: Array) -> Array:
+        """The nearest deviation, (N, nu), that has the bandwidth which the experiment allows."""
+        task = self.cost.level.task
+        basis = bandwidth_basis(task, task.stated_times)
+        if basis is None:
+            return deviation
+        return np.asarray(basis @ np.linalg.lstsq(basis, deviation)[0])
+
+    def _largest(self, about: Array, deviation: Array) -> InsideControl | None:
+        """Find the largest share of a deviation, (N, nu), that keeps all limits."""
+        share, outside = 1.0, np.inf
+        while self.cost.trajectory(about + share * deviation) is None:
+            share, outside = SHARE_STEP * share, share
+            if share < LEAST_SHARE or self.budget.stop.requested:
+                return None
+
+        # Bisect between the share that keeps the limits and the next larger one that does not.
+        while np.isfinite(outside) and outside > SHARE_RATIO * share:
+            middle = float(np.sqrt(share * outside))
+            if self.cost.trajectory(about + middle * deviation) is not None:
+                share = middle
+            else:
+                outside = middle
+        return self._inside(about, share * deviation, share)
+
+    def _inside(self, about: Array, deviation: Array, share: float) -> InsideControl | None:
+        """A control with its cost; None where it violates a limit or tells nothing."""
+        point = self.cost.point(about + deviation)
+        if point is None or point.criterion is None or not np.isfinite(point.cost):
+            return None
+        return InsideControl(
+            about=about,
+            deviation=deviation,
+            cost=point.cost,
+            min_eigenvalue=float(point.criterion.eigenvalues[0]),
+            share=share,
+        )
+
+    def _enlarged(self, inside: InsideControl) -> InsideControl:
+        """Enlarge the deviation of one actuator after the other while all limits hold."""
+        actuators = inside.deviation.shape[1]
+        factors = np.ones(actuators)
+        if actuators == 1:
+            return inside
+
+        for factor in SINGLE_FACTORS:
+            for i in range(actuators):
+                larger = np.array(factors)
+                larger[i] *= factor
+                deviation = larger * inside.deviation
+                if self._is_over:
+                    break
+                if self.cost.trajectory(inside.about + deviation) is not None:
+                    factors = larger
+
+        found = self._inside(inside.about, factors * inside.deviation, inside.share)
+        return inside if found is None or found.cost >= inside.cost else found
