@@ -187,7 +187,7 @@ def _design_release(
     steps_before = task.plant.engine_steps
 
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    identifiability = _identifiability(task, first, None)
+    identifiability = _identifiability(task, first)
     require_designable(task, identifiability)
     stage = DescentLevel(task, identifiability.basis)
     first = stage.problem.reevaluated(first)
@@ -458,6 +458,14 @@ def _choose(
         status = Status.BEST_SEEN if best.status is Status.INFEASIBLE else best.status
         return replace(best, status=status), min(cheaper, key=lambda begin: begin.cost)
     return best, begins[0] if best.point is None else best.point
+
+
+def _keeps_limits(task: DesignTask, point: DesignPoint) -> bool:
+    """Check whether a motion without controls keeps the hard limits, if there are any."""
+    if not task.is_limited:
+        return True
+
+    return point.trajectory is not None and verify(task, point.trajectory).is_feasible
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
