@@ -43,10 +43,13 @@ def experiment_text(proposal: Proposal) -> str:
     document.add("initial", _initial(proposal, values["initial"]))
     document.add("parameters", _parameters(proposal))
     document.add("noise", _noise(proposal))
+    if proposal.release is not None:
+        document.add("nuisance", _nuisance(values["nuisance"]))
     document.add("limits", _limits(proposal, values.get("limits", {})))
     if proposal.rest:
         document.add("boundary", _boundary())
-    document.add("cost", _cost())
+    if proposal.release is None:
+        document.add("cost", _cost())
     document.add("descent", _descent())
     return tomlkit.dumps(document).rstrip() + "\n"
 
@@ -91,6 +94,8 @@ def _initial(proposal: Proposal, values: Mapping[str, Any]) -> Table:
     """Initial state and control."""
     table = tomlkit.table()
     start = proposal.start
+    if proposal.release is not None:
+        return _release(proposal, values)
     table.add(tomlkit.comment(f"The start: {start.reason}."))
     others = [
         name
@@ -109,6 +114,29 @@ def _initial(proposal: Proposal, values: Mapping[str, Any]) -> Table:
     for key, value in values["control"].items():
         control.add(key, _plain(value))
     table.add("control", control)
+    return table
+
+
+def _release(proposal: Proposal, values: Mapping[str, Any]) -> Table:
+    """Release of a model without actuators."""
+    table = tomlkit.table()
+    table.add(tomlkit.comment(f"The release, at rest, away from {proposal.start.reason}."))
+    table.add("qpos", values["qpos"])
+    table.add(
+        tomlkit.comment("Releases that a design may choose [m or rad]. A push is a velocity,")
+    )
+    table.add(tomlkit.comment('for example "qvel:<joint>" = [-1.0, 1.0].'))
+    table.add("free", _inline(values["free"]))
+    return table
+
+
+def _nuisance(values: Mapping[str, Any]) -> Table:
+    """Errors of the release."""
+    table = tomlkit.table()
+    table.add(
+        tomlkit.comment("The error of the release is unknown; the fit reads it from each log.")
+    )
+    table.add("initial", _inline(values["initial"]))
     return table
 
 

@@ -31,6 +31,11 @@ from mjfim.studies.first_experiment.excitation import (
     rounded,
 )
 from mjfim.studies.first_experiment.outputs import ProposedNoise, proposed_noise
+from mjfim.studies.first_experiment.release import (
+    FIRST_SHARE,
+    ProposedRelease,
+    propose_release,
+)
 from mjfim.studies.first_experiment.selection import identifiable
 from mjfim.studies.first_experiment.start import Start, choose_start, influence_of_controls
 from mjfim.studies.first_experiment.time_scale import TimeScale, reach, time_scale
@@ -85,6 +90,7 @@ class Proposal:
         control_limits: Ranges of the controls that have none in the MJCF.
         velocity_limits: Velocity limits that a URDF states [m/s or rad/s].
         rest: Whether the experiment begins at rest.
+        release: Release of a model without actuators; None for a model with actuators.
         remarks: Sentences for the head of the file.
     """
 
@@ -102,11 +108,15 @@ class Proposal:
     velocity_limits: dict[str, float]
     rest: bool
     remarks: Sequence[str]
+    release: ProposedRelease | None = None
 
     def values(self) -> dict[str, Any]:
         """Keys and tables of the experiment file."""
         initial: dict[str, Any] = {}
-        if self.start.keyframe is not None:
+        if self.release is not None:
+            initial["qpos"] = self.release.qpos.tolist()
+            initial["free"] = {name: list(ends) for name, ends in self.release.free.items()}
+        elif self.start.keyframe is not None:
             initial["keyframe"] = self.start.keyframe
         else:
             initial["qpos"] = self.start.qpos.tolist()
@@ -117,12 +127,16 @@ class Proposal:
             "model": self.model,
             "rate": self.times.rate,
             "horizon": self.times.horizon,
-            "initial": {**initial, "control": self.control()},
+            "initial": initial,
             "parameters": {each.name: each.table() for each in self.chosen},
             "noise": {each.key: each.sigma for each in self.noise},
-            "cost": {"control": 0.0},
             "descent": {"seconds": SECONDS},
         }
+        if self.release is None:
+            initial["control"] = self.control()
+            values["cost"] = {"control": 0.0}
+        else:
+            values["nuisance"] = {"initial": dict.fromkeys(self.release.free, True)}
         limits: dict[str, Any] = {}
         if self.control_limits:
             limits["control"] = {name: list(both) for name, both in self.control_limits.items()}
@@ -166,17 +180,11 @@ def propose_experiment(
 
     Raises:
         ModelError: The model cannot be read.
-        ExperimentError: The model has no actuator or no parameter of the wanted groups, or a wish
-            cannot be fulfilled.
+        ExperimentError: The model has neither an actuator nor a joint that can be released, or no
+            parameter of the wanted groups, or a wish cannot be fulfilled.
     """
     urdf, source = _model(path)
     model = source.model
-    if model.nu == 0:
-        raise ExperimentError(
-            f"{path}: the model has no actuator, so there is no experiment to design; add "
-            "<actuator> elements to the MJCF"
-        )
-
     found = candidates(model, wishes.groups, wishes.payload)[:MOST_CANDIDATES]
     if not found:
         raise ExperimentError(
@@ -193,9 +201,15 @@ def propose_experiment(
     times = wanted_times(time_scale(model, data), model, wishes)
 
     controls = source.coordinates.controls
-    wanted = first_amplitudes(
-        model, start, influence_of_controls(model, start), length, times.period
-    )
+    release = None
+    wanted = np.zeros(0)
+    if controls:
+        wanted = first_amplitudes(
+            model, start, influence_of_controls(model, start), length, times.period
+        )
+    else:
+        release = propose_release(model, start.qpos, length)
+        _require_release(path, release)
     draft = Proposal(
         model=companion_name if urdf else os.path.relpath(path, folder),
         companion=None if urdf is None else urdf.mjcf(os.path.relpath(path, folder)),
@@ -214,8 +228,21 @@ def propose_experiment(
         velocity_limits={} if urdf is None else urdf.velocities,
         rest=False,
         remarks=(),
+        release=release,
     )
-    return _Refinement(source=source, folder=folder, wishes=wishes).refined(draft)
+    refinement = _Refinement(source=source, folder=folder, wishes=wishes)
+    if release is not None:
+        return refinement.released(draft, length)
+    return refinement.refined(draft)
+
+
+def _require_release(path: Path, release: ProposedRelease) -> None:
+    """Raise ExperimentError where no joint can be released."""
+    if not release.free:
+        raise ExperimentError(
+            f"{path}: the model has neither an actuator nor a slide, hinge or ball joint with a "
+            "name that could be released; add <actuator> elements to the MJCF, or name its joints"
+        )
 
 
 def wanted_times(times: TimeScale, model: Any, wishes: Wishes) -> TimeScale:
@@ -341,6 +368,40 @@ class _Refinement:
             others=[each for i, each in enumerate(draft.chosen) if i not in chosen],
         )
 
+    def released(self, draft: Proposal, length: float) -> Proposal:
+        """The draft of a model without actuators, with a release that keeps all limits.
+
+        Args:
+            draft: The draft.
+            length: Length of the robot [m].
+        """
+        lean = replace(draft, chosen=draft.chosen[:1])
+
+        def keeps_limits(shares: Array) -> bool:
+            """Whether the motion from a release keeps all limits."""
+            found = propose_release(self.source.model, draft.start.qpos, length, float(shares[0]))
+            trial = replace(lean, release=found)
+            system = System.resolve(self._experiment(trial), source=self.source)
+            return self._room(system, trial, np.zeros(0)) >= 0.0
+
+        remarks = ["The model has no actuators: a design chooses the release, `initial.free`."]
+        kept = largest_feasible(np.array([FIRST_SHARE]), keeps_limits)
+        if kept is None:
+            kept = np.array([FIRST_SHARE])
+            remarks.append("Warning: no release near this start keeps all limits.")
+
+        share = float(kept[0])
+        release = propose_release(self.source.model, draft.start.qpos, length, share)
+        moved = replace(draft, release=release)
+        remarks += _unnamed(self.source.model)
+        chosen = self._identified(moved)
+        return replace(
+            moved,
+            remarks=remarks,
+            chosen=[draft.chosen[i] for i in chosen],
+            others=[each for i, each in enumerate(draft.chosen) if i not in chosen],
+        )
+
     def _experiment(self, draft: Proposal, **tables: Any) -> Experiment:
         """The experiment that a draft states, with other tables."""
         values = {**draft.values(), **tables}
@@ -401,7 +462,7 @@ class _Refinement:
         return draft.times.samples
 
     def _identified(self, draft: Proposal) -> Sequence[int]:
-        """Indices of the candidates that the chirp identifies together."""
+        """Indices of the candidates that the chirp or the release identifies together."""
         system = System.resolve(self._experiment(draft), source=self.source)
         task = self._task(system, draft)
         point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
@@ -410,4 +471,8 @@ class _Refinement:
                 "the simulation diverges when the parameters change a little"
             )
         F = np.asarray(point.information - task.information.prior)
-        return identifiable(F, task.parameters.scale)
+
+        # The error of a release is a further unknown.
+        n = len(draft.chosen)
+        hidden = F[:n, n:] @ np.linalg.pinv(F[n:, n:], hermitian=True) @ F[n:, :n]
+        return identifiable(F[:n, :n] - hidden, task.parameters.scale[:n])
