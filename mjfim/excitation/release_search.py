@@ -19,9 +19,11 @@ from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.evaluation import UNSTABLE_GROWTH
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DIVERGED, DesignPoint
 from mjfim.excitation.release_space import ReleaseSpace
+from mjfim.optimize.lq import largest_amplification
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.plant.plant import Plant
 from mjfim.records.design import HistoryRow, StartResult, Status
@@ -51,6 +53,9 @@ SAFETY = 1e-4
 # Objective of a release that diverges, above that of any other.
 WORST = 1e3
 
+# Name of the growth of a small disturbance among the margins.
+GROWTH = "growth"
+
 # Least cost whose logarithm is taken; it avoids the logarithm of zero.
 TINY = 1e-300
 
@@ -66,7 +71,8 @@ class Release:
     Attributes:
         shares: (d,) place in the ranges.
         point: Its motion, information and cost.
-        margins: Smallest relative margin of each kind of limit; empty without limits.
+        margins: Smallest relative margin of each kind of limit, and of the growth of a small
+            disturbance; empty where it diverges.
     """
 
     shares: Array
@@ -75,10 +81,16 @@ class Release:
 
     @property
     def margin(self) -> float:
-        """Smallest relative margin; infinite without limits, and -infinite where it diverges."""
+        """Smallest relative margin; -infinite where the simulation diverges."""
         if self.point.trajectory is None:
             return -np.inf
         return min(self.margins.values(), default=np.inf)
+
+    @property
+    def margin_of_limits(self) -> float:
+        """Smallest relative margin of the limits; NaN without limits."""
+        limits = [margin for kind, margin in self.margins.items() if kind != GROWTH]
+        return min(limits, default=np.nan)
 
     @property
     def rank(self) -> tuple[bool, float]:
@@ -322,7 +334,7 @@ class ReleaseSearch:
             seconds=self.budget.seconds_used,
             steps=task.plant.engine_steps - self._steps_before,
             rate=1.0 / task.dt,
-            margin=release.margin if release.margins else np.nan,
+            margin=release.margin_of_limits,
         )
 
     def _released(self, shares: Array) -> Plant:
@@ -339,7 +351,26 @@ class ReleaseSearch:
         trajectory, margins = moved
         problem = replace(self.stage.problem, plant=plant)
         point = problem.point(trajectory, CENTRAL_DIFFERENCES)
+        if point.trajectory is None:
+            return Release(shares=shares, point=DIVERGED, margins={})
+
+        margins = {**margins, GROWTH: self._margin_of_growth(plant, trajectory)}
         return Release(shares=shares, point=point, margins=margins)
+
+    def _margin_of_growth(self, plant: Plant, trajectory: Trajectory) -> float:
+        """Margin of the growth of a small disturbance; 0 where it grows `UNSTABLE_GROWTH`-fold.
+
+        The criterion favours motions that are close to chaotic, which no feedback could steer.
+        """
+        task = self.stage.task
+        try:
+            A, _, _, _ = plant.derivatives.jacobians(task.theta, trajectory)
+        except SimulationDivergedError:
+            return -1.0
+
+        growth = largest_amplification(A, task.sizes[: task.space.nx])
+        least = np.finfo(float).tiny
+        return float(1.0 - np.log(max(growth, least)) / np.log(UNSTABLE_GROWTH))
 
     def _simulated(self, plant: Plant) -> tuple[Trajectory, dict[str, float]] | None:
         """Motion of a plant from its initial state, with the relative margins of its limits."""

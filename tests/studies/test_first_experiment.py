@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, ModelError
+from mjfim.excitation.design import design
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import verify
 from mjfim.experiment.schema import Experiment
@@ -48,6 +49,31 @@ URDF = """
     <dynamics damping="0.05" friction="0"/>
   </joint>
 </robot>
+"""
+
+FREE_BODY = """
+<mujoco>
+  <worldbody>
+    <body name="b"><freejoint name="base"/><geom size="0.1" mass="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+DOUBLE = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.004" integrator="implicitfast"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="rod">
+      <joint name="hinge" axis="0 1 0" range="-0.5 2.0" damping="0.02"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/>
+      <body name="bob" pos="0 0 -0.5">
+        <joint name="{kind}" type="{kind}" axis="1 0 0" damping="0.01"/>
+        <geom name="bob" type="box" size="0.05 0.1 0.02" mass="0.2"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
 """
 
 PENDULUM = """
@@ -168,9 +194,8 @@ def test_faults_are_named(tmp_path: Path) -> None:
         propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(groups=("motors",)))
 
     bare = tmp_path / "bare.xml"
-    text = pendulum(tmp_path, length=1.0, mass=1.0).read_text(encoding="utf-8")
-    bare.write_text(re.sub(r"<actuator>.*</actuator>", "", text), encoding="utf-8")
-    with pytest.raises(ExperimentError, match="has no actuator"):
+    bare.write_text(FREE_BODY, encoding="utf-8")
+    with pytest.raises(ExperimentError, match=r"neither an actuator nor a slide, hinge or ball"):
         propose_experiment(bare, tmp_path)
     with pytest.raises(ModelError, match="no such model file"):
         propose_experiment(tmp_path / "absent.xml", tmp_path)
@@ -407,3 +432,38 @@ def test_wishes_that_cannot_be_fulfilled_are_named(
 ) -> None:
     with pytest.raises(ExperimentError, match=message):
         propose_experiment(MODELS / "cart_pendulum.xml", tmp_path, Wishes(**wished))
+
+
+@pytest.mark.parametrize("kind", ["slide", "ball"])
+def test_a_model_without_actuators_is_released(kind: str, tmp_path: Path) -> None:
+    """The release is away from the equilibrium, inside the ranges, and its motion keeps them."""
+    path = tmp_path / "double.xml"
+    path.write_text(DOUBLE.format(kind=kind), encoding="utf-8")
+    proposal = propose_experiment(path, tmp_path)
+    file = tmp_path / "double.toml"
+    file.write_text(experiment_text(proposal), encoding="utf-8")
+
+    experiment = Experiment.from_file(file)
+    assert experiment.initial.control is None
+    low, high = experiment.initial.free["qpos:hinge"]
+    assert -0.5 < low < high < 2.0
+    assert set(experiment.nuisance.initial or ()) == set(experiment.initial.free)
+    assert len(experiment.initial.free) == (2 if kind == "slide" else 4)
+
+    task = DesignTask.resolve(experiment)
+    assert 0.0 < task.initial.qpos[0, 0] < high
+    assert task.release is not None
+    assert verify(task, task.initial).is_feasible
+    assert "hinge_damping" in experiment.parameters
+
+
+@pytest.mark.slow
+def test_the_first_experiment_of_a_free_pendulum_runs_without_edits(tmp_path: Path) -> None:
+    proposal = propose_experiment(MODELS / "free_pendulum.xml", tmp_path)
+    file = tmp_path / "first.toml"
+    file.write_text(experiment_text(proposal), encoding="utf-8")
+    experiment = Experiment.from_file(file)
+    assert check(experiment).self_test.passed
+    made = design(experiment)
+    assert made.sound
+    assert made.final.eigenvalues[0] > 10.0 * made.initial.eigenvalues[0]
