@@ -241,8 +241,8 @@ def many_joints(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("table", "named"),
     [
-        ("[limits]\nvelocity = 1.0\n", "'ball_0'"),
-        ("[limits]\nposition = { ball_7 = [-1.0, 1.0] }\n", "'ball_7'"),
+        ("[limits]\nvelocity = { ball = 1.0 }\n", "'ball'"),
+        ("[limits]\nposition = { ball_7 = [-1.0, 1.0] }\n", "ball_7"),
         ("[limits]\nposition = { hinge = [-1.0, 1.0] }\n", "'hinge'"),
         ('[cost]\ncriterion = "c"\nsubset = []\n', "damping_0"),
         ('[cost]\ncriterion = "c"\nsubset = ["mass"]\n', "damping_0"),
