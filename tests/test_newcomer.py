@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
+import pytest
 
-from scripts.newcomer import Walk, markdown, violations
+from scripts.newcomer import Walk, markdown, violations, walk
 
 SERVO = """
 <mujoco>
@@ -104,3 +107,41 @@ def test_the_table_has_a_row_for_each_model() -> None:
     assert lines[2].startswith("| arm | 0 | 0 (2 s) | 1 (3 s) | 0 (50 s) | no end (600 s) |")
     assert "12.3 (start breaks limits) | 9 of 10 | no: force of servo" in lines[2]
     assert lines[3] == "| odd | 0 | 2 (1 s) | — | — | — | — | — | — |"
+
+
+# Upright, so that the experiment is short.
+PENDULUM = """
+<mujoco>
+  <option timestep="0.02"/>
+  <worldbody>
+    <body name="rod" pos="0 0 1">
+      <joint name="hinge" axis="0 1 0" damping="0.1"/>
+      <geom size="0.05" mass="1" pos="0 0 0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.slow
+def test_a_walk_ends_with_the_parameters_of_the_robot(tmp_path: Path) -> None:
+    model = tmp_path / "pendulum.xml"
+    model.write_text(PENDULUM, encoding="utf-8")
+    found = walk(model, tmp_path / "walk")
+    assert found.codes["init"] == found.codes["simulate"] == 0
+    assert {found.codes[verb] for verb in ("check", "design", "identify")} <= {0, 1}
+    assert found.claimed
+    assert found.feasible_start
+    assert not found.violations
+    assert found.gain is not None
+    assert found.gain > 1.0
+    assert found.inside is not None
+    assert found.parameters
+
+
+@pytest.mark.slow
+def test_a_model_that_init_refuses_has_a_row(tmp_path: Path) -> None:
+    found = walk(tmp_path / "absent.xml", tmp_path / "walk")
+    assert found.codes == {"init": 2}
+    assert "no such model file" in found.messages["init"]
