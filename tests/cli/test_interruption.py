@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import time
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from mjfim.cli.common import ProgressDisplay
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
+from mjfim.interruption import NOTHING_SENTENCE
 from mjfim.output import archive, plots
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.design import Status
@@ -30,7 +31,7 @@ from tests.support.cli import (
     run,
     write_experiment,
 )
-from tests.support.paths import MODELS
+from tests.support.paths import MODELS, ROOT
 
 
 def interrupt(*_: object, **__: object) -> None:
@@ -110,19 +111,35 @@ def test_an_interrupted_check_is_written_and_marked_as_incomplete(
     assert loaded.missing and not stated.missing
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.15, 0.6])
-def test_a_press_while_the_program_starts(seconds: float) -> None:
-    words = [*PROCESS, "design", "none.toml", "-o", "none"]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        time.sleep(seconds)
-        process.send_signal(signal.SIGTERM)
-        _, told = process.communicate(timeout=20.0)
+# A program that runs the command line, and sends itself a signal when a module is imported.
+PRESSED_DURING_IMPORT = """
+import os
+import runpy
+import signal
+import sys
+from importlib.abc import MetaPathFinder
 
-    # The program has either been interrupted or found that the file is missing.
-    assert process.returncode in (1, 2)
-    assert "Traceback" not in told
-    assert len(told.splitlines()) == 1
+
+class Press(MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == sys.argv[1]:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+sys.meta_path.insert(0, Press())
+runpy.run_module("mjfim", run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("module", ["matplotlib", "mjfim.cli.main", "rerun"])
+def test_a_press_while_the_program_starts(module: str) -> None:
+    words = [sys.executable, "-W", "error", "-c", PRESSED_DURING_IMPORT, module]
+    ended = subprocess.run(
+        words, capture_output=True, text=True, cwd=ROOT, check=False, timeout=60.0
+    )
+    assert ended.returncode == 1
+    assert ended.stderr == f"mjfim: {NOTHING_SENTENCE}\n"
+    assert not ended.stdout
 
 
 def test_interrupted_on_the_coarse_level() -> None:
