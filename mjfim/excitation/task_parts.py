@@ -43,20 +43,24 @@ def require_design_keys(system: System, work: str = "design") -> None:
     if experiment.initial.control is None and system.controls:
         raise ExperimentError(
             f"{experiment.source}: {work} needs `initial.control`, the control from which it "
-            f"starts, for example {_control_example(experiment)}; `mjfim init "
+            f"starts, for example {_control_example(system)}; `mjfim init "
             f"{experiment.model}` writes a whole file with amplitudes that suit the model"
         )
 
 
-def _control_example(experiment: Experiment) -> str:
+def _control_example(system: System) -> str:
     """Initial control that a message proposes.
 
     It varies about the control of the keyframe, which is the default offset, where one is stated.
     """
     text = 'control = { kind = "multisine", amplitude = 1.0 }'
-    stated = experiment.initial.keyframe
+    initial, model = system.experiment.initial, system.model
+    names = [model.key(i).name for i in range(model.nkey) if model.key(i).name]
+    stated = initial.keyframe
     if stated is None:
-        return f"{text} in [initial]"
+        is_free = names and initial.qpos is None
+        offer = f", about the control of a keyframe with keyframe = {names[0]!r}" if is_free else ""
+        return f"{text} in [initial]{offer}"
     return (
         f"{text} in [initial], about the control of the keyframe {shortened(repr(stated))}, or "
         'control = { kind = "constant", amplitude = 0.0 }, which holds it'

@@ -1151,7 +1151,7 @@ def test_faults_in_python_are_experiment_errors(values: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("initial", "fragment"),
     [
-        ({}, 'for example control = { kind = "multisine", amplitude = 1.0 } in [initial]; `mjfim'),
+        ({}, 'for example control = { kind = "multisine", amplitude = 1.0 } in [initial], about'),
         ({"keyframe": "hanging"}, "about the control of the keyframe 'hanging', or control = {"),
     ],
 )
