@@ -22,6 +22,9 @@ ANNOUNCED_SECONDS = 20.0
 # Duration of one iteration from which a design is refused, unless it states as much time [s].
 LONGEST_ITERATION = 3600.0
 
+# Share of the longest iteration below which its time need not be known accurately.
+NEGLIGIBLE_SHARE = 0.1
+
 # Passes over the data that a fit usually needs, with its intervals and predictions.
 USUAL_PASSES = 10
 
@@ -44,7 +47,7 @@ def announce_design(
     Raises:
         ExperimentError: A single iteration would take hours, and no such time is stated.
     """
-    experiment, descent = system.experiment, system.experiment.descent
+    descent = system.experiment.descent
     most = max(descent.max_iterations, 1)
     iteration = iteration_seconds(system, negligible=ANNOUNCED_SECONDS / most)
     if iteration is None:
@@ -53,11 +56,7 @@ def announce_design(
     # A single iteration that takes hours is a mistyped horizon or rate, as a rule.
     stated = 0.0 if is_default else (descent.seconds or 0.0)
     if iteration > max(longest_iteration, stated):
-        raise ExperimentError(
-            f"{experiment.source}: horizon: {experiment.horizon:g} s at {experiment.rate:g} Hz: "
-            f"one iteration would take about {in_words(iteration)}; {QUICKER} (descent.seconds = "
-            f"{2.0 * iteration:.1g} permits it)"
-        )
+        raise ExperimentError(_refusal_of_iteration(system, iteration))
 
     starts = number_of_starts(system)
     longest = most * -(-starts // min(cores(), starts)) * iteration
@@ -73,6 +72,33 @@ def announce_design(
     _say(
         f"one iteration takes about {in_words(iteration)}, and the design {duration}; "
         f"{BEST_IS_KEPT}"
+    )
+
+
+def refusal_of_design(system: System, longest_iteration: float = LONGEST_ITERATION) -> str | None:
+    """Say why a design is refused because of its duration, as the design itself does.
+
+    Args:
+        system: The system, whose experiment states the design.
+        longest_iteration: Time of one iteration from which the design is refused [s].
+
+    Returns:
+        The sentence; None where the design is not refused.
+    """
+    stated = system.experiment.descent.seconds or 0.0
+    iteration = iteration_seconds(system, negligible=NEGLIGIBLE_SHARE * longest_iteration)
+    if iteration is None or iteration <= max(longest_iteration, stated):
+        return None
+    return _refusal_of_iteration(system, iteration)
+
+
+def _refusal_of_iteration(system: System, iteration: float) -> str:
+    """Sentence about a single iteration that takes too long: its time [s]."""
+    experiment = system.experiment
+    return (
+        f"{experiment.source}: horizon: {experiment.horizon:g} s at {experiment.rate:g} Hz: one "
+        f"iteration would take about {in_words(iteration)}; {QUICKER} (descent.seconds = "
+        f"{2.0 * iteration:.1g} permits it)"
     )
 
 

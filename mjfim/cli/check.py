@@ -9,7 +9,7 @@ import typer
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.cli.announcements import announce_check, announce_recordings
+from mjfim.cli.announcements import announce_check, announce_recordings, refusal_of_design
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -73,6 +73,11 @@ def check(
     else:
         require_design_keys(system, "check without recordings")
         announce_check(system, _stated_control(system))
+
+    # A design whose iterations take hours is refused, which depends on the machine.
+    refused = None
+    if not loaded and trajectory is None and system.controls:
+        refused = refusal_of_design(system)
     with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
 
@@ -82,7 +87,9 @@ def check(
     print_result(as_json, result.summary(), render(describe_check(result)))
     if output is not None:
         errors.print(f"wrote {output}/", markup=False)
-    raise typer.Exit(0 if result.ok else 1)
+    if refused is not None:
+        errors.print(f"mjfim: `mjfim design` refuses this experiment: {refused}", markup=False)
+    raise typer.Exit(0 if result.ok and refused is None else 1)
 
 
 def _stated_control(system: System) -> Array:

@@ -266,16 +266,24 @@ def _identifiability(task: DesignTask, begin: DesignPoint) -> Identifiability:
 
     They are looked for along the control with which the search begins and along random controls.
     """
-    if begin.information is None or begin.trajectory is None or begin.sensitivity is None:
-        reason = "when the parameters change slightly along the initial control"
-        if task.samples_of_parameters is not None:
-            reason += (
-                ", or at a parameter sample of [robust]; state bounds within which the model is "
-                "valid"
-            )
-        raise SimulationDivergedError(f"the simulation diverges {reason}")
-
+    require_evaluated(task, begin)
+    if begin.trajectory is None or begin.sensitivity is None:
+        raise SimulationDivergedError("the trajectory diverges")
     return task.identifiability_test.along(begin.trajectory, begin.sensitivity)
+
+
+def require_evaluated(task: DesignTask, begin: DesignPoint) -> None:
+    """Raise SimulationDivergedError where the control with which a search begins diverges."""
+    values = (begin.information, begin.trajectory, begin.sensitivity)
+    if all(value is not None for value in values):
+        return
+
+    reason = "when the parameters change slightly along the initial control"
+    if task.samples_of_parameters is not None:
+        reason += (
+            ", or at a parameter sample of [robust]; state bounds within which the model is valid"
+        )
+    raise SimulationDivergedError(f"the simulation diverges {reason}")
 
 
 def _scaled_start(limited: LimitedCost, control: Array, budget: Budget) -> InsideControl | None:

@@ -80,6 +80,24 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
     )
 
 
+def growth_along(task: DesignTask, trajectory: Trajectory) -> float:
+    """Largest open-loop amplification of a small deviation along a trajectory."""
+    A = task.plant.derivatives.jacobians(task.theta, trajectory)[0]
+    return largest_amplification(A, regulator_for(task).state_sizes)
+
+
+def growth_warning(growth: float) -> str | None:
+    """Warning about strong growth of small disturbances; None where it is not strong."""
+    if not growth > UNSTABLE_GROWTH:
+        return None
+
+    return (
+        f"a small disturbance grows up to {growth:.1e}-fold along this trajectory when its control "
+        "is played open loop; the predicted sigma assumes that there is no disturbance. Play it "
+        "with the gains of design.npz, or raise cost.control"
+    )
+
+
 def evaluate(
     experiment: Experiment, trajectory: Trajectory, *, threads: int | None = None
 ) -> Evaluation:
@@ -173,12 +191,9 @@ def design_warnings(
             "there, it may rest on spurious information caused by the saturation, and the descent "
             "may have stopped early; raise cost.control or begin with a smaller initial control"
         )
-    if final.growth > UNSTABLE_GROWTH:
-        yield (
-            f"a small disturbance grows up to {final.growth:.1e}-fold along this trajectory when "
-            "its control is played open loop; the predicted sigma assumes that there is no "
-            "disturbance. Play it with the gains of design.npz, or raise cost.control"
-        )
+    unstable = growth_warning(final.growth)
+    if unstable is not None:
+        yield unstable
     yield from _limit_warnings(found)
     yield from open_boundary_warnings(task)
     if found.deviation > SAME_STATE_TOLERANCE:

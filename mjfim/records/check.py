@@ -11,7 +11,7 @@ import numpy as np
 from mjfim.arrays import Array, freeze
 from mjfim.errors import first_ones
 from mjfim.records.combinations import ParameterGroup
-from mjfim.records.design import CombinationAccuracy
+from mjfim.records.design import CombinationAccuracy, LimitViolation
 from mjfim.records.shown import ShownRecord
 
 # Two parameters are confounded if the absolute correlation of their estimates exceeds this number.
@@ -196,6 +196,8 @@ class Check(ShownRecord):
             are equal.
         missing: What was not computed because the check was stopped, in words; empty where it is
             complete.
+        refused: Reasons why `mjfim design` refuses the experiment, in its own words.
+        violations: Limits that the motion of the initial control violates.
     """
 
     source: str
@@ -212,6 +214,8 @@ class Check(ShownRecord):
     verdict: tuple[str, ...]
     combined: tuple[CombinationAccuracy, ...] = ()
     missing: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
+    violations: tuple[LimitViolation, ...] = ()
 
     file_stem: ClassVar[str] = "check"
     made_by: ClassVar[str] = "`mjfim check EXPERIMENT -o DIR`"
@@ -236,8 +240,9 @@ class Check(ShownRecord):
     def ok(self) -> bool:
         """True if the check found no fault.
 
-        The derivatives agree, all parameters are identifiable, and one repetition reaches every
-        stated accuracy.
+        The derivatives agree, all parameters are identifiable, one repetition reaches every stated
+        accuracy, and a design would not refuse the experiment. Limits that the initial control
+        violates are no fault, because a design looks for a motion inside.
         """
         known = {row.name for row in self.rows if np.isfinite(row.std)}
 
@@ -246,7 +251,7 @@ class Check(ShownRecord):
 
         stated = [row for row in self.rows if row.stated and not row.nuisance]
         reached = all(row.repetitions == 1 for row in stated)
-        passed = self.self_test.passed and not self.missing
+        passed = self.self_test.passed and not self.missing and not self.refused
         return passed and separable and not self.not_excited and reached
 
     def summary(self) -> dict[str, Any]:
@@ -262,6 +267,8 @@ class Check(ShownRecord):
             "ok": self.ok,
             "complete": not self.missing,
             "missing": list(self.missing),
+            "refused": list(self.refused),
+            "violations": [violation.summary() for violation in self.violations],
             "verdict": list(self.verdict),
             "source": self.source,
             "horizon": self.horizon,

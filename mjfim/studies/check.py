@@ -6,13 +6,14 @@ It needs no fit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import RecordingError, SimulationDivergedError, first_ones, shortened
+from mjfim.excitation.design import require_evaluated
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task import DesignTask
@@ -42,6 +43,7 @@ from mjfim.records.progress import shown_progress
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.derivative_test import self_test
+from mjfim.studies.design_outlook import DesignOutlook
 
 # Target standard deviation where none is stated, relative to the size of the parameter.
 DEFAULT_RELATIVE_STD = 0.05
@@ -105,7 +107,10 @@ def check_task(
     if trajectory is not None:
         curve, source = task.plant.simulate(task.theta, trajectory.ctrl), "the given trajectory"
 
+    # A start that diverges is refused in the words of a design.
     problem, point = _evaluate(task, curve)
+    if trajectory is None:
+        require_evaluated(task, point)
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
@@ -114,14 +119,19 @@ def check_task(
         stage = _Stages(token)
         test = task.identifiability_test
         identifiability = stage.identifiability(test.along, curve, point.sensitivity)
+        tested = stage.test_derivatives(task, problem, point, identifiability)
+        outlook = DesignOutlook()
+        if trajectory is None and not token.requested:
+            outlook = DesignOutlook.of(task, identifiability)
         return _Assessment(
             task=task,
             source=source,
             duration=float(curve.t[-1]),
             identifiability=identifiability,
             data=_common_information(task, [point.information - task.information.prior]),
-            tested=stage.test_derivatives(task, problem, point, identifiability),
+            tested=tested,
             missing=tuple(stage.missing),
+            outlook=outlook,
         ).check()
 
 
@@ -266,6 +276,7 @@ class _Assessment:
         data: (p, p) information of the checked data [1 / theta-unit^2], without priors.
         tested: Test of the derivatives.
         missing: What was left out after a request to stop, in words.
+        outlook: What a design would say about the initial control.
     """
 
     task: DesignTask
@@ -275,6 +286,7 @@ class _Assessment:
     data: Array
     tested: SelfTest
     missing: tuple[str, ...]
+    outlook: DesignOutlook = field(default_factory=DesignOutlook)
 
     def check(self) -> Check:
         """The record for the user."""
@@ -323,9 +335,15 @@ class _Assessment:
             not_separable=found.groups_along_all,
             not_excited=not_excited,
             self_test=self.tested,
-            verdict=(*verdict.sentences(), *_probable_degrees(task)),
+            verdict=(
+                *self.outlook.sentences(),
+                *verdict.sentences(),
+                *_probable_degrees(task),
+            ),
             combined=combined,
             missing=self.missing,
+            refused=self.outlook.refused,
+            violations=self.outlook.violations,
         )
 
     def _information(self) -> FisherInformation:

@@ -67,7 +67,12 @@ def self_test(
     tested = replace(tested, recursion=recursion_error(task, trajectory, point.sensitivity))
     if stop():
         return tested
-    tested = replace(tested, slope=slope_error(task, problem, point), finished=True)
+    try:
+        slope = slope_error(task, problem, point)
+    except np.linalg.LinAlgError:
+        # The motion is so unstable that no direction of descent can be computed.
+        slope = np.inf
+    tested = replace(tested, slope=slope, finished=True)
 
     # The result of the roughness test names its cause. The likely cause of any other failure is the
     # first constraint that acts.
