@@ -201,7 +201,8 @@ def _judge_estimate(found: Walk, folder: Path) -> None:
     estimate = _read(file)
     robot = tomllib.loads((folder / ROBOT).read_text(encoding="utf-8"))["parameters"]
     true = np.array([robot[name]["true"] for name in estimate["parameters"]])
-    low, high = np.array(estimate["interval"])[: len(true)].T
+    # An interval without a finite end is null in JSON; it counts as missed.
+    low, high = np.array(estimate["interval"], dtype=float)[: len(true)].T
     found.inside = int(((low <= true) & (true <= high)).sum())
     found.parameters = len(true)
     found.misfit = bool(estimate["misfit"])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
-from scripts.newcomer import Walk, markdown, violations, walk
+from scripts.newcomer import Walk, _judge_estimate, markdown, violations, walk
 
 SERVO = """
 <mujoco>
@@ -107,6 +108,21 @@ def test_the_table_has_a_row_for_each_model() -> None:
     assert lines[2].startswith("| arm | 0 | 0 (2 s) | 1 (3 s) | 0 (50 s) | no end (600 s) |")
     assert "12.3 (start breaks limits) | 9 of 10 | no: force of servo" in lines[2]
     assert lines[3] == "| odd | 0 | 2 (1 s) | — | — | — | — | — | — |"
+
+
+def test_an_interval_without_ends_is_missed(tmp_path: Path) -> None:
+    (tmp_path / "fit").mkdir()
+    estimate = {
+        "parameters": ["m", "c"],
+        "interval": [[0.9, 1.2], [None, None]],
+        "misfit": False,
+    }
+    (tmp_path / "fit" / "estimate.json").write_text(json.dumps(estimate), encoding="utf-8")
+    robot = "[parameters]\nm = { true = 1.05 }\nc = { true = 0.1 }\n"
+    (tmp_path / "robot.toml").write_text(robot, encoding="utf-8")
+    found = Walk(model="arm")
+    _judge_estimate(found, tmp_path)
+    assert (found.inside, found.parameters) == (1, 2)
 
 
 # Upright, so that the experiment is short.
