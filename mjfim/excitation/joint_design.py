@@ -19,6 +19,7 @@ from mjfim.errors import (
 )
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
 from mjfim.information.marginal import shared
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
@@ -70,6 +71,8 @@ def design_jointly(
     ):
         tasks = [DesignTask.resolve(experiment, threads=threads) for experiment in experiments]
         _require_common_parameters(tasks)
+        for task in tasks:
+            require_controls(task.system, "the joint design")
 
         information = [_initial_information(task) for task in tasks]
         designs: list[Design | None] = [None] * len(tasks)

@@ -25,6 +25,7 @@ from mjfim.excitation.target_accuracy import (
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
@@ -200,6 +201,7 @@ def shortest_experiment(
         shown_progress("designing", callback, progress) as show,
     ):
         task = DesignTask.resolve(experiment, threads=threads)
+        require_controls(task.system, "the search for the shortest horizon")
         search = _HorizonSearch(task, tolerance, show, executor, token)
         return search.run(_default_longest(task) if longest is None else longest)
 

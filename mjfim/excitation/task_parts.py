@@ -67,6 +67,28 @@ def _control_example(system: System) -> str:
     )
 
 
+def require_controls(system: System, work: str) -> None:
+    """Check that controls are designed, for work that compares or continues them.
+
+    Args:
+        system: The system.
+        work: Name of the work, for the message.
+
+    Raises:
+        ExperimentError: The model has no actuators, or `initial.free` is stated.
+    """
+    if system.controls and not system.experiment.initial.free:
+        return
+
+    reason = "the model has no actuators"
+    if system.controls:
+        reason = "initial.free lets the design choose the initial state instead"
+    raise ExperimentError(
+        f"{system.experiment.source}: {work} is for designs of a control, and {reason}; use "
+        "`mjfim design`"
+    )
+
+
 def sample_count(experiment: Experiment, stride: int) -> int:
     """Number of samples in the horizon.
 

@@ -23,6 +23,7 @@ from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.feasibility import shrink_until_feasible
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import require_controls
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import run_in_order, workers_of
@@ -183,6 +184,7 @@ def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str
         ExperimentError: No baseline is requested, a key is unknown, or its method is not
             applicable.
     """
+    require_controls(task.system, "compare")
     if methods is None:
         return tuple(
             key for key, baseline in METHODS.items() if task.is_limited or not baseline.needs_limits

@@ -113,6 +113,16 @@ def test_faults_are_named(free: dict[str, Any], message: str, tmp_path: Path) ->
         mjfim.design(short(tmp_path, initial={"free": free}))
 
 
+def test_studies_of_controls_refuse_a_release(tmp_path: Path) -> None:
+    experiment = short(tmp_path)
+    with pytest.raises(ExperimentError, match="compare is for designs of a control"):
+        mjfim.compare(experiment)
+    with pytest.raises(ExperimentError, match="shortest horizon is for designs of a control"):
+        mjfim.shortest_experiment(experiment)
+    with pytest.raises(ExperimentError, match="joint design is for designs of a control"):
+        mjfim.design_jointly([experiment, experiment])
+
+
 @pytest.mark.slow
 def test_a_pendulum_at_rest_is_released_where_it_moves(tmp_path: Path) -> None:
     """The stated release tells nothing; position and velocity are chosen together."""
