@@ -35,7 +35,11 @@ QUICKER = "a shorter horizon, a lower rate or a longer timestep makes it quicker
 
 
 def announce_design(
-    system: System, *, is_default: bool, longest_iteration: float = LONGEST_ITERATION
+    system: System,
+    *,
+    is_default: bool,
+    longest_iteration: float = LONGEST_ITERATION,
+    work: str = "the design",
 ) -> None:
     """Say how long a design takes, if it is long.
 
@@ -43,6 +47,7 @@ def announce_design(
         system: The system, whose experiment states the design.
         is_default: True if the time of the design is the default, not what the user stated.
         longest_iteration: Time of one iteration from which the design is refused [s].
+        work: The work that takes this time, in words.
 
     Raises:
         ExperimentError: A single iteration would take hours, and no such time is stated.
@@ -69,10 +74,7 @@ def announce_design(
         end = max(descent.seconds, iteration)
         key = "default of descent.seconds" if is_default else "descent.seconds"
         duration = f"at most about {in_words(end)} ({key}: {descent.seconds:g} s)"
-    _say(
-        f"one iteration takes about {in_words(iteration)}, and the design {duration}; "
-        f"{BEST_IS_KEPT}"
-    )
+    _say(f"one iteration takes about {in_words(iteration)}, and {work} {duration}; {BEST_IS_KEPT}")
 
 
 def refusal_of_design(system: System, longest_iteration: float = LONGEST_ITERATION) -> str | None:

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.cli.announcements import announce_design
 from mjfim.cli.common import (
     ExperimentFile,
     Folder,
@@ -96,6 +97,8 @@ def campaign(
     names = run.folder.next_files(simulated=simulated)
     claim_folder(output, names, input_files(stated, recordings or []), force=force)
 
+    # Every round makes a design; its recordings add less time.
+    announce_design(run.task.system, is_default=False, work="the design of a round")
     found = run.simulated(rounds, seed) if simulated else run.real(rounds, recordings or [])
 
     keep_result(output)

@@ -42,6 +42,10 @@ KINDS = (*LIMIT_KINDS, "clearance")
 # Largest number of robots; more would take days.
 MAX_RUNS = 100_000
 
+# Largest relative error of a guess, and largest ratio of the noise to the stated one. Robots beyond
+# them have nothing in common with the model, and their numbers overflow in the end.
+MAX_WRONG, MAX_NOISE = 10.0, 1e6
+
 # Default reserve of a design, as fractions of half ranges. The servo arm needs these for parameters
 # that are wrong by 20 %.
 DEFAULT_RESERVE = ("position=0.05", "velocity=0.3", "force=0.25")
@@ -61,7 +65,10 @@ def robustness(
     ] = Path("out/robustness"),
     runs: Annotated[int, typer.Option(min=1, max=MAX_RUNS, help="Number of robots.")] = 100,
     wrong: Annotated[
-        float, typer.Option(min=0.0, help="Relative error of the guess of every parameter.")
+        float,
+        typer.Option(
+            min=0.0, max=MAX_WRONG, help="Relative error of the guess of every parameter."
+        ),
     ] = 0.2,
     latency: Annotated[
         float | None,
@@ -75,7 +82,10 @@ def robustness(
         typer.Option("--feedback", help="The controller adds the gains times the deviation."),
     ] = False,
     noise: Annotated[
-        float, typer.Option(min=0.0, help="Ratio of the robots' noise to the stated noise.")
+        float,
+        typer.Option(
+            min=0.0, max=MAX_NOISE, help="Ratio of the robots' noise to the stated noise."
+        ),
     ] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
     jobs: Annotated[

@@ -28,7 +28,7 @@ class Quantity:
         value: The number.
         digits: Significant digits.
         suffix: Text behind it, with its space: " %", " s", " ×".
-        infinite: Words for an infinite value, where words are wanted.
+        infinite: Words for a positive infinite value, where words are wanted.
     """
 
     value: float
@@ -40,7 +40,7 @@ class Quantity:
         if np.isnan(self.value):
             return "-"
         if np.isinf(self.value):
-            return self.infinite
+            return self.infinite if self.value > 0.0 else f"-{self.infinite}"
         return f"{self.value:.{self.digits}g}{self.suffix}"
 
 

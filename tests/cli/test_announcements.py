@@ -51,6 +51,15 @@ def test_the_time_of_a_design_is_announced(
     assert "(default of descent.seconds: 0.001 s)" in capsys.readouterr().err
 
 
+def test_the_design_of_a_round_is_announced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A campaign makes several designs."""
+    system = _system(tmp_path, 4000.0)
+    announce_design(system, is_default=False, work="the design of a round")
+    assert ", and the design of a round at most about" in capsys.readouterr().err
+
+
 def test_a_short_design_is_not_announced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

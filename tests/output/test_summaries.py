@@ -124,6 +124,7 @@ def test_cells_in_words() -> None:
     assert str(Quantity(value=0.12345, digits=2, suffix=" %")) == "0.12 %"
     assert str(Quantity(value=np.nan)) == "-"
     assert str(Quantity(value=np.inf, infinite="not alone")) == "not alone"
+    assert (str(Quantity(value=np.inf)), str(Quantity(value=-np.inf))) == ("∞", "-∞")
 
 
 def test_bars_do_not_break_a_markdown_table(design: Design, task: DesignTask) -> None:
