@@ -232,7 +232,7 @@ class ReleaseSearch:
         for number, start in enumerate(starts, start=1):
             if self.budget.exhausted:
                 break
-            name = f"search {number} of {len(starts)} from a release of the grid"
+            name = f"grid release {number} of {len(starts)}"
             results[name] = self._local_search(name, start)
         return results
 

@@ -400,6 +400,18 @@ def test_convergence_of_empty_short_and_negative_histories(tmp_path: Path) -> No
         render(plots.convergence(dataclasses.replace(design, history=history)), tmp_path)
 
 
+def test_the_first_iterate_is_called_initial_only_where_it_is() -> None:
+    """A search from another start than the initial control names that start."""
+    design = dataclasses.replace(make_design(), found_by="multisine 4 of 9")
+    first = design.history[0]
+
+    for cost, label in ((design.initial.cost, "initial"), (7e7, "start: multisine 4 of 9")):
+        history = (dataclasses.replace(first, cost=cost), *design.history[1:])
+        figure = plots.convergence(dataclasses.replace(design, history=history))
+        texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+        assert label in texts
+
+
 def test_convergence_is_logarithmic() -> None:
     assert [axes.get_yscale() for axes in plots.convergence(make_design()).axes] == ["log"] * 3
 

@@ -392,7 +392,7 @@ def convergence(design: Design) -> Figure:
             color=INITIAL_COLOUR,
             marker="o",
             linestyle="",
-            label=f"start: {design.found_by}",
+            label=_start_label(design),
         ),
         Line2D([], [], color=OPTIMIZED_COLOUR, marker="o", linestyle="", label="optimized"),
     ]
@@ -406,6 +406,14 @@ def convergence(design: Design) -> Figure:
         )
     add_title(figure, "Convergence", handles, note)
     return figure
+
+
+def _start_label(design: Design) -> str:
+    """Return the name of the first iterate, which is not the initial trajectory in every search."""
+    costs = [row.cost for row in design.history[:1]]
+    if not costs or np.isclose(costs[0], design.initial.cost, rtol=1e-9, atol=0.0):
+        return "initial"
+    return f"start: {design.found_by}"
 
 
 def _draw_history(
