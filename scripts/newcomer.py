@@ -189,7 +189,9 @@ def _write_robot(folder: Path) -> None:
     document = tomlkit.parse((folder / EXPERIMENT).read_text(encoding="utf-8"))
     tables: Any = document["parameters"]
     for name, value in zip(design["parameters"], design["theta"], strict=True):
-        tables[name]["true"] = (1.0 + DIFFERENCE) * value
+        # The unknown initial state has no table; the robot begins as the model does.
+        if name in tables:
+            tables[name]["true"] = (1.0 + DIFFERENCE) * value
     (folder / ROBOT).write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
@@ -200,9 +202,10 @@ def _judge_estimate(found: Walk, folder: Path) -> None:
         return
     estimate = _read(file)
     robot = tomllib.loads((folder / ROBOT).read_text(encoding="utf-8"))["parameters"]
-    true = np.array([robot[name]["true"] for name in estimate["parameters"]])
+    stated = [j for j, name in enumerate(estimate["parameters"]) if name in robot]
+    true = np.array([robot[estimate["parameters"][j]]["true"] for j in stated])
     # An interval without a finite end is null in JSON; it counts as missed.
-    low, high = np.array(estimate["interval"], dtype=float)[: len(true)].T
+    low, high = np.array(estimate["interval"], dtype=float)[stated].T
     found.inside = int(((low <= true) & (true <= high)).sum())
     found.parameters = len(true)
     found.misfit = bool(estimate["misfit"])

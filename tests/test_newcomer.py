@@ -111,10 +111,11 @@ def test_the_table_has_a_row_for_each_model() -> None:
 
 
 def test_an_interval_without_ends_is_missed(tmp_path: Path) -> None:
+    """An unknown initial state, which has no table in the file, is not judged."""
     (tmp_path / "fit").mkdir()
     estimate = {
-        "parameters": ["m", "c"],
-        "interval": [[0.9, 1.2], [None, None]],
+        "parameters": ["initial qpos:hinge", "m", "c"],
+        "interval": [[0.0, 0.1], [0.9, 1.2], [None, None]],
         "misfit": False,
     }
     (tmp_path / "fit" / "estimate.json").write_text(json.dumps(estimate), encoding="utf-8")
