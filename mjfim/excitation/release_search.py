@@ -247,6 +247,7 @@ class ReleaseSearch:
         self._name = name
 
         def seen(shares: Array) -> Release:
+            """Evaluate a release inside its ranges, and remember it."""
             release = self.evaluate(np.clip(shares, 0.0, 1.0))
             reached.append(release)
             return release

@@ -17,7 +17,7 @@ from mjfim.records.design import LimitViolation
 
 @dataclass(frozen=True, kw_only=True)
 class DesignOutlook:
-    """What a design would say about the initial control.
+    """Judgement of a design about the initial control, before it begins.
 
     Attributes:
         refused: Reasons why a design refuses the experiment, in its own words; empty where it does

@@ -213,7 +213,7 @@ def _drives_by_joint(plan: RobotPlan) -> dict[str, list[Drive]]:
 
 
 def _content(positions: str | None, are_servos: bool) -> Positions:
-    """What the positions of the trajectory are."""
+    """Choose the kind of positions in the trajectory; ExperimentError for an unknown kind."""
     if positions is None:
         return "command" if are_servos else "motion"
 

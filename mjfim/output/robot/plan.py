@@ -29,7 +29,7 @@ from mjfim.records.playback import Playback
 
 
 class DriveKind(Enum):
-    """What the control of an actuator means."""
+    """Meaning of the control of an actuator."""
 
     FORCE = "force or torque"
     POSITION = "position of a servo"
@@ -172,7 +172,7 @@ def _holds_position(model: Any, actuator: int) -> bool:
 
 
 def _kind(model: Any, actuator: int) -> DriveKind:
-    """What the control of an actuator with one control means."""
+    """Meaning of the control of an actuator that has one control."""
     has_fixed_gain = int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
     if not has_fixed_gain or not has_gain or is_integrated(model, actuator):

@@ -134,7 +134,7 @@ class Plan:
         return float(self.t[-1] - self.t[0]) / len(self.ctrl)
 
     def measured(self, reading: Reading) -> dict[str, float]:
-        """What the robot measured, by name.
+        """Measured values by name.
 
         Args:
             reading: What `read_state` returned.
@@ -235,7 +235,7 @@ class Plan:
 
 @dataclass
 class Report:
-    """What was played.
+    """Account of a design that was played.
 
     Attributes:
         rows: Number of controls that were sent.
@@ -439,7 +439,7 @@ def _with_default(values: Sequence[float | None], default: float) -> np.ndarray:
 
 
 def describe(plan: Plan) -> str:
-    """What a design needs, in words."""
+    """Describe in words what a design needs."""
     lines = [
         f"design {SETTINGS['name']}: {plan.t[-1]:g} s, {len(plan.ctrl)} rows at "
         f"{1.0 / plan.period:g} Hz",
