@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from mjfim.excitation.constraints import SUBSTEP_KINDS
 from mjfim.output.plots.style import (
     GRID_COLOUR,
     MUTED_COLOUR,
@@ -22,20 +23,7 @@ from mjfim.output.plots.style import (
 from mjfim.records.design import Design, LimitUsage
 
 # Kinds of limits in the order of their panels.
-LIMIT_KINDS = (
-    "position",
-    "tilt",
-    "velocity",
-    "angular_velocity",
-    "acceleration",
-    "force",
-    "joint_force",
-    "tendon_force",
-    "tendon_length",
-    "control",
-    "control_rate",
-    "clearance",
-)
+LIMIT_KINDS = (*SUBSTEP_KINDS, "control", "control_rate", "clearance")
 
 # Colours of the curves that come closest to a bound, the closest first; these curves are named in
 # the legend.
