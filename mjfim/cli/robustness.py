@@ -33,7 +33,7 @@ from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
 from mjfim.output.summaries.robustness import describe_robustness
 from mjfim.output.text import render
 from mjfim.parallel import cores
-from mjfim.records.robustness import RobotConditions, Robustness
+from mjfim.records.robustness import MAX_NOISE, MAX_WRONG, RobotConditions, Robustness
 from mjfim.studies.robustness import assess_robustness, default_latency
 
 # Kinds of limits from which a design can keep a reserve.
@@ -41,10 +41,6 @@ KINDS = (*LIMIT_KINDS, "clearance")
 
 # Largest number of robots; more would take days.
 MAX_RUNS = 100_000
-
-# Largest relative error of a guess, and largest ratio of the noise to the stated one. Robots beyond
-# them have nothing in common with the model, and their numbers overflow in the end.
-MAX_WRONG, MAX_NOISE = 10.0, 1e6
 
 # Default reserve of a design, as fractions of half ranges. The servo arm needs these for parameters
 # that are wrong by 20 %.
@@ -67,7 +63,7 @@ def robustness(
     wrong: Annotated[
         float,
         typer.Option(
-            min=0.0, max=MAX_WRONG, help="Relative error of the guess of every parameter."
+            help=f"Relative error of the guess of every parameter, from 0 to {MAX_WRONG:g}."
         ),
     ] = 0.2,
     latency: Annotated[
@@ -84,7 +80,7 @@ def robustness(
     noise: Annotated[
         float,
         typer.Option(
-            min=0.0, max=MAX_NOISE, help="Ratio of the robots' noise to the stated noise."
+            help=f"Ratio of the robots' noise to the stated noise, from 0 to {MAX_NOISE:g}."
         ),
     ] = 1.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,

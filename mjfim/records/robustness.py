@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.errors import ExperimentError
 from mjfim.records.shown import ShownRecord
 
 # Probability with which the intervals and joint regions should hold the true values.
@@ -21,6 +22,10 @@ REQUIRED_COVERAGE = 0.90
 
 # Default delay of the control of a simulated robot [s]; it is rounded up to whole timesteps.
 LATENCY = 5e-3
+
+# Largest relative error of a guess, and largest ratio of the noise to the stated one. Robots beyond
+# them have nothing in common with the model, and their numbers overflow in the end.
+MAX_WRONG, MAX_NOISE = 10.0, 1e6
 
 # Smallest reserve, as a fraction of half a range; smaller values are round-off.
 MIN_RESERVE = 1e-9
@@ -36,6 +41,9 @@ class RobotConditions:
         feedback: True if the controller adds the gains times the measured deviation.
         loudness: Ratio of the robot's noise to the stated noise.
         seed: Seed of the random numbers.
+
+    Raises:
+        ExperimentError: A number is outside its range.
     """
 
     wrong: float = 0.2
@@ -43,6 +51,17 @@ class RobotConditions:
     feedback: bool = False
     loudness: float = 1.0
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value, most in (
+            ("wrong", self.wrong, MAX_WRONG),
+            ("noise", self.loudness, MAX_NOISE),
+        ):
+            if not 0.0 <= value <= most:
+                raise ExperimentError(f"{name}: {value:g} is not a number from 0 to {most:g}")
+
+        if not 0.0 <= self.latency < np.inf:
+            raise ExperimentError(f"latency: {self.latency:g} is not a finite number of at least 0")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

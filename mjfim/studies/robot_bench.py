@@ -89,7 +89,6 @@ class RobotBench:
                 conditions cannot be simulated.
             RecordingError: The design cannot be read.
         """
-        _require_finite(conditions)
         self.conditions = conditions
         stated = DesignTask.resolve(experiment, threads=1)
         self.plan = read_playback(table, stated.system.channels)
@@ -577,19 +576,3 @@ def _assessed_limits(task: DesignTask, constraints: ConstraintSet) -> tuple[Limi
             )
         )
     return (*within, *others)
-
-
-def _require_finite(conditions: RobotConditions) -> None:
-    """Require that the numbers of the conditions are finite and not negative.
-
-    Raises:
-        ExperimentError: A number is not.
-    """
-    numbers = {
-        "wrong": conditions.wrong,
-        "latency": conditions.latency,
-        "noise": conditions.loudness,
-    }
-    for name, value in numbers.items():
-        if not 0.0 <= value < np.inf:
-            raise ExperimentError(f"{name}: {value:g} is not a finite number of at least 0")

@@ -156,14 +156,11 @@ def test_version() -> None:
         ("check", "study.toml", "--threads", "1000000"),
         ("design", "study.toml", "-o", "out", "--starts", "1000000000"),
         ("robustness", "study.toml", "--runs", "1000000000"),
-        ("robustness", "study.toml", "--wrong", "1e300"),
-        ("robustness", "study.toml", "--noise", "1e300"),
     ],
-    ids=["threads", "starts", "runs", "wrong", "noise"],
+    ids=["threads", "starts", "runs"],
 )
 def test_amounts_beyond_a_bound_are_refused(words: tuple[str, ...]) -> None:
     """The message states the bound."""
     result = run(*words)
     assert result.exit_code == 2
-    told = " ".join(result.stderr.replace("│", " ").split())
-    assert "less than or equal to" in told or "is not in the range" in told
+    assert "less than or equal to" in " ".join(result.stderr.replace("│", " ").split())

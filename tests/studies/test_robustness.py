@@ -13,7 +13,12 @@ import pytest
 from scipy.stats import binom
 
 import mjfim
-from mjfim.errors import ExperimentError, NoResultError, RecordingError
+from mjfim.errors import (
+    ExperimentError,
+    NoResultError,
+    RecordingError,
+    SimulationDivergedError,
+)
 from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import control_of_earlier_design
 from mjfim.excitation.task import DesignTask
@@ -621,8 +626,10 @@ def test_the_player_script_walks_through_the_plan(
         (["--latency", "nan"], "latency: nan is not a finite number of at least 0"),
         (["--latency", "inf"], "latency: inf is not a finite number of at least 0"),
         (["--latency", "1e300"], "latency: 1e+300 s is longer than the design, which lasts 2 s"),
-        (["--latency", 0.0, "--wrong", "inf"], "wrong: inf is not a finite number"),
-        (["--latency", 0.0, "--noise", "inf"], "noise: inf is not a finite number"),
+        (["--latency", 0.0, "--wrong", "inf"], "wrong: inf is not a number from 0 to 10"),
+        (["--wrong", "1e300"], "wrong: 1e+300 is not a number from 0 to 10"),
+        (["--wrong", "-1"], "wrong: -1 is not a number from 0 to 10"),
+        (["--latency", 0.0, "--noise", "inf"], "noise: inf is not a number from 0 to 1e+06"),
         (["--latency", 0.0, "--reserve", "position=0.1"], "--reserve is for a new design"),
         (["--reserve", "speed=0.1"], "unknown kind of limit 'speed'"),
     ],
@@ -636,9 +643,20 @@ def test_misuse_is_one_sentence(
 
 
 @pytest.mark.filterwarnings("error")
-def test_without_an_estimate_the_errors_are_unknown(cart: tuple[mjfim.Experiment, Path]) -> None:
-    """Noise with which no fit begins leaves no estimate, and no mean of nothing."""
-    loud = RobotConditions(latency=0.0, loudness=1e300)
-    result = mjfim.assess_robustness(*cart, runs=1, conditions=loud)
+def test_without_an_estimate_the_errors_are_unknown(
+    cart: tuple[mjfim.Experiment, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot that diverges leaves no estimate, and the study computes no mean of nothing."""
+    bench = bench_of(cart)
+
+    def diverge(*_: object) -> None:
+        raise SimulationDivergedError("the robot diverges")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench, "play", diverge)
+        runs = [bench.run(0)]
+    result = summarize_runs(bench, runs)
+
     assert np.isnan(result.observed).all() and np.isnan(result.formal).all()
+    assert result.troubles == {"the robot diverges": 1}
     assert not result.ok
