@@ -54,7 +54,7 @@ class Walk:
         codes: Exit codes by verb; None where a verb did not end in time.
         seconds: Duration by verb, with the start of Python and the pictures [s].
         messages: Last line on stderr of the verbs with another exit code than 0.
-        gain: Smallest eigenvalue of the information, optimized over initial; None without a design.
+        gain: Smallest eigenvalue of the information, designed over initial; None without a design.
         feasible_start: Whether the initial control keeps all limits.
         claimed: Whether `design` says that all limits hold.
         violations: What plain MuJoCo finds beyond its limit in the design.

@@ -23,8 +23,8 @@ from mjfim.arrays import Array
 from mjfim.errors import MjfimError
 from mjfim.output import plots
 from mjfim.output.plots.style import (
+    DESIGNED_COLOUR,
     INITIAL_COLOUR,
-    OPTIMIZED_COLOUR,
     format_number,
     format_with_uncertainty,
     quotient_unit,
@@ -255,7 +255,7 @@ def test_table_names_every_parameter_and_unit(
     text = all_text(figure)
     labels = make_labels(dofs, count)
     assert all(labels.parameter(j) in text for j in range(count))
-    assert "initial" in text and "optimized" in text
+    assert "initial" in text and "designed" in text
     render(figure, tmp_path)
 
 
@@ -263,7 +263,7 @@ def test_table_names_every_parameter_and_unit(
     "name", [n for n in (*FIGURES, *TABLES) if n not in ("fit", "parameter_intervals")]
 )
 def test_both_trajectories_are_drawn_in_their_colours(name: str) -> None:
-    assert {INITIAL_COLOUR, OPTIMIZED_COLOUR} <= all_colours((FIGURES | TABLES)[name](2, 3))
+    assert {INITIAL_COLOUR, DESIGNED_COLOUR} <= all_colours((FIGURES | TABLES)[name](2, 3))
 
 
 @pytest.mark.parametrize("name", [*FIGURES, *TABLES])

@@ -228,7 +228,7 @@ class TestDesign:
             ("bars", "log10 cost"),
             ("history", "step length"),
         ]
-        for key in ("initial", "optimized"):
+        for key in ("initial", "designed"):
             expected += [
                 ("robots", key, "bodies", "bob"),
                 ("robots", key, "bodies", "bob", "bob"),
@@ -263,7 +263,7 @@ class TestDesign:
         for origin in origins:
             assert any(path == origin or path.startswith(f"{origin}/") for path in logged), origin
 
-    @pytest.mark.parametrize("key", ["initial", "optimized"])
+    @pytest.mark.parametrize("key", ["initial", "designed"])
     def test_series_are_exact(self, file: Path, design: Design, key: str) -> None:
         side = design.initial if key == "initial" else design.final
         nanoseconds = np.rint(side.trajectory.t * 1e9).astype(np.int64)
@@ -282,7 +282,7 @@ class TestDesign:
         self, file: Path, cart: mujoco.MjModel, design: Design
     ) -> None:
         data = mujoco.MjData(cart)
-        path = ("robots", "optimized", "bodies", "bob")
+        path = ("robots", "designed", "bodies", "bob")
         times, translation = column(file, path, "sim_time", "Transform3D:translation")
         _, quaternion = column(file, path, "sim_time", "Transform3D:quaternion")
         assert len(times) == len(design.trajectory.t)
@@ -325,12 +325,12 @@ class TestDesign:
 
     def test_phase_plots_share_one_scale(self, file: Path) -> None:
         peak = {}
-        for key in ("initial", "optimized"):
+        for key in ("initial", "designed"):
             values = column(file, ("phase", "mass", key, "now"), "sim_time", "Points2D:positions")[
                 1
             ]
             peak[key] = np.abs(values[:, 0]).max(axis=0)
-        np.testing.assert_allclose(peak["optimized"], [1.5, 1.0], rtol=1e-6)
+        np.testing.assert_allclose(peak["designed"], [1.5, 1.0], rtol=1e-6)
         np.testing.assert_allclose(peak["initial"], [1.5 / 16, 1.0 / 16], rtol=1e-6)
 
     def test_file_is_replaced_only_when_the_new_one_is_complete(
@@ -370,7 +370,7 @@ class TestAnyModel:
         log_design(path, model, designed(model), labels_of_model(model))
         logged = entities(path)
         assert not [entry for entry in logged if "__warnings" in entry]
-        for key in ("initial", "optimized"):
+        for key in ("initial", "designed"):
             bodies = [model.body(b).name or f"body{b}" for b in range(1, model.nbody)]
             assert {entity_path(("robots", key, "bodies", body)) for body in bodies} <= logged
 

@@ -80,7 +80,7 @@ def _handles(*, simulated: bool) -> list[Line2D]:
     estimated = Line2D(
         [],
         [],
-        color=style.OPTIMIZED_COLOUR,
+        color=style.DESIGNED_COLOUR,
         marker="o",
         label="estimated after the round, from all recordings",
     )
@@ -109,7 +109,7 @@ def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
         markersize=8,
         zorder=2,
     )
-    axes.plot(rounds, attained, color=style.OPTIMIZED_COLOUR, marker="o", markersize=4, zorder=3)
+    axes.plot(rounds, attained, color=style.DESIGNED_COLOUR, marker="o", markersize=4, zorder=3)
 
     values = np.concatenate([predicted, attained, [wanted]])
     usable = values[np.isfinite(values) & (values > 0.0)]
@@ -161,7 +161,7 @@ def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -
     known = np.isfinite(std)
     bar = np.where(known, std, 0.0)
 
-    colour = style.OPTIMIZED_COLOUR
+    colour = style.DESIGNED_COLOUR
     axes.errorbar(rounds, theta, 2 * bar, color=colour, linestyle="", linewidth=0.9)
     axes.errorbar(
         rounds, theta, bar, color=colour, linestyle="", linewidth=2.4, marker="o", markersize=4

@@ -11,11 +11,11 @@ from matplotlib.patches import Patch
 
 from mjfim.arrays import Array
 from mjfim.output.plots.style import (
+    DESIGNED_COLOUR,
     GRID_COLOUR,
     INITIAL_COLOUR,
     MUTED_COLOUR,
     NORMAL_FONT,
-    OPTIMIZED_COLOUR,
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
@@ -69,7 +69,7 @@ def check_figure(check: Check) -> Figure:
         ),
         Patch(
             facecolor="white",
-            edgecolor=OPTIMIZED_COLOUR,
+            edgecolor=DESIGNED_COLOUR,
             hatch="////",
             label="not identifiable alone",
         ),
@@ -109,7 +109,7 @@ def _draw_standard_deviations(axes: Axes, rows: list[ParameterCheck]) -> None:
         high,
         height=0.6,
         facecolor="white",
-        edgecolor=OPTIMIZED_COLOUR,
+        edgecolor=DESIGNED_COLOUR,
         hatch="////",
         linewidth=0.8,
     )

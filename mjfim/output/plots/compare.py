@@ -12,11 +12,11 @@ from matplotlib.patches import Patch
 
 from mjfim.arrays import Array
 from mjfim.output.plots.style import (
+    DESIGNED_COLOUR,
     GRID_COLOUR,
     INITIAL_COLOUR,
     MUTED_COLOUR,
     NORMAL_FONT,
-    OPTIMIZED_COLOUR,
     OTHER_COLOUR,
     SMALL_FONT,
     TEXT_COLOUR,
@@ -86,7 +86,7 @@ def compare_figure(comparison: Comparison) -> Figure:
 def _handles(comparison: Comparison) -> list[Patch]:
     """Return legend entries of the kinds of methods that are present."""
     names = {
-        OPTIMIZED_COLOUR: "design",
+        DESIGNED_COLOUR: "design",
         INITIAL_COLOUR: "baseline",
         OTHER_COLOUR: "baseline that beats the design",
     }
@@ -109,7 +109,7 @@ def _handles(comparison: Comparison) -> list[Patch]:
 def _method_colour(comparison: Comparison, row: MethodResult) -> str:
     """Return the colour of a method."""
     if row.method == DESIGN:
-        return OPTIMIZED_COLOUR
+        return DESIGNED_COLOUR
     return OTHER_COLOUR if row in comparison.beating else INITIAL_COLOUR
 
 

@@ -14,10 +14,10 @@ from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import per_second
 from mjfim.output.plots.style import (
+    DESIGNED_COLOUR,
     GRID_COLOUR,
     INITIAL_COLOUR,
     MUTED_COLOUR,
-    OPTIMIZED_COLOUR,
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
@@ -50,7 +50,7 @@ PARAMETER_NAME_WIDTH = 18
 # Share of the largest sensitivity to a parameter below which a sensitivity is a rounding error.
 NEGLIGIBLE_SENSITIVITY = 1e-7
 
-# Ratio of the optimized to the initial loop of sensitivities above which the initial one is drawn
+# Ratio of the designed to the initial loop of sensitivities above which the initial one is drawn
 # enlarged.
 ENLARGING_RATIO = 4.0
 
@@ -154,7 +154,7 @@ def _panels(quantity: str, labels: tuple[str, ...]) -> list[_Panel]:
 
 def _styled_evaluations(design: Design) -> tuple[tuple[Evaluation, str, float], ...]:
     """Return both evaluations of a design, each with its colour and its line width [points]."""
-    return (design.initial, INITIAL_COLOUR, 1.5), (design.final, OPTIMIZED_COLOUR, 1.7)
+    return (design.initial, INITIAL_COLOUR, 1.5), (design.final, DESIGNED_COLOUR, 1.7)
 
 
 def _draw_state(axes: Axes, design: Design, panel: _Panel) -> None:
@@ -278,7 +278,7 @@ def _loops(design: Design, dof: int, j: int) -> tuple[Array, Array]:
     """Return the sensitivities of position and velocity of a degree of freedom to parameter j.
 
     Returns:
-        (N+1, 2) of the initial and of the optimized trajectory [x-unit / theta-unit].
+        (N+1, 2) of the initial and of the designed trajectory [x-unit / theta-unit].
     """
     nv = design.trajectory.qvel.shape[1]
     columns = [dof, nv + dof]
@@ -297,19 +297,19 @@ def _is_insensitive(design: Design, dof: int, j: int) -> bool:
 
 def _draw_loops(axes: Axes, loops: tuple[Array, Array]) -> None:
     """Draw both loops; the initial one lies on top, because it is the smaller one."""
-    initial, optimized = loops
+    initial, designed = loops
     axes.plot(*initial.T, color=INITIAL_COLOUR, linewidth=1.5, zorder=3)
-    axes.plot(*optimized.T, color=OPTIMIZED_COLOUR, linewidth=1.7, zorder=2)
+    axes.plot(*designed.T, color=DESIGNED_COLOUR, linewidth=1.7, zorder=2)
     axes.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=3.5, zorder=4)
     axes.locator_params(axis="x", nbins=MAX_PHASE_TICKS)
 
 
 def _enlarge_initial_loop(axes: Axes, loops: tuple[Array, Array]) -> None:
     """Draw a tiny initial loop once more, enlarged, in a box above the other one."""
-    initial, optimized = loops
+    initial, designed = loops
     initial_extent = np.ptp(initial, axis=0)
-    optimized_extent = np.ptp(optimized, axis=0)
-    tiny = (ENLARGING_RATIO * initial_extent < optimized_extent).all()
+    designed_extent = np.ptp(designed, axis=0)
+    tiny = (ENLARGING_RATIO * initial_extent < designed_extent).all()
     if not tiny or not (initial_extent > 0.0).all():
         return
 
@@ -394,7 +394,7 @@ def convergence(design: Design) -> Figure:
             linestyle="",
             label=_start_label(design),
         ),
-        Line2D([], [], color=OPTIMIZED_COLOUR, marker="o", linestyle="", label="optimized"),
+        Line2D([], [], color=DESIGNED_COLOUR, marker="o", linestyle="", label="designed"),
     ]
     if relative_slope is not None:
         handles.append(Line2D([], [], color=MUTED_COLOUR, linestyle=":", label="slope / J"))
@@ -444,7 +444,7 @@ def _draw_history(
     usable = np.flatnonzero(np.isfinite(shown))
     first, last = usable[0], usable[-1]
     axes.plot(iterations[first], shown[first], "o", color=INITIAL_COLOUR, markersize=6)
-    axes.plot(iterations[last], shown[last], "o", color=OPTIMIZED_COLOUR, markersize=6)
+    axes.plot(iterations[last], shown[last], "o", color=DESIGNED_COLOUR, markersize=6)
     text = f"{format_number(float(shown[first]))} → {format_number(float(shown[last]))}"
     axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=4)
 

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from mjfim.excitation.constraints import SUBSTEP_KINDS
 from mjfim.output.plots.style import (
+    DESIGNED_COLOUR,
     GRID_COLOUR,
     MUTED_COLOUR,
-    OPTIMIZED_COLOUR,
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
@@ -27,7 +27,7 @@ LIMIT_KINDS = (*SUBSTEP_KINDS, "control", "control_rate", "clearance")
 
 # Colours of the curves that come closest to a bound, the closest first; these curves are named in
 # the legend.
-NAMED_COLOURS = (OPTIMIZED_COLOUR, "#ee7733", "#aa3377")
+NAMED_COLOURS = (DESIGNED_COLOUR, "#ee7733", "#aa3377")
 
 # Characters to which the names of curves are shortened.
 CURVE_NAME_WIDTH = 24
@@ -87,7 +87,7 @@ def _draw_kind(axes: Axes, design: Design, kind: str, xlabel: str) -> None:
         _margin_in_words(kind, margin),
         loc="left",
         fontsize=SMALL_FONT + 1,
-        color=OPTIMIZED_COLOUR if margin < 0.0 else TEXT_COLOUR,
+        color=DESIGNED_COLOUR if margin < 0.0 else TEXT_COLOUR,
         pad=17,
     )
 

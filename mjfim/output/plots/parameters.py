@@ -13,9 +13,11 @@ from matplotlib.transforms import Transform
 
 from mjfim.arrays import Array
 from mjfim.output.plots.style import (
+    DESIGNED_COLOUR,
+    IDENTIFIED_COLOUR,
     INITIAL_COLOUR,
+    NOMINAL_COLOUR,
     NORMAL_FONT,
-    OPTIMIZED_COLOUR,
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
@@ -58,7 +60,7 @@ class _Accuracies:
         names: n names with units.
         values: (n,) values [theta-unit].
         std_initial: (n,) standard deviations along the initial trajectory [theta-unit].
-        std_final: (n,) standard deviations along the optimized trajectory [theta-unit].
+        std_final: (n,) standard deviations along the designed trajectory [theta-unit].
     """
 
     names: list[str]
@@ -92,7 +94,7 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     axes.set_xlim(*_bar_limits(stds))
     axes.set_ylim(count - 0.45, -0.55)
     _draw_bars(axes, accuracies.std_initial, -BAR_OFFSET, INITIAL_COLOUR)
-    _draw_bars(axes, accuracies.std_final, BAR_OFFSET, OPTIMIZED_COLOUR)
+    _draw_bars(axes, accuracies.std_final, BAR_OFFSET, DESIGNED_COLOUR)
 
     format_axes(axes, "predicted standard deviation [unit of the parameter]")
     axes.grid(False, axis="y")
@@ -101,7 +103,7 @@ def std_bars(design: Design, labels: Labels) -> Figure:
 
     handles = [
         Patch(color=INITIAL_COLOUR, label="initial"),
-        Patch(color=OPTIMIZED_COLOUR, label="optimized"),
+        Patch(color=DESIGNED_COLOUR, label="designed"),
     ]
     note = BEST_CASE
     if not np.isfinite(stds).all():
@@ -199,7 +201,7 @@ def _write_columns(axes: Axes, accuracies: _Accuracies) -> None:
 
     # Right edge of each column [points], behind the right end of the axis.
     _write_column(axes, 62.0, "σ / value", initial_texts, INITIAL_COLOUR)
-    _write_column(axes, 122.0, "σ / value", final_texts, OPTIMIZED_COLOUR)
+    _write_column(axes, 122.0, "σ / value", final_texts, DESIGNED_COLOUR)
     _write_column(axes, 178.0, "ratio", ratio_texts, TEXT_COLOUR)
 
 
@@ -275,7 +277,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     figure = new_figure(9.5, 1.9 + row_height * count)
     axes = figure.subplots()
     axes.set(xlim=_interval_limits(relative), ylim=(count - 0.4, -0.6))
-    axes.axvline(0.0, color=INITIAL_COLOUR, linewidth=1.6)
+    axes.axvline(0.0, color=NOMINAL_COLOUR, linewidth=1.6)
     for j, name in enumerate(estimate.parameters):
         if np.isfinite(relative.centre[j]):
             _draw_interval(axes, relative, j, at_bound=name in estimate.at_bound)
@@ -338,7 +340,7 @@ def _draw_interval(axes: Axes, relative: _RelativeEstimate, j: int, *, at_bound:
     if np.isfinite(half):
         formal = (max(centre - half, low), min(centre + half, high))
         axes.plot(
-            formal, (j, j), color=OPTIMIZED_COLOUR, linewidth=5.0, solid_capstyle="butt", alpha=0.3
+            formal, (j, j), color=IDENTIFIED_COLOUR, linewidth=5.0, solid_capstyle="butt", alpha=0.3
         )
 
     left, right = (float(end) for end in relative.interval[j])
@@ -346,7 +348,7 @@ def _draw_interval(axes: Axes, relative: _RelativeEstimate, j: int, *, at_bound:
     axes.plot(
         (shown_left, shown_right),
         (j, j),
-        color=OPTIMIZED_COLOUR,
+        color=IDENTIFIED_COLOUR,
         linewidth=1.4,
         solid_capstyle="butt",
     )
@@ -357,8 +359,8 @@ def _draw_interval(axes: Axes, relative: _RelativeEstimate, j: int, *, at_bound:
         centre,
         j,
         "s" if at_bound else "o",
-        color=OPTIMIZED_COLOUR,
-        markerfacecolor="white" if at_bound else OPTIMIZED_COLOUR,
+        color=IDENTIFIED_COLOUR,
+        markerfacecolor="white" if at_bound else IDENTIFIED_COLOUR,
         markersize=6.5,
         zorder=3,
     )
@@ -366,7 +368,7 @@ def _draw_interval(axes: Axes, relative: _RelativeEstimate, j: int, *, at_bound:
 
 def _draw_end(axes: Axes, x: float, row: int, marker: str) -> None:
     """Draw the marker at one end of an interval."""
-    axes.plot(x, row, marker, color=OPTIMIZED_COLOUR, markersize=7, clip_on=False)
+    axes.plot(x, row, marker, color=IDENTIFIED_COLOUR, markersize=7, clip_on=False)
 
 
 def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
@@ -389,15 +391,15 @@ def _interval_handles() -> list[Line2D]:
     at_bound = Line2D(
         [],
         [],
-        color=OPTIMIZED_COLOUR,
+        color=IDENTIFIED_COLOUR,
         marker="s",
         markerfacecolor="white",
         linestyle="",
         label="at its bound",
     )
-    colour = OPTIMIZED_COLOUR
+    colour = IDENTIFIED_COLOUR
     return [
-        Line2D([], [], color=INITIAL_COLOUR, label="guess", linewidth=1.6),
+        Line2D([], [], color=NOMINAL_COLOUR, label="guess", linewidth=1.6),
         Line2D([], [], color=colour, marker="o", alpha=0.9, label="estimate, 95 % interval"),
         Line2D([], [], color=colour, linewidth=5.0, alpha=0.3, label="formal 95 %"),
         at_bound,

@@ -16,10 +16,10 @@ from mjfim.model.coordinates import split_unit
 from mjfim.output.plots.recording_fit import MAX_OUTPUTS, shown_outputs
 from mjfim.output.plots.style import (
     GRID_COLOUR,
-    INITIAL_COLOUR,
+    IDENTIFIED_COLOUR,
     MEASURED_COLOUR,
     MUTED_COLOUR,
-    OPTIMIZED_COLOUR,
+    NOMINAL_COLOUR,
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
@@ -205,8 +205,8 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
         axes.set_xlabel(f"rms prediction error [{unit or '–'}]")
 
     handles = [
-        Patch(color=INITIAL_COLOUR, label="nominal model"),
-        Patch(color=OPTIMIZED_COLOUR, label="identified model"),
+        Patch(color=NOMINAL_COLOUR, label="nominal model"),
+        Patch(color=IDENTIFIED_COLOUR, label="identified model"),
     ]
     note = (
         "The identified parameters were fitted to all other recordings; "
@@ -224,8 +224,8 @@ def _draw_errors(axes: Axes, found: tuple[Prediction, ...], j: int) -> None:
     places = np.arange(len(found))
     nominal = [prediction.nominal.rms[j] for prediction in found]
     identified = [prediction.identified.rms[j] for prediction in found]
-    axes.barh(places - BAR_OFFSET, nominal, BAR_HEIGHT, color=INITIAL_COLOUR, alpha=0.75)
-    axes.barh(places + BAR_OFFSET, identified, BAR_HEIGHT, color=OPTIMIZED_COLOUR, alpha=0.85)
+    axes.barh(places - BAR_OFFSET, nominal, BAR_HEIGHT, color=NOMINAL_COLOUR, alpha=0.75)
+    axes.barh(places + BAR_OFFSET, identified, BAR_HEIGHT, color=IDENTIFIED_COLOUR, alpha=0.85)
 
     axes.set_yticks(places, [_recording_name(prediction) for prediction in found])
     axes.set_ylim(len(found) - 0.5, -0.5)

@@ -67,9 +67,9 @@ def _draw_limits(axes: Axes, result: Robustness) -> None:
     # The robots of a row are spread at random over its height, so that all dots are visible.
     rng = np.random.default_rng(0)
     style.format_axes(axes, "margin over half of the range [%]")
-    axes.axvspan(low, 0.0, color=style.OPTIMIZED_COLOUR, alpha=0.10, linewidth=0.0)
+    axes.axvspan(low, 0.0, color=style.DESIGNED_COLOUR, alpha=0.10, linewidth=0.0)
     for i, row in enumerate(rows):
-        colour = style.INITIAL_COLOUR if result.kept[:, i].all() else style.OPTIMIZED_COLOUR
+        colour = style.INITIAL_COLOUR if result.kept[:, i].all() else style.DESIGNED_COLOUR
         heights = row + rng.uniform(-0.22, 0.22, result.runs)
         axes.plot(
             percent[:, i], heights, "o", color=colour, markersize=3.5, alpha=0.5, markeredgewidth=0
@@ -108,7 +108,7 @@ def _limit_handles() -> list[Line2D]:
     exceeding = Line2D(
         [],
         [],
-        color=style.OPTIMIZED_COLOUR,
+        color=style.DESIGNED_COLOUR,
         marker=".",
         linestyle="",
         label="robots, some exceed the limit",
@@ -137,7 +137,7 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
         inside = np.abs(z) <= INTERVAL_HALF_WIDTH
         for chosen, colour in (
             (inside, style.MEASURED_COLOUR),
-            (~inside, style.OPTIMIZED_COLOUR),
+            (~inside, style.DESIGNED_COLOUR),
         ):
             axes.plot(
                 x[chosen],
@@ -167,7 +167,7 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
     low, high = (100.0 * k / n for k in binom.interval(CONFIDENCE, n, CONFIDENCE))
     axes.axhspan(low, high, color=style.MEASURED_COLOUR, alpha=0.12, linewidth=0.0)
     axes.axhline(
-        100.0 * REQUIRED_COVERAGE, color=style.OPTIMIZED_COLOUR, linewidth=1.0, linestyle="--"
+        100.0 * REQUIRED_COVERAGE, color=style.DESIGNED_COLOUR, linewidth=1.0, linestyle="--"
     )
     axes.plot(x, share, "o", color=style.TEXT_COLOUR, markersize=5.0)
     for i, value in enumerate(share):
@@ -213,7 +213,7 @@ def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
         x,
         100.0 * observed,
         ".",
-        color=style.OPTIMIZED_COLOUR,
+        color=style.DESIGNED_COLOUR,
         markersize=9.0,
         markeredgewidth=0.0,
         label="rms error of the estimates",

@@ -27,6 +27,7 @@ from matplotlib.lines import Line2D
 from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
 from mjfim.model.coordinates import split_unit
+from mjfim.output import vocabulary
 
 # Arguments and result of a function that draws.
 Arguments = ParamSpec("Arguments")
@@ -35,11 +36,17 @@ Result = TypeVar("Result")
 # The settings of matplotlib belong to the whole process, so one thread draws at a time.
 STYLE_LOCK = threading.RLock()
 
-# Colour of the initial trajectory, of guesses and of nominal models.
-INITIAL_COLOUR = "#0077bb"
+# Colour of the initial trajectory.
+INITIAL_COLOUR = vocabulary.INITIAL.colour
 
-# Colour of the optimized trajectory, of estimates and of identified models.
-OPTIMIZED_COLOUR = "#cc3311"
+# Colour of the designed trajectory, and of limits that are violated.
+DESIGNED_COLOUR = vocabulary.DESIGNED.colour
+
+# Colour of nominal models and of initial guesses.
+NOMINAL_COLOUR = vocabulary.NOMINAL.colour
+
+# Colour of identified models and of estimates.
+IDENTIFIED_COLOUR = vocabulary.IDENTIFIED.colour
 
 # Colour of text, of true values and of reference lines.
 TEXT_COLOUR = "#222222"
@@ -50,11 +57,11 @@ MUTED_COLOUR = "#6b7076"
 # Colour of grid lines and of shaded bands.
 GRID_COLOUR = "#d9dcdf"
 
-# Colour of trajectories and methods that are neither initial nor optimized.
-OTHER_COLOUR = "#8a6d3b"
+# Colour of trajectories and methods that are neither initial nor designed.
+OTHER_COLOUR = vocabulary.OTHER.colour
 
 # Colour of measurements and of residuals.
-MEASURED_COLOUR = "#009988"
+MEASURED_COLOUR = vocabulary.MEASURED.colour
 
 # Font sizes of tick labels and notes, of axis labels, and of titles [points].
 SMALL_FONT, NORMAL_FONT, LARGE_FONT = 8.0, 9.0, 11.0
@@ -71,8 +78,7 @@ NOTEBOOK_DPI = 80.0
 # Name and colour in figures of the two trajectories of a design or study, by their name in the
 # records.
 TRAJECTORY_STYLES: dict[str, tuple[str, str]] = {
-    "initial": ("initial", INITIAL_COLOUR),
-    "final": ("optimized", OPTIMIZED_COLOUR),
+    key: (term.word, term.colour) for key, term in vocabulary.TRAJECTORY_TERMS.items()
 }
 
 # Digits of a power of ten, raised.
@@ -360,7 +366,7 @@ def add_title(figure: Figure, title: str, handles: Sequence[Artist] = (), note: 
 
 
 def trajectory_handles() -> list[Line2D]:
-    """Return the legend entries of the initial and the optimized trajectory."""
+    """Return the legend entries of the initial and the designed trajectory."""
     return [
         Line2D([], [], color=colour, label=name, linewidth=2.0)
         for name, colour in TRAJECTORY_STYLES.values()

@@ -12,6 +12,7 @@ import rerun.blueprint as rrb
 
 from mjfim.arrays import evenly_spread_indices
 from mjfim.model.coordinates import output_label
+from mjfim.output import vocabulary
 from mjfim.output.rerun.camera import place_camera
 from mjfim.output.rerun.history import history_bars, history_lines, log_history
 from mjfim.output.rerun.layout import (
@@ -42,11 +43,11 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
 from mjfim.records.trajectory import Trajectory
 
-# Styles of the initial and the optimized trajectory, and of a predicted and a measured motion.
-INITIAL = RobotStyle(accent=(70, 130, 220))
-OPTIMIZED = RobotStyle(accent=(220, 60, 60))
-PREDICTED = RobotStyle(accent=(230, 130, 30))
-MEASURED = RobotStyle(accent=(125, 135, 150), opacity=0.4)
+# Styles of the initial and the designed trajectory, and of a predicted and a measured motion.
+INITIAL = RobotStyle(accent=vocabulary.INITIAL.rgb)
+DESIGNED = RobotStyle(accent=vocabulary.DESIGNED.rgb)
+PREDICTED = RobotStyle(accent=vocabulary.IDENTIFIED.rgb)
+MEASURED = RobotStyle(accent=vocabulary.MEASURED.rgb, opacity=0.4)
 
 # Styles of further trajectories and series, one after the other.
 FURTHER_STYLES = (
@@ -57,10 +58,7 @@ FURTHER_STYLES = (
 )
 
 # Styles of trajectories with a known name.
-STYLES_BY_NAME = {"initial": INITIAL, "optimized": OPTIMIZED}
-
-# Names under which trajectories are shown, where they differ from those in the file of a design.
-SHOWN_NAMES = {"final": "optimized"}
+STYLES_BY_NAME = {"initial": INITIAL, vocabulary.DESIGNED.word: DESIGNED}
 
 # Largest number of samples of a recording, or of a motion, in a file.
 MAX_SAMPLES = 20_000
@@ -81,7 +79,7 @@ def log_design(
         labels: Labels of the model's columns, usually `labels_of_model(model)`.
         addition: Markdown to append to the summary.
     """
-    evaluations = {"initial": design.initial, "optimized": design.final}
+    evaluations = {"initial": design.initial, "designed": design.final}
     poses = {
         name: body_poses(model, evaluation.trajectory.t, evaluation.trajectory.qpos)
         for name, evaluation in evaluations.items()
@@ -89,7 +87,7 @@ def log_design(
     camera = place_camera(model, list(poses.values()), views=2, aspect=ASPECT_WITH_TEXT)
     titles = {
         "initial trajectory (blue)": ("robots", "initial"),
-        "optimized trajectory (red)": ("robots", "optimized"),
+        "designed trajectory (red)": ("robots", "designed"),
     }
     plots = [
         PhasePlot.of_most_sensitive(design, j, model.nv) for j in parameters_with_phase_plot(design)
@@ -100,7 +98,7 @@ def log_design(
     units = labels.parameter_units or ("",) * len(design.parameters)
     with open_recording(path, model, "design", layout) as rec:
         _log_text(rec, design_text(design, units, addition))
-        log_history(rec, design.history, (OPTIMIZED, INITIAL, *FURTHER_STYLES))
+        log_history(rec, design.history, (DESIGNED, INITIAL, *FURTHER_STYLES))
         for plot in plots:
             plot.log_axes(rec, labels)
         for name, evaluation in evaluations.items():
@@ -178,10 +176,10 @@ def log_estimate(
     """
     trajectories = {"predicted": _thinned(predicted)}
     styles = {"predicted": PREDICTED, "measured": MEASURED}
-    title = "predicted robot (orange)"
+    title = "identified robot (purple)"
     if measured is not None:
         trajectories["measured"] = _thinned(measured)
-        title += " and measured robot (grey, transparent)"
+        title += " and measured robot (teal, transparent)"
 
     poses = {
         name: body_poses(model, trajectory.t, trajectory.qpos)
@@ -252,10 +250,10 @@ def log_trajectories(
     Args:
         path: The file.
         model: The model.
-        trajectories: The trajectories by name; `final` is shown as `optimized`.
+        trajectories: The trajectories by name; `final` is shown as `designed`.
         labels: Labels of the model's columns.
     """
-    trajectories = {SHOWN_NAMES.get(name, name): found for name, found in trajectories.items()}
+    trajectories = {vocabulary.shown_word(name): found for name, found in trajectories.items()}
     styles = _trajectory_styles(list(trajectories))
     poses = {
         name: body_poses(model, trajectory.t, trajectory.qpos)

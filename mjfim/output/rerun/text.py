@@ -12,7 +12,7 @@ from mjfim.records.estimate import Estimate
 
 # Sentences that explain the colours of the recordings.
 DESIGN_COLOURS = (
-    "Blue: the initial trajectory. Red: the optimized trajectory. Space bar: play or pause. "
+    "Blue: the initial trajectory. Red: the designed trajectory. Space bar: play or pause. "
     "The plots of ψ show sensitivities: how much a position (→) and its velocity (↑) change per "
     "unit of a parameter."
 )

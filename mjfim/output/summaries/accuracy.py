@@ -50,7 +50,7 @@ def accuracy_table(design: Design, units: Sequence[str]) -> SummaryTable:
         key="accuracy",
         title="Predicted standard deviation σ of each parameter after one experiment",
         columns=columns(
-            "parameter", "value", "σ initial", "relative", "σ optimized", "relative", "change of σ"
+            "parameter", "value", "σ initial", "relative", "σ designed", "relative", "change of σ"
         ),
         rows=tuple(rows),
     )

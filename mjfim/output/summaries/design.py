@@ -71,8 +71,8 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
         parts.append(
             Paragraph(
                 text=(
-                    "Some parameters are not identifiable alone; the design is optimized for "
-                    "combinations of them, see design.json"
+                    "Some parameters are not identifiable alone; the search maximises the "
+                    "information of combinations of them, see design.json"
                 )
             )
         )
@@ -107,7 +107,7 @@ def eigenvalue_table(design: Design) -> SummaryTable:
     rows = []
     for trajectory, title, evaluation in (
         ("initial", "initial", design.initial),
-        ("final", "optimized", design.final),
+        ("final", "designed", design.final),
     ):
         descending = evaluation.eigenvalues[::-1]
         values: list[Cell] = [Quantity(value=float(descending[k]), digits=5) for k in shown]

@@ -18,13 +18,11 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
+from mjfim.output.vocabulary import shown_word
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 
 # Largest number of parameters for which covariance matrices are shown; of more, variances only.
 MAX_MATRIX = 5
-
-# Names of the trajectories of a study in titles, where they differ from those in the record.
-TRAJECTORY_NAMES = {"final": "optimized"}
 
 
 def describe_study(study: MonteCarloStudy, units: Sequence[str]) -> Summary:
@@ -70,7 +68,7 @@ def _efficiency_table(
         )
         rows.append(Row(cells=cells, trajectory=trajectory))
 
-    shown = TRAJECTORY_NAMES.get(trajectory, trajectory)
+    shown = shown_word(trajectory)
     title = f"{shown}: {trials.trials} trials, {trials.failed} failed, {study.measure_rate:g} Hz"
     return SummaryTable(
         key=f"efficiency {trajectory}",
