@@ -117,6 +117,7 @@ def robustness(
         loudness=noise,
         seed=seed,
     )
+    conditions.check()
 
     # A new design stands in a folder of its own, below that of the study.
     new = [f"design/{name}" for name in DESIGN_ARCHIVE] if design_folder is None else []

@@ -41,9 +41,6 @@ class RobotConditions:
         feedback: True if the controller adds the gains times the measured deviation.
         loudness: Ratio of the robot's noise to the stated noise.
         seed: Seed of the random numbers.
-
-    Raises:
-        ExperimentError: A number is outside its range.
     """
 
     wrong: float = 0.2
@@ -52,7 +49,12 @@ class RobotConditions:
     loudness: float = 1.0
     seed: int = 0
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Check that every number is in its range.
+
+        Raises:
+            ExperimentError: A number is not.
+        """
         for name, value, most in (
             ("wrong", self.wrong, MAX_WRONG),
             ("noise", self.loudness, MAX_NOISE),

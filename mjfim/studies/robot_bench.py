@@ -89,6 +89,7 @@ class RobotBench:
                 conditions cannot be simulated.
             RecordingError: The design cannot be read.
         """
+        conditions.check()
         self.conditions = conditions
         stated = DesignTask.resolve(experiment, threads=1)
         self.plan = read_playback(table, stated.system.channels)
