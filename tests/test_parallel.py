@@ -51,6 +51,7 @@ def pool() -> Iterator[mjfim.Pool]:
         yield two_workers
 
 
+@pytest.mark.slow
 def test_processes_of_a_pool_are_others_and_see_the_request_to_stop(pool: mjfim.Pool) -> None:
     assert pool.submit(identity).result() != os.getpid()
 

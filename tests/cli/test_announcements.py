@@ -67,6 +67,7 @@ def test_a_short_design_is_not_announced(
     assert not capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_iteration_of_hours_is_refused(tmp_path: Path) -> None:
     """The message states the time; a stated time that is longer permits it."""
     system = _system(tmp_path, 40.0)
@@ -79,6 +80,7 @@ def test_an_iteration_of_hours_is_refused(tmp_path: Path) -> None:
         announce_design(patient, is_default=True, longest_iteration=1e-3)
 
 
+@pytest.mark.slow
 def test_long_checks_fits_and_studies_are_announced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -158,6 +158,7 @@ def test_interrupted_on_the_coarse_level() -> None:
     assert result.final.cost < 0.1 * result.initial.cost
 
 
+@pytest.mark.slow
 def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
     """Exit code 1, all files can be read, and the result is better than the start."""
     path = write_experiment(tmp_path, tolerance="1e-12", max_iterations="200\nstarts = 10000")

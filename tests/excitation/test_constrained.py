@@ -281,6 +281,7 @@ def over() -> Budget:
     return Budget(seconds=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robust", [False, True], ids=["one model", "variants"])
 def test_a_motion_about_the_holding_control_is_found_and_improved(
     robust: bool, tmp_path: Path
@@ -812,6 +813,7 @@ def test_a_design_that_comes_too_close_between_its_samples_is_corrected(
     assert (final.cost in [row.cost for row in final.history]) is has_time
 
 
+@pytest.mark.slow
 def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
     """Without the limit the fore-arm comes closer."""
     task, design = arm_design(tmp_path, limits={"clearance": 0.15})

@@ -186,6 +186,7 @@ def test_the_cost_is_the_pooled_criterion_of_separate_experiments_at_the_samples
     assert point.cost == pytest.approx(task.samples_of_parameters.value(alone) + running, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("over", "pooled"), [("worst", np.max), pytest.param("mean", np.mean, marks=pytest.mark.slow)]
 )

@@ -207,6 +207,7 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
     assert made(2, boundary={"end": "periodic"}) == [0.5, 2.5]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("empty_figures")
 def test_the_command_line(tmp_path: Path) -> None:
     """The design of the shortest horizon is written; exit code 1 where no horizon is enough."""

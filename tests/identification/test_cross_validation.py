@@ -41,6 +41,7 @@ def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.
     assert (alone[0].mae < alone[0].rms).all()
 
 
+@pytest.mark.slow
 def test_without_held_out_recordings_each_is_predicted_by_the_others(
     base: mjfim.Experiment,
 ) -> None:

@@ -345,6 +345,7 @@ def test_an_interruption_before_the_last_search_ends_all_searches(
     np.testing.assert_array_equal(found.theta, task.parameters.guess)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 3.0])
 def test_a_robust_fit_tests_the_size_of_its_residuals(
     task: DesignTask, recording: Recording, scale: float

@@ -96,6 +96,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # ---- records
 
 
+@pytest.mark.slow
 def test_each_method_has_its_budget_and_the_design_comes_last() -> None:
     c = small()
     assert [r.method for r in c.rows] == ["chirp", "fourier5", DESIGN]

@@ -151,6 +151,7 @@ def test_simulated_noise_is_correlated_and_sampled_as_stated(
     assert np.abs(error).max() < 4.5 * np.sqrt(2.0 / len(every))
 
 
+@pytest.mark.slow
 def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estimates(
     experiment: Experiment, design: mjfim.Design
 ) -> None:
