@@ -1,0 +1,211 @@
+"""Pictures of robots by MuJoCo's renderer: ghosts, tints, background and light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from mjfim.arrays import Array
+
+# A picture or a frame: (height, width, 3) bytes.
+Image = NDArray[np.uint8]
+
+# Background of models without a sky of their own (0..1). It shines by itself: `BACKGROUND_EMISSION`
+# times its colour, to which the lights of the model add little.
+BACKGROUND = (0.0885, 0.0905, 0.0935, 1.0)
+BACKGROUND_EMISSION = 10.0
+
+# Distance of the background, as a share of that of the far clipping plane.
+BACKGROUND_DISTANCE = 0.7
+
+# Size of the map of shadows [pixels]; MuJoCo's own takes twice as long without a graphics card.
+SHADOW_SIZE = 1024
+
+# Light from the camera, in models without lights and in others (0..1).
+HEADLIGHT_ALONE, HEADLIGHT_AMONG_OTHERS = (0.45, 0.45), (0.25, 0.30)
+
+# Groups of geoms that MuJoCo's viewer shows by default.
+SHOWN_GROUPS = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quality:
+    """How well pictures are drawn.
+
+    Attributes:
+        shadows: True for shadows.
+        samples: Samples of a pixel, for smooth edges; 0 for one.
+    """
+
+    shadows: bool
+    samples: int
+
+
+# From the best to the quickest. Without a graphics card, each takes half as long as the one before.
+QUALITIES = (
+    Quality(shadows=True, samples=4),
+    Quality(shadows=False, samples=4),
+    Quality(shadows=False, samples=0),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaintedRobot:
+    """How a robot is drawn.
+
+    Attributes:
+        colour: (3,) colour of its tint (0..1).
+        tint: Share of the colour in moving parts (0..1).
+        opacity: Opacity of moving parts (0..1).
+    """
+
+    colour: Array
+    tint: float
+    opacity: float
+
+    @classmethod
+    def of(cls, track: dict[str, Any]) -> PaintedRobot:
+        """Read the settings of a track.
+
+        Args:
+            track: The settings.
+        """
+        colour = np.array(track["colour"], dtype=np.float64) / 255.0
+        return cls(colour=colour, tint=float(track["tint"]), opacity=float(track["opacity"]))
+
+    def paint(self, geom: mujoco.MjvGeom) -> None:
+        """Tint a moving part.
+
+        Args:
+            geom: The part in the scene.
+        """
+        geom.rgba[:3] = (1.0 - self.tint) * geom.rgba[:3] + self.tint * self.colour
+        geom.rgba[3] *= self.opacity
+
+
+class Painter:
+    """Draws robots with one renderer."""
+
+    def __init__(
+        self, model: mujoco.MjModel, job: dict[str, Any], offset: Array, quality: Quality
+    ) -> None:
+        """Open a context.
+
+        Args:
+            model: The model; its visual settings are changed.
+            job: Settings of the film.
+            offset: (3,) vector from the point at which the camera looks to the camera [m].
+            quality: How well to draw.
+        """
+        width, height = int(job["width"]), int(job["height"])
+        self._model = model
+        self._data = mujoco.MjData(model)
+        self._pert = mujoco.MjvPerturb()
+        self._is_moving = model.body_weldid[model.geom_bodyid] != 0
+        self._option = _options(model, self._is_moving)
+        self._camera = _camera(offset)
+        self._has_sky = bool(np.any(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)))
+
+        model.vis.quality.offsamples = quality.samples
+        _set_visual(model, width, height, float(job["field_of_view"]))
+        self._renderer = mujoco.Renderer(model, height, width)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = quality.shadows
+
+    def close(self) -> None:
+        """Close the context."""
+        self._renderer.close()
+
+    def picture(
+        self, robots: Sequence[PaintedRobot], positions: Sequence[Array], target: Array
+    ) -> Image:
+        """Draw robots into one picture.
+
+        Args:
+            robots: How they are drawn; those after the first one are ghosts.
+            positions: (nq,) positions of each robot.
+            target: (3,) point at which the camera looks [m].
+        """
+        self._camera.lookat[:] = target
+        scene = self._renderer.scene
+        for k, (robot, qpos) in enumerate(zip(robots, positions, strict=True)):
+            self._data.qpos[:] = qpos
+            mujoco.mj_fwdPosition(self._model, self._data)
+
+            first = 0
+            if k == 0:
+                self._renderer.update_scene(self._data, self._camera, self._option)
+            else:
+                first = scene.ngeom
+                dynamic = mujoco.mjtCatBit.mjCAT_DYNAMIC
+                mujoco.mjv_addGeoms(
+                    self._model, self._data, self._option, self._pert, int(dynamic), scene
+                )
+            self._paint(scene, first, robot)
+
+        if not self._has_sky:
+            self._add_background(scene, target)
+        return np.asarray(self._renderer.render())
+
+    def _paint(self, scene: mujoco.MjvScene, first: int, robot: PaintedRobot) -> None:
+        """Tint the moving parts that were added to the scene from the number `first` on."""
+        for k in range(first, scene.ngeom):
+            geom = scene.geoms[k]
+            is_geom = geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)
+            if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
+                robot.paint(geom)
+
+    def _add_background(self, scene: mujoco.MjvScene, target: Array) -> None:
+        """Add a bright wall behind everything, because MuJoCo's background is black."""
+        camera = scene.camera[0]
+        forward = np.array(camera.forward, dtype=np.float64)
+        up = np.array(camera.up, dtype=np.float64)
+        far = float(self._model.vis.map.zfar) * float(self._model.stat.extent)
+        distance = BACKGROUND_DISTANCE * far
+
+        place = np.array(camera.pos, dtype=np.float64) + distance * forward
+        rotation = np.stack([np.cross(forward, up), up, -forward], axis=1)
+        size = np.array([2.0 * distance, 2.0 * distance, 1e-3 * distance])
+        wall = scene.geoms[scene.ngeom]
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        mujoco.mjv_initGeom(wall, box, size, place, rotation.ravel(), np.array(BACKGROUND))
+        wall.emission, wall.specular, wall.shininess = BACKGROUND_EMISSION, 0.0, 0.0
+        wall.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
+        scene.ngeom += 1
+
+
+def _set_visual(model: mujoco.MjModel, width: int, height: int, field_of_view: float) -> None:
+    """Set size, quality, camera and light for drawing without a graphics card."""
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    model.vis.global_.fovy = np.degrees(field_of_view)
+    model.vis.quality.shadowsize = SHADOW_SIZE
+
+    ambient, diffuse = HEADLIGHT_AMONG_OTHERS if model.nlight else HEADLIGHT_ALONE
+    model.vis.headlight.ambient[:] = np.maximum(model.vis.headlight.ambient, ambient)
+    model.vis.headlight.diffuse[:] = diffuse
+    model.vis.headlight.specular[:] = 0.1
+
+
+def _options(model: mujoco.MjModel, is_moving: NDArray[np.bool_]) -> mujoco.MjvOption:
+    """Show what MuJoCo's viewer shows; where that leaves nothing, hidden parts or inertias."""
+    option = mujoco.MjvOption()
+    if not np.any(is_moving):
+        option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
+    elif not np.any(model.geom_group[is_moving] < SHOWN_GROUPS):
+        option.geomgroup[:] = 1
+    return option
+
+
+def _camera(offset: Array) -> mujoco.MjvCamera:
+    """A camera that stands at an offset (3,) from the point at which it looks [m]."""
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.distance = float(np.linalg.norm(offset))
+    forward = -offset / camera.distance
+    camera.azimuth = float(np.degrees(np.arctan2(forward[1], forward[0])))
+    camera.elevation = float(np.degrees(np.arcsin(forward[2])))
+    return camera

@@ -1,0 +1,67 @@
+"""A video as bytes, for a file or for a page that holds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mjfim.atomic_io import replacing
+from mjfim.errors import MjfimError, RecordingError
+
+# Format of a video: that of the ending of its file.
+Format = Literal["mp4", "gif", "webp"]
+
+# Media type of each format, as pages state it.
+MEDIA_TYPES: dict[Format, str] = {"mp4": "video/mp4", "gif": "image/gif", "webp": "image/webp"}
+
+# Formats that the user can ask for by the ending of a file.
+FILE_FORMATS: dict[str, Format] = {".mp4": "mp4", ".gif": "gif"}
+
+
+class NoVideoError(MjfimError):
+    """There is no video, for a reason that its message states; the work goes on without it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Video:
+    """A video of a motion.
+
+    Attributes:
+        data: Contents of its file.
+        media_type: `video/mp4`, which a page shows as a video, or `image/gif` or `image/webp`,
+            which it shows as an image.
+        caption: What it shows and how fast it is played, in one or two sentences.
+        width: Width [pixels].
+        height: Height [pixels].
+    """
+
+    data: bytes
+    media_type: str
+    caption: str
+    width: int
+    height: int
+
+    def save(self, path: Path) -> None:
+        """Write the video into a file.
+
+        Args:
+            path: The file.
+        """
+        with replacing(path) as temporary:
+            temporary.write_bytes(self.data)
+
+
+def format_of(path: Path) -> Format:
+    """Return the format that the ending of a file asks for.
+
+    Args:
+        path: The file.
+
+    Raises:
+        RecordingError: The ending is neither .mp4 nor .gif.
+    """
+    found = FILE_FORMATS.get(path.suffix.lower())
+    if found is None:
+        raise RecordingError(f"--video {path}: the name of a video ends in .mp4 or .gif")
+    return found

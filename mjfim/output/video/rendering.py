@@ -1,0 +1,214 @@
+"""Draws a film with MuJoCo's renderer, in a process of its own.
+
+A renderer needs a context of OpenGL. Which kind the computer has is known only after one was
+opened, and a faulty driver can end or block the process that tries it. So another process opens it,
+draws and encodes; this one waits for the file, for a limited time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.output.video.film import FRAME_RATE, VIEW_HEIGHT, VIEW_WIDTH, Film, speed_text
+from mjfim.output.video.record import MEDIA_TYPES, Format, NoVideoError, Video
+
+# Kinds of OpenGL contexts by system, in the order in which they are tried: without a display first.
+BACK_ENDS = {"Linux": ("egl", "osmesa", "glfw")}
+OTHER_BACK_ENDS = ("",)
+
+# Names of the files that the two processes exchange.
+MODEL_FILE, ARRAYS_FILE, JOB_FILE, RESULT_FILE = "model.mjb", "film.npz", "job.json", "result.json"
+
+# Program of the other process. It searches modules in the same places as this one.
+PROGRAM = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+    "from mjfim.output.video.worker import main; main(sys.argv[2])"
+)
+
+# Time that the other process may need beside drawing: to start, to open a context, and to write
+# the end of the file [s].
+START_SECONDS = 20.0
+
+# Values of the variable MUJOCO_GL that turn drawing off.
+TURNED_OFF = ("disable", "disabled", "off", "false", "0")
+
+# Reasons why there is no video. They are complete parts of a sentence.
+NO_RENDERER = (
+    "MuJoCo can draw nothing here; on a computer without a display it needs EGL (package libegl1) "
+    "or OSMesa (package libosmesa6)"
+)
+IS_TURNED_OFF = "the variable MUJOCO_GL turns drawing off"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """How much a video may cost.
+
+    Attributes:
+        seconds: Time for drawing [s]. A slower computer draws fewer frames per second.
+        fewest_frames: Frames per second of the film below which there is none.
+        max_bytes: Largest size of an mp4 file.
+    """
+
+    seconds: float
+    fewest_frames: float = 7.0
+    max_bytes: int = 2_000_000
+
+
+# Effort of a video that the user asks for, and of one that is added to a report.
+WANTED = Effort(seconds=60.0, fewest_frames=0.0)
+ADDED = Effort(seconds=2.0)
+
+
+def render(film: Film, kind: Format, effort: Effort = WANTED) -> Video:
+    """Draw a film.
+
+    Args:
+        film: The film.
+        kind: Format of the video.
+        effort: What it may cost.
+
+    Returns:
+        The video.
+
+    Raises:
+        NoVideoError: Nothing can be drawn here, or not in time.
+    """
+    require_encoder(kind)
+    with tempfile.TemporaryDirectory(prefix="mjfim-video-") as name:
+        folder = Path(name)
+        _write_job(folder, film, kind, effort)
+        result = _drawn(folder, effort)
+        data = (folder / f"film.{kind}").read_bytes()
+
+    return Video(
+        data=data,
+        media_type=MEDIA_TYPES[kind],
+        caption=film.caption,
+        width=result["width"],
+        height=result["height"],
+    )
+
+
+def require_encoder(kind: Format) -> None:
+    """Make sure before the work that a format can be written.
+
+    Args:
+        kind: The format.
+
+    Raises:
+        NoVideoError: A package is missing.
+    """
+    if kind == "mp4" and find_spec("av") is None:
+        raise NoVideoError(
+            "mp4 needs the package av; install it with `pip install 'mjfim[video]'`, or write a "
+            "file that ends in .gif"
+        )
+
+
+def _write_job(folder: Path, film: Film, kind: Format, effort: Effort) -> None:
+    """Write what the other process reads."""
+    mujoco.mj_saveModel(film.model, str(folder / MODEL_FILE), None)
+
+    arrays: dict[str, Any] = {"t": film.t, "offset": film.offset}
+    views = []
+    for k, view in enumerate(film.views):
+        arrays[f"target_{k}"] = view.target
+        tracks = []
+        for j, track in enumerate(view.tracks):
+            arrays[f"qpos_{k}_{j}"] = track.qpos
+            tracks.append(
+                {
+                    "word": track.word,
+                    "colour": track.colour,
+                    "tint": track.tint,
+                    "opacity": track.opacity,
+                }
+            )
+        views.append(tracks)
+    np.savez(folder / ARRAYS_FILE, **arrays)
+
+    job = {
+        "views": views,
+        "width": VIEW_WIDTH,
+        "height": VIEW_HEIGHT,
+        "field_of_view": film.field_of_view,
+        "follows": film.follows,
+        "speed": film.speed,
+        "remark": speed_text(film.speed),
+        "kind": kind,
+        "rate": FRAME_RATE,
+        "seconds": effort.seconds,
+        "fewest_frames": effort.fewest_frames,
+        "max_bytes": effort.max_bytes,
+    }
+    (folder / JOB_FILE).write_text(json.dumps(job), encoding="utf-8")
+
+
+def _drawn(folder: Path, effort: Effort) -> dict[str, Any]:
+    """Let another process draw the film, with the first kind of context that works here."""
+    deadline = time.monotonic() + START_SECONDS + 2.0 * effort.seconds
+    for back_end in back_ends():
+        _run(folder, back_end, deadline - time.monotonic())
+
+        # A process that found no context leaves no result.
+        found = folder / RESULT_FILE
+        if found.is_file():
+            result: dict[str, Any] = json.loads(found.read_text(encoding="utf-8"))
+            if "reason" in result:
+                raise NoVideoError(result["reason"])
+            return result
+
+    raise NoVideoError(NO_RENDERER)
+
+
+def back_ends() -> tuple[str, ...]:
+    """List the kinds of contexts to try: that of the variable MUJOCO_GL, or those of the system.
+
+    Raises:
+        NoVideoError: The variable turns drawing off.
+    """
+    stated = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if stated in TURNED_OFF:
+        raise NoVideoError(IS_TURNED_OFF)
+    return (stated,) if stated else BACK_ENDS.get(platform.system(), OTHER_BACK_ENDS)
+
+
+def _run(folder: Path, back_end: str, seconds: float) -> None:
+    """Run the other process to its end, or end it when the time is over."""
+    if seconds <= 0.0:
+        raise NoVideoError("drawing took too long")
+
+    environment = {**os.environ, "MUJOCO_GL": back_end}
+    if back_end == "":
+        environment.pop("MUJOCO_GL")
+    command = [sys.executable, "-P", "-c", PROGRAM, json.dumps(sys.path), str(folder)]
+
+    # In a session of its own, Ctrl-C reaches only this process, which then ends the other one.
+    with subprocess.Popen(
+        command,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    ) as process:
+        try:
+            process.wait(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            raise NoVideoError(f"drawing did not end within {seconds:.0f} s") from None
+        finally:
+            process.kill()

@@ -1,0 +1,190 @@
+"""Films of motions: their speed, their camera, and videos that MuJoCo draws."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from mjfim.arrays import Array
+from mjfim.errors import RecordingError
+from mjfim.output import vocabulary
+from mjfim.output.video import NoVideoError
+from mjfim.output.video.film import (
+    Film,
+    film_of_estimate,
+    film_of_trajectories,
+    film_speed,
+    positions_at,
+)
+from mjfim.output.video.record import Video, format_of
+from mjfim.output.video.rendering import Effort, back_ends, render
+from mjfim.records.trajectory import Trajectory
+
+SWING = """
+<mujoco>
+  <worldbody>
+    <body><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1" size=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+FLYING = """
+<mujoco>
+  <worldbody><body name="flyer"><freejoint/><geom size=".1" mass="1000"/></body></worldbody>
+</mujoco>
+"""
+
+# Few and small frames, so that a test takes little time.
+QUICK = Effort(seconds=2.0, fewest_frames=0.0)
+
+
+@pytest.fixture(scope="module")
+def swing() -> mujoco.MjModel:
+    """A pendulum."""
+    return mujoco.MjModel.from_xml_string(SWING)
+
+
+@pytest.fixture(scope="module")
+def flying() -> mujoco.MjModel:
+    """A free body."""
+    return mujoco.MjModel.from_xml_string(FLYING)
+
+
+def motion(t: Array, qpos: Array) -> Trajectory:
+    """A motion of which only positions matter."""
+    nothing = np.zeros((len(t), 0))
+    return Trajectory(t=t, qpos=qpos, qvel=nothing, act=nothing, ctrl=nothing[:-1])
+
+
+def swinging(seconds: float, amplitude: float = 0.5) -> Trajectory:
+    """A swing with a sample every 10 ms."""
+    t = np.linspace(0.0, seconds, round(100 * seconds) + 1)
+    return motion(t, amplitude * np.sin(3.0 * t)[:, None])
+
+
+def drawn(film: Film, kind: str) -> Video:
+    """Draw a film; skip the test where nothing can be drawn."""
+    try:
+        return render(film, kind, QUICK)  # type: ignore[arg-type]
+    except NoVideoError as reason:
+        pytest.skip(f"no video here: {reason}")
+
+
+class TestFilm:
+    @pytest.mark.parametrize(
+        ("seconds", "speed"),
+        [(4.0, 1.0), (20.0, 1.0), (30.0, 2.0), (500.0, 2.0), (2.0, 0.5), (0.01, 0.002)],
+    )
+    def test_speed_makes_a_film_of_some_seconds(self, seconds: float, speed: float) -> None:
+        assert film_speed(seconds) == speed
+
+    def test_a_long_motion_ends_early_and_says_so(self, swing: mujoco.MjModel) -> None:
+        film = film_of_estimate(swing, swinging(100.0), None)
+        assert film.t[-1] == pytest.approx(40.0)
+        assert film.caption == (
+            "The identified motion, 2 times faster than real time. "
+            "Only the first 40 s are shown; 60 s follow."
+        )
+
+    def test_initial_is_beside_designed(self, swing: mujoco.MjModel) -> None:
+        named = {"initial": swinging(4.0), "final": swinging(4.0, 1.0)}
+        film = film_of_trajectories(swing, named)
+
+        words = [[track.word for track in view.tracks] for view in film.views]
+        assert words == [["initial"], ["designed"]]
+        assert film.caption == "The initial motion beside the designed motion, in real time."
+
+    def test_measured_is_a_ghost_over_identified(self, swing: mujoco.MjModel) -> None:
+        film = film_of_estimate(swing, swinging(4.0), swinging(4.0, 0.6))
+        (view,) = film.views
+        robot, ghost = view.tracks
+        assert (robot.word, ghost.word) == ("identified", "measured")
+        assert robot.opacity == 1.0 > ghost.opacity
+        assert ghost.colour == vocabulary.MEASURED.rgb
+
+    def test_positions_between_samples_turn_the_shortest_way(self, flying: mujoco.MjModel) -> None:
+        begin = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        half_turn = np.array([1.0, 0.0, 0.0, np.cos(0.6), 0.0, 0.0, np.sin(0.6)])
+
+        # The other sign of the quaternion is the same rotation.
+        half_turn[3:] *= -1.0
+        found = positions_at(
+            flying, np.array([0.0, 2.0]), np.stack([begin, half_turn]), np.array([-1.0, 1.0, 9.0])
+        )
+        np.testing.assert_allclose(found[0], begin)
+        middle = [0.5, 0.0, 0.0, np.cos(0.3), 0.0, 0.0, np.sin(0.3)]
+        np.testing.assert_allclose(found[1], middle, atol=1e-12)
+        np.testing.assert_allclose(found[2, :3], half_turn[:3])
+
+    @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+    @pytest.mark.parametrize(("distance", "follows"), [(0.1, False), (5.0, True)])
+    def test_camera_follows_a_body_that_travels_far(
+        self, distance: float, follows: bool, scale: float
+    ) -> None:
+        text = FLYING.replace('size=".1"', f'size="{0.1 * scale}"')
+        model = mujoco.MjModel.from_xml_string(text)
+        t = np.linspace(0.0, 4.0, 41)
+        qpos = np.tile(model.qpos0, (41, 1))
+        qpos[:, 0] = scale * distance * t / 4.0
+
+        film = film_of_estimate(model, motion(t, qpos), None)
+        assert film.follows == follows
+        (view,) = film.views
+        travelled = view.target[-1, 0] - view.target[0, 0]
+        assert travelled == pytest.approx(scale * distance if follows else 0.0, rel=0.1)
+
+
+class TestVideo:
+    def test_other_endings_are_refused(self) -> None:
+        assert format_of(Path("a.MP4")) == "mp4"
+        with pytest.raises(RecordingError, match=r"ends in \.mp4 or \.gif"):
+            format_of(Path("a.avi"))
+
+    def test_drawing_may_be_turned_off(
+        self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("MUJOCO_GL", "disable")
+        with pytest.raises(NoVideoError, match="MUJOCO_GL turns drawing off"):
+            render(film_of_estimate(swing, swinging(1.0), None), "gif")
+
+    def test_a_stated_context_is_the_only_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("MUJOCO_GL", "egl")
+        assert back_ends() == ("egl",)
+        monkeypatch.delenv("MUJOCO_GL")
+        assert len(back_ends()) >= 1
+
+    @pytest.mark.slow
+    def test_mp4_shows_both_motions(self, swing: mujoco.MjModel, tmp_path: Path) -> None:
+        av = pytest.importorskip("av", reason="mp4 needs the extra `video`")
+        named = {"initial": swinging(4.0, 0.0), "final": swinging(4.0, 1.0)}
+        video = drawn(film_of_trajectories(swing, named), "mp4")
+        video.save(tmp_path / "film.mp4")
+
+        assert video.media_type == "video/mp4"
+        assert 1000 < len(video.data) < 2_000_000
+        with av.open(str(tmp_path / "film.mp4")) as container:
+            stream = container.streams.video[0]
+            assert (stream.codec.name, stream.pix_fmt) == ("h264", "yuv420p")
+            assert (stream.width, stream.height) == (video.width, video.height)
+            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+
+        # The left pendulum stands still, the right one moves.
+        first, later = frames[0].astype(int), frames[len(frames) // 8].astype(int)
+        change = np.abs(first - later)[40:380].max(axis=(0, 2))
+        half = video.width // 2
+        assert change[: half - 20].max() < 40 < change[half + 20 :].max()
+
+    @pytest.mark.slow
+    def test_gif_repeats_for_ever(self, swing: mujoco.MjModel) -> None:
+        video = drawn(film_of_estimate(swing, swinging(3.0), swinging(3.0, 0.6)), "gif")
+        with Image.open(io.BytesIO(video.data)) as picture:
+            assert picture.format == "GIF"
+            assert picture.size == (video.width, video.height)
+            assert picture.info["loop"] == 0
+            duration = picture.info["duration"] * getattr(picture, "n_frames", 1)
+        assert duration == pytest.approx(3000.0, rel=0.1)
