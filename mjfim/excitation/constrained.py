@@ -23,8 +23,9 @@ from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import RELAXED, ModelVariant
 from mjfim.parallel import offer_result, one_blas_thread, pool_stop_token
-from mjfim.records.design import HistoryRow, Status
+from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
+from mjfim.records.iterates import IterateMotion
 from mjfim.signals import independent_curves
 
 # Power of the smooth E-criterion. The criterion is always smoothed here, because under hard limits
@@ -213,7 +214,7 @@ class _Search:
                     continue
 
                 row = self._row(iterate, point, result.steps)
-                result = replace(result, history=(*result.history, row))
+                result = replace(result, history=extended(result.history, [row]))
                 yield DesignEvent(start=result.name, row=row)
 
                 if self.budget.stop.requested:
@@ -277,6 +278,7 @@ class _Search:
             rate=1.0 / self.task.dt,
             mu=iterate.mu,
             margin=min(margins.values(), default=np.nan),
+            motion=IterateMotion.of(values.trajectory),
         )
 
 

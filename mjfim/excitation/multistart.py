@@ -27,7 +27,7 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.verification import verify
 from mjfim.parallel import run_in_order, workers_of
-from mjfim.records.design import HistoryRow, Status
+from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
 
 # The first round keeps one in this number of starts.
@@ -617,4 +617,4 @@ def _join(first: tuple[HistoryRow, ...], second: tuple[HistoryRow, ...]) -> tupl
         replace(row, iteration=row.iteration + end.iteration + 1, steps=row.steps + end.steps)
         for row in second
     ]
-    return (*first, *continued)
+    return extended(first, continued)

@@ -26,8 +26,9 @@ from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.optimize.lq import largest_amplification
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.plant.plant import Plant
-from mjfim.records.design import HistoryRow, StartResult, Status
+from mjfim.records.design import HistoryRow, StartResult, Status, extended
 from mjfim.records.events import DesignCallback, DesignEvent
+from mjfim.records.iterates import IterateMotion
 from mjfim.records.trajectory import Trajectory
 
 # The grid has 2^(5 + d) releases for d coordinates, but no more than 2^9, and the corners of up to
@@ -319,8 +320,9 @@ class ReleaseSearch:
             moved = float(np.abs(release.shares - self.best.shares).max())
         self.best, self.found_by = release, self._name
 
-        self._history.append(self._row(release, len(self._history), moved))
-        self._callback(DesignEvent(start=self._name, row=self._history[-1]))
+        row = self._row(release, len(self._history), moved)
+        self._history = list(extended(tuple(self._history), [row]))
+        self._callback(DesignEvent(start=self._name, row=row))
 
     def _row(self, release: Release, iteration: int, moved: float) -> HistoryRow:
         """The iterate of a release; `moved`: distance from the one before, in ranges."""
@@ -336,6 +338,7 @@ class ReleaseSearch:
             steps=task.plant.engine_steps - self._steps_before,
             rate=1.0 / task.dt,
             margin=release.margin_of_limits,
+            motion=IterateMotion.of(release.point.trajectory),
         )
 
     def _released(self, shares: Array) -> Plant:

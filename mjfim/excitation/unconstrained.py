@@ -22,8 +22,9 @@ from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
-from mjfim.records.design import HistoryRow, Status
+from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
+from mjfim.records.iterates import IterateMotion
 
 # Growth of a small deviation along the trajectory above which the projection uses feedback.
 FEEDBACK_THRESHOLD = 10.0
@@ -321,9 +322,10 @@ class UnconstrainedSearch:
             seconds=self.budget.seconds_used,
             steps=steps,
             rate=1.0 / stage.task.dt,
+            motion=IterateMotion.of(point.trajectory),
         )
         result = ended.progress.result
-        result = replace(result, history=(*result.history, row))
+        result = replace(result, history=extended(result.history, [row]))
         return replace(ended, progress=replace(ended.progress, result=result)), row
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, ClassVar
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from mjfim.arrays import Array, freeze
 from mjfim.errors import RenamedFields
+from mjfim.records.iterates import IterateMotion, IterateMotions, superfluous
 from mjfim.records.labels import Labels
 from mjfim.records.serialization import SavedRecord
 from mjfim.records.shown import ShownRecord
@@ -129,6 +130,8 @@ class HistoryRow:
         rate: Sample rate of the plant of this iterate [Hz]; lower than stated on a coarse plant.
         mu: Weight of the barrier of hard limits; 0 without limits.
         margin: Worst margin divided by half of its range; NaN without limits.
+        motion: Thinned motion of the iterate; None where it diverged, or where the search no longer
+            keeps it. A `Design` has it in `motions` instead.
     """
 
     iteration: int
@@ -142,6 +145,21 @@ class HistoryRow:
     rate: float = 0.0
     mu: float = 0.0
     margin: float = float("nan")
+    motion: IterateMotion | None = field(default=None, compare=False, repr=False)
+
+
+def extended(history: tuple[HistoryRow, ...], rows: Iterable[HistoryRow]) -> tuple[HistoryRow, ...]:
+    """Append iterates to a history, of which at most `MAX_MOTIONS` keep their motions.
+
+    Args:
+        history: The history.
+        rows: The iterates.
+    """
+    joined = [*history, *rows]
+    moving = [place for place, row in enumerate(joined) if row.motion is not None]
+    for dropped in superfluous([joined[place].iteration for place in moving]):
+        joined[moving[dropped]] = replace(joined[moving[dropped]], motion=None)
+    return tuple(joined)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,6 +360,8 @@ class Design(ShownRecord):
         sizes: (p,) sizes of which standard deviations are a share: magnitudes of the values, or of
             the whole vectors or tensors of which they are entries [theta-unit]. Default: the
             magnitudes of the values.
+        motions: Thinned motions of at most `MAX_MOTIONS` iterates; None if none was kept. They may
+            be given by the rows of `history` instead.
     """
 
     status: Status
@@ -367,6 +387,7 @@ class Design(ShownRecord):
     data: Array = field(default_factory=lambda: np.zeros((0, 0)))
     labels: Labels | None = None
     sizes: Array = field(default_factory=lambda: np.zeros(0))
+    motions: IterateMotions | None = None
 
     file_stem: ClassVar[str] = "design"
     made_by: ClassVar[str] = "`mjfim design EXPERIMENT -o DIR`"
@@ -375,6 +396,14 @@ class Design(ShownRecord):
     def __post_init__(self) -> None:
         if not len(self.sizes):
             object.__setattr__(self, "sizes", np.abs(self.theta))
+
+        # The arrays of all motions are saved together.
+        few = extended((), self.history)
+        motions = [(row.iteration, row.motion) for row in few if row.motion is not None]
+        if motions:
+            object.__setattr__(self, "motions", IterateMotions.of(motions))
+            still = tuple(replace(row, motion=None) for row in self.history)
+            object.__setattr__(self, "history", still)
         freeze(self, "theta", "prior", "data", "sizes")
 
     @property

@@ -1,0 +1,126 @@
+"""Thinned motions of the iterates of a design, from which a viewer can show how the search went."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mjfim.records.trajectory import Trajectory
+
+# Largest number of iterates of one search whose motions are kept, and number of samples of each.
+MAX_MOTIONS, MOTION_SAMPLES = 40, 200
+
+# Motions are only drawn, so that half of the digits are enough.
+DrawnArray = NDArray[np.float32]
+
+
+def _freeze_drawn(record: object, *names: str) -> None:
+    """Replace named fields of a frozen record by read-only float32 arrays."""
+    for name in names:
+        array = np.array(getattr(record, name), dtype=np.float32)
+        array.setflags(write=False)
+        object.__setattr__(record, name, array)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class IterateMotion:
+    """Motion of one iterate at `MOTION_SAMPLES` evenly spread samples, n in all.
+
+    Attributes:
+        t: (n,) times [s].
+        qpos: (n, nq) positions [m or rad; unit quaternions for ball and free joints].
+        ctrl: (n, nu) controls; the last one is repeated at the end [unit of the actuator].
+    """
+
+    t: DrawnArray
+    qpos: DrawnArray
+    ctrl: DrawnArray
+
+    def __post_init__(self) -> None:
+        _freeze_drawn(self, "t", "qpos", "ctrl")
+
+    @classmethod
+    def of(cls, trajectory: Trajectory | None) -> IterateMotion | None:
+        """Thin a trajectory.
+
+        Args:
+            trajectory: The trajectory; None for an iterate whose simulation diverged.
+
+        Returns:
+            The motion; None without a trajectory.
+        """
+        if trajectory is None:
+            return None
+
+        # A trajectory with fewer samples repeats some, so that all motions have the same size.
+        last = trajectory.samples
+        rows = np.linspace(0, last, MOTION_SAMPLES).round().astype(np.intp)
+        held = np.minimum(rows, last - 1)
+        return cls(
+            t=trajectory.t[rows].astype(np.float32),
+            qpos=trajectory.qpos[rows].astype(np.float32),
+            ctrl=trajectory.ctrl[held].astype(np.float32),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class IterateMotions:
+    """Motions of m iterates of a design, with n samples each.
+
+    Attributes:
+        iteration: (m,) ascending numbers of the iterates.
+        t: (m, n) times [s].
+        qpos: (m, n, nq) positions [m or rad; unit quaternions for ball and free joints].
+        ctrl: (m, n, nu) controls [unit of the actuator].
+    """
+
+    iteration: DrawnArray
+    t: DrawnArray
+    qpos: DrawnArray
+    ctrl: DrawnArray
+
+    def __post_init__(self) -> None:
+        _freeze_drawn(self, "iteration", "t", "qpos", "ctrl")
+
+    @classmethod
+    def of(cls, motions: Sequence[tuple[int, IterateMotion]]) -> IterateMotions | None:
+        """Join motions.
+
+        Args:
+            motions: Number and motion of each iterate, ascending.
+
+        Returns:
+            The motions; None if there are none.
+        """
+        if not motions:
+            return None
+        return cls(
+            iteration=np.array([iteration for iteration, _ in motions], dtype=np.float32),
+            t=np.stack([motion.t for _, motion in motions]),
+            qpos=np.stack([motion.qpos for _, motion in motions]),
+            ctrl=np.stack([motion.ctrl for _, motion in motions]),
+        )
+
+
+def superfluous(iterations: Sequence[int], limit: int = MAX_MOTIONS) -> set[int]:
+    """Choose iterates whose motions are dropped, so that at most `limit` remain.
+
+    One after the other the iterate is dropped whose neighbours are nearest to each other. The first
+    and the last one stay.
+
+    Args:
+        iterations: Ascending numbers of the iterates that have a motion.
+        limit: Largest number that remains, at least 2.
+
+    Returns:
+        Places in `iterations` of those that are dropped.
+    """
+    kept = list(range(len(iterations)))
+    while len(kept) > limit:
+        numbers = np.array([iterations[place] for place in kept])
+        gaps = numbers[2:] - numbers[:-2]
+        del kept[1 + int(np.argmin(gaps))]
+    return set(range(len(iterations))) - set(kept)
