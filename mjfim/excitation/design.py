@@ -45,7 +45,7 @@ from mjfim.parallel import one_blas_thread
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import GROUPS_TEXT, ParameterGroup, groups_in_words
-from mjfim.records.design import Design, Evaluation, ScaledStart, Status
+from mjfim.records.design import Design, Evaluation, ScaledStart, Status, without_motions
 from mjfim.records.events import DesignCallback
 from mjfim.records.progress import shown_progress
 
@@ -572,13 +572,14 @@ class _Report:
             parameters.prior_information,
             parameters.recording_specific,
         )
+        history, motions = without_motions(best.history)
         return Design(
             status=status,
             parameters=parameters.names,
             theta=task.theta,
             initial=initial,
             final=final,
-            history=best.history,
+            history=history,
             slope=best.slope,
             steps=steps,
             seconds=seconds,
@@ -596,6 +597,7 @@ class _Report:
             data=data,
             labels=labels_of_system(task.system),
             sizes=parameters.sizes(task.theta),
+            motions=motions,
         )
 
 

@@ -212,7 +212,14 @@ def usage_within_samples(
 
     t = _engine_times(task, len(positions))
     for i, (kind, name) in enumerate(zip(substeps.kinds, substeps.names, strict=True)):
-        yield LimitUsage(kind=kind, name=name, t=t, share=positions[:, i])
+        yield LimitUsage(
+            kind=kind,
+            name=name,
+            t=t,
+            share=positions[:, i],
+            lower=float(substeps.bounds.lower[i]),
+            upper=float(substeps.bounds.upper[i]),
+        )
 
 
 def _usage_of_controls(
@@ -234,7 +241,14 @@ def _bounded_usage(
 
     bounded = np.isfinite(bounds.lower) | np.isfinite(bounds.upper)
     for i in np.flatnonzero(bounded).tolist():
-        yield LimitUsage(kind=kind, name=task.controls[i], t=t, share=positions[:, i])
+        yield LimitUsage(
+            kind=kind,
+            name=task.controls[i],
+            t=t,
+            share=positions[:, i],
+            lower=float(bounds.lower[i]),
+            upper=float(bounds.upper[i]),
+        )
 
 
 def _clearance_usage(
@@ -252,7 +266,8 @@ def _clearance_usage(
 
     t = _engine_times(task, len(positions))
     share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)
-    return distance, LimitUsage(kind="clearance", name=pair.name, t=t, share=share)
+    used = LimitUsage(kind="clearance", name=pair.name, t=t, share=share, lower=clearance.least)
+    return distance, used
 
 
 def _engine_times(task: DesignTask, count: int) -> Array:

@@ -65,7 +65,7 @@ def predict(
     problem = FitProblem.of(system, recordings)
     values = np.asarray(theta)
     return tuple(
-        _prediction_errors(problem, values, _masks_of(problem.masks, [i]), recording.name, Budget())
+        _predicted(problem, values, _masks_of(problem.masks, [i]), recording.name, Budget())[0]
         for i, recording in enumerate(problem.recordings)
     )
 
@@ -167,27 +167,38 @@ def _prediction(
     if len(problem.recordings) == 1 and not held_out:
         name = f"last {100 * PREDICTED_SHARE:.0f} % of {name}"
 
-    nominal = problem.system.parameters.guess
-    return Prediction(
-        name=name,
-        identified=_prediction_errors(problem, theta, part.masks, name, budget),
-        nominal=_prediction_errors(problem, nominal, part.masks, name, budget),
-        held_out=held_out,
+    guess = problem.system.parameters.guess
+    errors, outputs = _predicted(problem, theta, part.masks, name, budget)
+    nominal_errors, nominal_outputs = _predicted(problem, guess, part.masks, name, budget)
+    prediction = Prediction(name=name, identified=errors, nominal=nominal_errors, held_out=held_out)
+
+    # The fitted recordings are in the estimate anyway.
+    if not held_out:
+        return prediction
+    i = part.recordings[0]
+    return replace(
+        prediction,
+        identified_outputs=outputs[i],
+        nominal_outputs=nominal_outputs[i],
     )
 
 
-def _prediction_errors(
+def _predicted(
     problem: FitProblem,
     theta: Array,
     masks: Sequence[np.ndarray],
     name: str,
     budget: Budget,
-) -> PredictionErrors:
-    """Errors at theta: (p,) of the values in some masks: (M, ny) for every recording.
+) -> tuple[PredictionErrors, list[Array]]:
+    """Predict the values in some masks: (M, ny) for every recording, at theta: (p,).
 
     Unknown initial states are estimated from the other values of a segment, or from the predicted
     ones where it has no others.
+
+    Returns:
+        The errors, and for every recording the (M, ny) outputs, NaN where the model diverges.
     """
+    diverged = [np.full(mask.shape, np.nan) for mask in masks]
     problem = problem.of_segments(problem.masked(masks).segments_with_values)
     at = problem.begin(theta)
 
@@ -213,7 +224,8 @@ def _prediction_errors(
                 rms[j] = np.sqrt(np.mean(errors**2))
                 mae[j] = np.mean(np.abs(errors))
 
-    return PredictionErrors(name=name, outputs=outputs, rms=rms, mae=mae)
+    errors_of_all = PredictionErrors(name=name, outputs=outputs, rms=rms, mae=mae)
+    return errors_of_all, diverged if predicted is None else predicted
 
 
 def _masks_for_initial_states(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -211,7 +211,16 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
         return ()
 
     found = predict_unfitted(result.problem, result.solution.unknowns, result.held_out, budget)
-    return () if budget.stop.requested else found
+    complete = () if budget.stop.requested else found
+    if result.held_out is None:
+        return complete
+
+    # The budget may have ended the predictions early.
+    recordings = _as_aligned(result.held_out, result.task.held_out)
+    return tuple(
+        replace(prediction, recording=recording)
+        for prediction, recording in zip(complete, recordings, strict=False)
+    )
 
 
 def _at_bounds(parameters: ParameterSet, theta: Array) -> tuple[tuple[str, ...], bool]:
@@ -262,7 +271,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         residual_rms=quality.rms,
         at_bound=findings.at_bound,
         predicted=quality.predicted,
-        recordings=_fitted_recordings(result),
+        recordings=_as_aligned(result.problem, result.task.recordings),
         warnings=tuple(_warnings(findings)),
         combinations=tuple(str(group) for group in accuracy.groups),
         data=accuracy.data_information,
@@ -284,9 +293,9 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
     )
 
 
-def _fitted_recordings(result: FitResult) -> tuple[Recording, ...]:
-    """The recordings with their outputs in the order of the experiment, as they were fitted."""
-    names = result.task.system.outputs.names
+def _as_aligned(problem: FitProblem, recordings: Sequence[Recording]) -> tuple[Recording, ...]:
+    """Recordings with their outputs in the order of the experiment, as a problem compares them."""
+    names = problem.system.outputs.names
     return tuple(
         Recording(
             t=aligned.t,
@@ -295,9 +304,7 @@ def _fitted_recordings(result: FitResult) -> tuple[Recording, ...]:
             outputs=names,
             name=aligned.name,
         )
-        for aligned, recording in zip(
-            result.problem.recordings, result.task.recordings, strict=True
-        )
+        for aligned, recording in zip(problem.recordings, recordings, strict=True)
     )
 
 

@@ -131,7 +131,7 @@ class HistoryRow:
         mu: Weight of the barrier of hard limits; 0 without limits.
         margin: Worst margin divided by half of its range; NaN without limits.
         motion: Thinned motion of the iterate; None where it diverged, or where the search no longer
-            keeps it. A `Design` has it in `motions` instead.
+            keeps it. In a `Design` they stand in `motions` instead.
     """
 
     iteration: int
@@ -160,6 +160,22 @@ def extended(history: tuple[HistoryRow, ...], rows: Iterable[HistoryRow]) -> tup
     for dropped in superfluous([joined[place].iteration for place in moving]):
         joined[moving[dropped]] = replace(joined[moving[dropped]], motion=None)
     return tuple(joined)
+
+
+def without_motions(
+    history: Iterable[HistoryRow],
+) -> tuple[tuple[HistoryRow, ...], IterateMotions | None]:
+    """Separate the motions from a history.
+
+    Args:
+        history: The history.
+
+    Returns:
+        The history without motions, and the motions; None if there are none.
+    """
+    rows = extended((), history)
+    motions = [(row.iteration, row.motion) for row in rows if row.motion is not None]
+    return tuple(replace(row, motion=None) for row in rows), IterateMotions.of(motions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,12 +237,16 @@ class LimitUsage:
         t: (n,) times [s].
         share: (n,) relative position between the bounds: -1 at the lower bound, 1 at the upper one.
             For a clearance: the required distance over the distance.
+        lower: Lower bound; -inf where there is none, or where it is unknown [unit of the kind].
+        upper: Upper bound, likewise inf.
     """
 
     kind: str
     name: str
     t: Array
     share: Array
+    lower: float = -np.inf
+    upper: float = np.inf
 
     def __post_init__(self) -> None:
         freeze(self, "t", "share")
@@ -360,8 +380,7 @@ class Design(ShownRecord):
         sizes: (p,) sizes of which standard deviations are a share: magnitudes of the values, or of
             the whole vectors or tensors of which they are entries [theta-unit]. Default: the
             magnitudes of the values.
-        motions: Thinned motions of at most `MAX_MOTIONS` iterates; None if none was kept. They may
-            be given by the rows of `history` instead.
+        motions: Thinned motions of at most `MAX_MOTIONS` iterates; None if none was kept.
     """
 
     status: Status
@@ -396,14 +415,6 @@ class Design(ShownRecord):
     def __post_init__(self) -> None:
         if not len(self.sizes):
             object.__setattr__(self, "sizes", np.abs(self.theta))
-
-        # The arrays of all motions are saved together.
-        few = extended((), self.history)
-        motions = [(row.iteration, row.motion) for row in few if row.motion is not None]
-        if motions:
-            object.__setattr__(self, "motions", IterateMotions.of(motions))
-            still = tuple(replace(row, motion=None) for row in self.history)
-            object.__setattr__(self, "history", still)
         freeze(self, "theta", "prior", "data", "sizes")
 
     @property

@@ -264,12 +264,23 @@ class Prediction:
         nominal: Errors of the nominal model.
         held_out: True if the user held out the data; False if they were left out of a fit for
             cross-validation.
+        recording: The held-out recording; None in a cross-validation, and in records of earlier
+            versions.
+        identified_outputs: (M, ny) outputs of the identified model for the held-out recording
+            [unit of the output]; NaN where the model diverges, empty without a recording.
+        nominal_outputs: (M, ny) outputs of the nominal model, likewise.
     """
 
     name: str
     identified: PredictionErrors
     nominal: PredictionErrors
     held_out: bool
+    recording: Recording | None = None
+    identified_outputs: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    nominal_outputs: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        freeze(self, "identified_outputs", "nominal_outputs")
 
     @property
     def ratio(self) -> float:

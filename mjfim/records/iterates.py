@@ -20,7 +20,9 @@ DrawnArray = NDArray[np.float32]
 def _freeze_drawn(record: object, *names: str) -> None:
     """Replace named fields of a frozen record by read-only float32 arrays."""
     for name in names:
-        array = np.array(getattr(record, name), dtype=np.float32)
+        # What is too large for this type is drawn nowhere.
+        with np.errstate(over="ignore"):
+            array = np.array(getattr(record, name), dtype=np.float32)
         array.setflags(write=False)
         object.__setattr__(record, name, array)
 

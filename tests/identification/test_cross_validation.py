@@ -40,6 +40,12 @@ def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.
     np.testing.assert_allclose(alone[0].rms, prediction.identified.rms, rtol=1e-9)
     assert (alone[0].mae < alone[0].rms).all()
 
+    # The outputs are those of which the errors are told; the first row begins the simulation.
+    assert prediction.recording is not None
+    errors = prediction.identified_outputs - prediction.recording.y
+    rms = np.sqrt(np.nanmean(errors[1:] ** 2, axis=0))
+    np.testing.assert_allclose(rms, prediction.identified.rms, rtol=1e-9)
+
 
 @pytest.mark.slow
 def test_without_held_out_recordings_each_is_predicted_by_the_others(

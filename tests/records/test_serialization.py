@@ -199,6 +199,9 @@ def round_trip(record: SavedRecord, folder: Path) -> None:
 def test_a_design_is_loaded_as_it_was(design: Design, tmp_path: Path) -> None:
     """With its history, its starts and the usage of its limits."""
     assert design.usage and len(design.starts) == 2 and design.nuisance
+    slide = next(used for used in design.usage if used.name == "slide")
+    assert (slide.lower, slide.upper) == (-2.0, 2.0)
+    assert design.motions is not None and len(design.motions.iteration) == len(design.history)
     round_trip(design, tmp_path)
 
 

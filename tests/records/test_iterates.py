@@ -1,0 +1,73 @@
+"""Thinned motions of iterates: how many are kept, which ones, and at which samples."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjfim.records.design import HistoryRow, extended, without_motions
+from mjfim.records.iterates import MAX_MOTIONS, MOTION_SAMPLES, IterateMotion, superfluous
+from mjfim.records.trajectory import Trajectory
+
+
+def moved(samples: int) -> Trajectory:
+    """A trajectory of one slide, whose position is its time."""
+    t = 0.01 * np.arange(samples + 1)
+    empty = np.zeros((samples + 1, 0))
+    return Trajectory(t=t, qpos=t[:, None], qvel=t[:, None], act=empty, ctrl=t[:-1, None])
+
+
+def row(iteration: int, motion: IterateMotion | None) -> HistoryRow:
+    """An iterate with a motion."""
+    return HistoryRow(
+        iteration=iteration,
+        cost=1.0,
+        criterion=1.0,
+        min_eigenvalue=1.0,
+        slope=1.0,
+        gamma=1.0,
+        seconds=0.0,
+        steps=0,
+        motion=motion,
+    )
+
+
+def test_a_motion_has_both_ends_and_evenly_spread_samples() -> None:
+    motion = IterateMotion.of(moved(1000))
+    assert motion is not None
+    assert motion.t.shape == (MOTION_SAMPLES,) and motion.qpos.shape == (MOTION_SAMPLES, 1)
+    assert motion.t[0] == 0.0 and motion.t[-1] == 10.0
+    assert np.ptp(np.diff(motion.t)) < 0.011
+    np.testing.assert_array_equal(motion.qpos[:, 0], motion.t)
+    np.testing.assert_array_equal(motion.ctrl[:-1, 0], motion.t[:-1])
+
+
+def test_short_and_diverged_iterates_are_taken() -> None:
+    short = IterateMotion.of(moved(3))
+    assert short is not None and set(short.t.tolist()) == {
+        float(np.float32(value)) for value in (0.0, 0.01, 0.02, 0.03)
+    }
+    assert IterateMotion.of(None) is None
+
+
+def test_many_iterates_keep_few_motions_evenly_spread() -> None:
+    history: tuple[HistoryRow, ...] = ()
+    motion = IterateMotion.of(moved(5))
+    for iteration in range(500):
+        history = extended(history, [row(iteration, motion)])
+    kept = [entry.iteration for entry in history if entry.motion is not None]
+    assert len(history) == 500 and len(kept) == MAX_MOTIONS
+    assert kept[0] == 0 and kept[-1] == 499
+    assert np.diff(kept).max() <= 4 * np.median(np.diff(kept))
+
+
+def test_motions_are_separated_from_the_history() -> None:
+    rows = [row(0, None), row(1, IterateMotion.of(moved(9))), row(4, IterateMotion.of(moved(5)))]
+    history, motions = without_motions(rows)
+    assert all(entry.motion is None for entry in history)
+    assert motions is not None and motions.iteration.tolist() == [1.0, 4.0]
+    assert motions.qpos.shape == (2, MOTION_SAMPLES, 1)
+    assert without_motions(history)[1] is None
+
+
+def test_the_iterate_between_the_nearest_neighbours_is_dropped() -> None:
+    assert superfluous([0, 10, 11, 20, 30], limit=4) == {2}
