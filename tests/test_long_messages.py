@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
-from mjfim.excitation.design import require_designable
+from mjfim.excitation.designable import require_designable
 from mjfim.excitation.joint_design import _require_common_parameters
 from mjfim.excitation.target_accuracy import require_reachable
 from mjfim.excitation.task import DesignTask

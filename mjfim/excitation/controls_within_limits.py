@@ -17,7 +17,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.constraints import ConstraintSet, ConstraintValues, constraint_set_of
 from mjfim.excitation.interior_point import MAX_START_VIOLATION, nearly_inside
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint
@@ -64,20 +64,26 @@ class LimitedCost:
         """The limits on the plant without clamps."""
         return constraint_set_of(self.level.task)
 
+    def values(self, control: Array) -> ConstraintValues | None:
+        """Limited quantities along a control: (N, nu); None where the simulation diverges."""
+        task = self.level.task
+        observed = task.plant.observe(task.theta, control, self.constraints.observations)
+        if observed is None:
+            return None
+        return self.constraints.evaluate(*observed, slopes=False)
+
     def trajectory(self, control: Array) -> Trajectory | None:
         """Trajectory of a control: (N, nu); None where it violates a limit.
 
         A force that keeps its limit only because a clamp cuts it off violates this limit.
         """
-        task = self.level.task
-        observed = task.plant.observe(task.theta, control, self.constraints.observations)
-        if observed is None:
-            return None
+        return self._accepted(self.values(control))
 
-        values = self.constraints.evaluate(*observed, slopes=False)
-        if not self.constraints.is_feasible(values):
+    def _accepted(self, values: ConstraintValues | None) -> Trajectory | None:
+        """Trajectory of limited quantities that keep all limits on the unmodified model, too."""
+        if values is None or not self.constraints.is_feasible(values):
             return None
-        return values.trajectory if verify(task, values.trajectory).is_feasible else None
+        return values.trajectory if verify(self.level.task, values.trajectory).is_feasible else None
 
     def point(self, control: Array) -> DesignPoint | None:
         """Evaluate a control: (N, nu); None where it violates a limit."""
@@ -89,14 +95,52 @@ class LimitedCost:
         point = self.point(control)
         return np.inf if point is None else point.cost
 
-    def is_far_outside(self, control: Array) -> bool:
-        """Check whether a control violates a limit by more than the barrier can remove."""
-        task = self.level.task
-        observed = task.plant.observe(task.theta, control, self.constraints.observations)
-        if observed is None:
+    def is_far_outside(self, values: ConstraintValues | None) -> bool:
+        """Check whether a limit is violated by more than the barrier can remove.
+
+        Args:
+            values: Limited quantities along a control; None where the simulation diverges.
+        """
+        if values is None:
             return True
-        values = self.constraints.evaluate(*observed, slopes=False)
         return not nearly_inside(self.constraints.relative_margins(values), MAX_START_VIOLATION)
+
+    def outside_start(self, control: Array, budget: Budget) -> OutsideStart | None:
+        """Describe an initial control, (N, nu), outside limits; None where it keeps them.
+
+        Args:
+            control: The initial control [u-unit].
+            budget: Time of the whole design, and the token that stops it.
+        """
+        if budget.stop.requested:
+            return None
+        values = self.values(control)
+        if self._accepted(values) is not None:
+            return None
+
+        scaled = ControlsWithinLimits(cost=self, budget=budget).scaled(control)
+        is_far = self.is_far_outside(values)
+        return OutsideStart(control=control, scaled=scaled, is_far=is_far)
+
+
+def limited_cost_of(stage: DescentLevel) -> LimitedCost | None:
+    """Cost of controls that keep all limits, at the stated level; None without hard limits."""
+    if not stage.task.is_limited:
+        return None
+    return LimitedCost(level=DescentLevel(stage.task.relaxed(), stage.basis))
+
+
+def keeps_limits(limited: LimitedCost | None, point: DesignPoint) -> bool:
+    """Check whether the motion of a point keeps the hard limits.
+
+    Args:
+        limited: Cost of controls that keep them; None without hard limits.
+        point: The point, which begins at the stated initial state.
+    """
+    if limited is None:
+        return True
+    curve = point.trajectory
+    return curve is not None and limited.trajectory(curve.ctrl) is not None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,6 +175,26 @@ class InsideControl:
     def record(self) -> ScaledStart:
         """The control as an entry of the design."""
         return ScaledStart(share=self.share, cost=self.cost, min_eigenvalue=self.min_eigenvalue)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OutsideStart:
+    """An initial control that violates a limit.
+
+    Attributes:
+        control: (N, nu) the control [u-unit].
+        scaled: The largest share of it that keeps all limits; None where no share does.
+        is_far: Whether it violates a limit by more than the barrier can remove.
+    """
+
+    control: Array
+    scaled: InsideControl | None
+    is_far: bool
+
+    @property
+    def record(self) -> ScaledStart | None:
+        """The scaled control as an entry of the design."""
+        return None if self.scaled is None else self.scaled.record
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

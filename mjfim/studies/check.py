@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import RecordingError, SimulationDivergedError, first_ones, shortened
-from mjfim.excitation.design import require_evaluated
+from mjfim.excitation.designable import require_evaluated
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task import DesignTask

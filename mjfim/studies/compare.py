@@ -18,7 +18,8 @@ from mjfim.errors import (
     listed,
     unknown,
 )
-from mjfim.excitation.design import design_budget, design_task, designable
+from mjfim.excitation.design import design_budget, design_task
+from mjfim.excitation.designable import designable
 from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.feasibility import shrink_until_feasible
 from mjfim.excitation.levels import DescentLevel

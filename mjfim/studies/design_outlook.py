@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from mjfim.errors import MjfimError, first_ones
-from mjfim.excitation.design import require_designable
+from mjfim.excitation.designable import require_designable
 from mjfim.excitation.evaluation import growth_along, growth_warning
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start

@@ -1,0 +1,209 @@
+"""Search for the best control: without a barrier, within hard limits, or one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.budget import Budget
+from mjfim.errors import SimulationDivergedError
+from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.controls_within_limits import (
+    ControlsWithinLimits,
+    InsideControl,
+    LimitedCost,
+    OutsideStart,
+    keeps_limits,
+)
+from mjfim.excitation.evaluation import point_at_stated_rate
+from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.levels import DescentLevel, coarse_level, easier_level
+from mjfim.excitation.multistart import Multistart
+from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.task import DesignTask
+from mjfim.excitation.unconstrained import UnconstrainedSearch
+from mjfim.excitation.verification import verify
+from mjfim.records.design import Status
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlSearch:
+    """Search for the best control from several initial controls.
+
+    Attributes:
+        stage: The stated level.
+        first: The experiment's initial control, evaluated.
+        executor: Runs several starts under hard limits side by side, or None.
+        budget: Time of the search and the token that stops it.
+        limited: Cost of controls that keep the hard limits; None without limits.
+        outside: The initial control where it violates a limit; None where it keeps them.
+    """
+
+    stage: DescentLevel
+    first: DesignPoint
+    executor: Executor | None
+    budget: Budget
+    limited: LimitedCost | None = None
+    outside: OutsideStart | None = None
+
+    def run(self, starts: Iterable[InitialControl]) -> Runs:
+        """Yield every iterate of all runs; return their results on the stated plant."""
+        if self.limited is None:
+            return (yield from self._run_without_barrier(starts))
+
+        return (yield from self._run_within_limits(list(starts), self.limited))
+
+    def _run_without_barrier(self, starts: Iterable[InitialControl]) -> Runs:
+        """Descend from every start; under hard limits until one descent leaves them."""
+        task, basis = self.stage.task, self.stage.basis
+        coarse = coarse_level(task, self.first, basis)
+        tasks = [task] if coarse is None else [coarse, task]
+
+        search = UnconstrainedSearch(
+            levels=[DescentLevel(level, basis) for level in tasks],
+            budget=self.budget,
+            constraints=constraint_set_of(task) if task.is_limited else None,
+            steps_before=sum(level.plant.engine_steps for level in tasks),
+        )
+        return (yield from search.run_all(starts))
+
+    def _run_within_limits(self, starts: list[InitialControl], limited: LimitedCost) -> Runs:
+        """Optimise under hard limits.
+
+        The search begins without a barrier where the weights of the cost may keep the limits.
+        """
+        results: list[RunResult] = []
+        steps_without_barrier = 0
+
+        if _is_bounded_by_weights(self.stage.task):
+            results = yield from self._run_without_barrier(starts)
+            if not results[-1].left_limits:
+                return results
+
+            # The start that left the limits continues from its last feasible control.
+            left = results.pop()
+            steps_without_barrier = left.steps
+            starts = starts[len(results) :]
+            if left.control is not None:
+                starts[0] = InitialControl(name=starts[0].name, control=left.control)
+
+        # A start far outside the limits is replaced by the best control inside that is found
+        # without derivatives.
+        inside = None if self.outside is None else self.outside.scaled
+        if inside is not None and self._is_far_outside(starts[0].control, limited):
+            inside = ControlsWithinLimits(cost=limited, budget=self.budget).best(inside)
+            starts[0] = InitialControl(name=starts[0].name, control=inside.begin)
+
+        free = limited.level
+        multistart = Multistart(
+            fine=free, coarse=easier_level(free), executor=self.executor, budget=self.budget
+        )
+        constrained = yield from multistart.run(starts)
+        constrained = yield from multistart.tighten_winner(constrained)
+
+        found = [self._on_stated_plant(result) for result in constrained]
+        results += self._not_worse(found, inside)
+        if results:
+            steps = results[0].steps + steps_without_barrier
+            results[0] = replace(results[0], steps=steps)
+        return results
+
+    def _is_far_outside(self, control: Array, limited: LimitedCost) -> bool:
+        """Check whether a control is far outside; that of the initial control is known."""
+        if self.outside is not None and control is self.outside.control:
+            return self.outside.is_far
+        return limited.is_far_outside(limited.values(control))
+
+    def _not_worse(self, found: list[RunResult], inside: InsideControl | None) -> list[RunResult]:
+        """Results whose first one is not worse than a control that keeps all limits."""
+        if not found or inside is None:
+            return found
+
+        first = found[0]
+        if first.is_feasible and first.cost <= inside.cost:
+            return found
+
+        # Nothing better was found from the first start.
+        status = first.status
+        if status is Status.INFEASIBLE or status.success:
+            status = Status.BEST_SEEN
+        kept = replace(first, control=inside.control, cost=inside.cost, status=status)
+        return [self._on_stated_plant(kept), *found[1:]]
+
+    def _on_stated_plant(self, result: RunResult) -> RunResult:
+        """Result of one start, evaluated again on the unmodified plant."""
+        point = None
+        if result.control is not None:
+            point = point_at_stated_rate(self.stage, result.control)
+
+        # A stopped search has not verified its controls on the unmodified model.
+        is_feasible = bool(np.isfinite(result.cost))
+        if self.budget.stop.requested:
+            trajectory = None if point is None else point.trajectory
+            is_feasible = trajectory is not None and verify(self.stage.task, trajectory).is_feasible
+
+        return replace(
+            result,
+            point=point,
+            cost=np.inf if point is None else point.cost,
+            is_feasible=is_feasible,
+        )
+
+
+def choose(
+    search: ControlSearch,
+    begins: Sequence[DesignPoint],
+    results: list[RunResult],
+    interrupted: bool,
+) -> tuple[RunResult, DesignPoint]:
+    """Choose the best run and the point of the design.
+
+    The point is that of the control with which the search began, or of the initial control, where
+    no run found a better one: a search that was stopped early may have seen controls on a coarse
+    level only, which are slightly worse. One that breaks a limit is chosen only if no run has a
+    point.
+
+    Args:
+        search: The search.
+        begins: The initial control and the one with which the search began.
+        results: One result per run.
+        interrupted: True where the search was stopped.
+    """
+    if not results:
+        results.append(RunResult(name="initial control", status=Status.INTERRUPTED))
+
+    # A search that was stopped on the coarse level has no point at the stated rate yet.
+    last = results[-1]
+    if last.point is None and last.control is not None:
+        point = point_at_stated_rate(search.stage, last.control)
+        cost = np.inf if point is None else point.cost
+        results[-1] = replace(last, point=point, cost=cost)
+
+    best = min(results, key=lambda result: (not result.is_feasible, result.cost))
+    if best.point is None and not interrupted:
+        raise SimulationDivergedError("the simulation diverges from every start")
+
+    # The beginning counts where it costs less than the best run, or where that breaks a limit.
+    bound = best.cost if best.is_feasible else np.inf
+    cheaper = [
+        begin for begin in begins if begin.cost < bound and keeps_limits(search.limited, begin)
+    ]
+    if cheaper:
+        status = Status.BEST_SEEN if best.status is Status.INFEASIBLE else best.status
+        return replace(best, status=status), min(cheaper, key=lambda begin: begin.cost)
+    return best, begins[0] if best.point is None else best.point
+
+
+def _is_bounded_by_weights(task: DesignTask) -> bool:
+    """Check whether weights on all controls may keep the limits without a barrier.
+
+    A barrier is needed for a boundary, a bandwidth, limits on control rates and a clearance.
+    """
+    limits = task.experiment.limits
+    needs_barrier = task.is_shaped or bool(limits.control_rate) or limits.clearance is not None
+    return not needs_barrier and bool((task.control_weight > 0.0).all())
