@@ -17,7 +17,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.excitation.constraints import ConstraintSet, ConstraintValues, constraint_set_of
+from mjfim.excitation.constraint_kinds import ConstraintValues
+from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.interior_point import MAX_START_VIOLATION, nearly_inside
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint
