@@ -25,6 +25,7 @@ from mjfim.experiment.labels import labels_of_system
 from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design
+from mjfim.output.folders import write_tables
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
@@ -204,7 +205,7 @@ def efficiency_table(study: MonteCarloStudy) -> Table:
 
 
 def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCarloStudy) -> None:
-    """Write Figures 2-6 and the tables as PNG, and the Rerun file.
+    """Write Figures 2-6 as PNG, the tables as Markdown and LaTeX, and the Rerun file.
 
     Args:
         folder: Folder that receives the files.
@@ -216,8 +217,6 @@ def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCa
     figures = {
         "figure_2": plots.trajectories(design, names),
         "figure_3": plots.sensitivity_phase(design, names),
-        "table_1": plots.design_table(design, names),
-        "table_2_3": plots.study_table(study, names),
         "convergence": plots.convergence(design),
     }
 
@@ -227,6 +226,8 @@ def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCa
 
     for name, figure in figures.items():
         plots.save(figure, folder / f"{name}.png")
+    write_tables(folder / "table_1", design)
+    write_tables(folder / "table_2_3", study)
     rerun_log.log_design(folder / "design.rrd", task.system.model_at(task.theta), design, names)
 
 

@@ -15,6 +15,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
+    Pictures,
     Threads,
     claim_folder,
     errors,
@@ -36,6 +37,7 @@ from mjfim.output.campaign_settings import (
     require_same_settings,
     write_settings,
 )
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.campaign import describe_campaign
 from mjfim.output.text import render
 from mjfim.recordings.read import read_recording
@@ -77,6 +79,7 @@ def campaign(
             help="Continue a simulated campaign, with its settings, after its last complete round.",
         ),
     ] = False,
+    pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -89,7 +92,7 @@ def campaign(
     A simulated campaign that was stopped or killed is continued with --resume.
     """
     stated = with_target_accuracies(mjfim.Experiment.from_file(experiment), wanted)
-    run = CampaignRun(output, DesignTask.resolve(stated, threads=threads))
+    run = CampaignRun(output, DesignTask.resolve(stated, threads=threads), pictures)
 
     simulated = not (real or recordings)
     if simulated:
@@ -127,18 +130,21 @@ class CampaignRun:
         folder: The folder of the campaign.
     """
 
-    def __init__(self, path: Path, task: DesignTask) -> None:
+    def __init__(
+        self, path: Path, task: DesignTask, pictures: PictureFormat = PictureFormat.PNG
+    ) -> None:
         """Prepare a campaign.
 
         Args:
             path: Folder of the campaign.
             task: The task as stated.
+            pictures: Format of the pictures.
 
         Raises:
             ExperimentError: No parameter states a target accuracy.
         """
         self.task = task
-        self.folder = CampaignFolder(path, task.system)
+        self.folder = CampaignFolder(path, task.system, pictures)
         self._wanted = target_accuracies(task)
         self._estimate: Estimate | None = None
 

@@ -15,6 +15,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Force,
     OtherDesign,
+    Pictures,
     Threads,
     claim_folder,
     errors,
@@ -29,6 +30,7 @@ from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import CHECK_FILES
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.check import describe_check
 from mjfim.output.text import render
 from mjfim.recordings.read import read_recording, recording_paths
@@ -49,6 +51,7 @@ def check(
         typer.Option("--output", "-o", metavar="DIR", help="Folder for check.json and check.png."),
     ] = None,
     as_json: AsJson = False,
+    pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -64,7 +67,7 @@ def check(
         archive.check_fits(design_file, trajectory, system)
     if output is not None:
         inputs = input_files(stated, [*(recordings or []), design_file])
-        claim_folder(output, CHECK_FILES, inputs, force=force)
+        claim_folder(output, pictures.files(CHECK_FILES), inputs, force=force)
 
     if loaded:
         announce_recordings(system, loaded, fit=False)
@@ -83,7 +86,7 @@ def check(
 
     if output is not None:
         with writing(output) as results:
-            results.write_check_folder(output, result)
+            results.write_check_folder(output, result, pictures)
     print_result(as_json, result.summary(), render(describe_check(result)))
     if output is not None:
         errors.print(f"wrote {output}/", markup=False)

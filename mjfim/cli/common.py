@@ -27,6 +27,7 @@ from mjfim.interruption import (
     Interruption,
     current_interruption,
 )
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.progress_text import design_text, fit_text, part_text
 from mjfim.parallel import LOST_SENTENCE, MAX_THREADS, Pool
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
@@ -107,6 +108,9 @@ Folder = Annotated[
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
+Pictures = Annotated[
+    PictureFormat, typer.Option("--format", help="Format of the pictures.", case_sensitive=False)
+]
 Threads = Annotated[
     int | None,
     typer.Option(min=1, max=MAX_THREADS, help="Threads for MuJoCo; default: all cores."),

@@ -13,6 +13,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
+    Pictures,
     Threads,
     claim_folder,
     errors,
@@ -25,6 +26,7 @@ from mjfim.errors import NoResultError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.input_files import input_files
 from mjfim.output.folders import comparison_files
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.comparison import describe_comparison
 from mjfim.output.text import render
 from mjfim.studies.baselines.methods import METHODS
@@ -48,6 +50,7 @@ def compare(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the baselines.")] = 0,
     as_json: AsJson = False,
+    pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -61,7 +64,7 @@ def compare(
     )
     baselines = chosen_methods(task, chosen)
     names = comparison_files(baselines)
-    claim_folder(output, names, input_files(task.experiment), force=force)
+    claim_folder(output, pictures.files(names), input_files(task.experiment), force=force)
     announce_comparison(len(baselines) + 1, seconds)
     with progress("comparing") as show:
         result = compare_task(
@@ -71,7 +74,7 @@ def compare(
     if not result.rows:
         raise NoResultError
     with writing(output) as results:
-        results.write_comparison_folder(output, result, task.system)
+        results.write_comparison_folder(output, result, task.system, pictures)
     print_result(as_json, result.summary(), render(describe_comparison(result)))
     errors.print(f"wrote {output}/")
     if not result.ok:

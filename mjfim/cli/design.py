@@ -18,6 +18,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
+    Pictures,
     Threads,
     claim_folder,
     errors,
@@ -36,6 +37,7 @@ from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import MAX_STARTS
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.design import describe_design
 from mjfim.output.text import render
 from mjfim.records.design import Design
@@ -78,6 +80,7 @@ def design(
             "--shortest", help="Find the shortest horizon at which every `wanted` σ is reached."
         ),
     ] = False,
+    pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -92,7 +95,7 @@ def design(
     has_default = stated.descent.seconds is None and not shortest
     task = DesignTask.of(_announced(system, has_default))
     names = (*DESIGN_FILES, *(SHORTEST_FILES if shortest else ()))
-    claim_folder(output, names, input_files(stated), force=force)
+    claim_folder(output, pictures.files(names), input_files(stated), force=force)
 
     with (
         several(task) as executor,
@@ -110,7 +113,7 @@ def design(
     if found is not None:
         task = DesignTask.resolve(found.experiment, threads=threads)
     with writing(output) as results:
-        results.write_design_folder(output, result, task.system)
+        results.write_design_folder(output, result, task.system, pictures)
         if found is not None:
             found.save(output)
 

@@ -14,6 +14,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
+    Pictures,
     Threads,
     claim_folder,
     errors,
@@ -28,6 +29,7 @@ from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.output.folders import estimate_files, parts_of_identified
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summaries.logs import describe_logs
 from mjfim.output.text import render
@@ -58,6 +60,7 @@ def identify(
         typer.Option(help="least_squares, which keeps bounds, or newton, the paper's method."),
     ] = "least_squares",
     as_json: AsJson = False,
+    pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -69,7 +72,7 @@ def identify(
     logs = recording_paths(recordings, system.channels)
     held_out_logs = recording_paths(held_out or [], system.channels)
     names = (*estimate_files(len(logs)), *parts_of_identified(output, system.model_path))
-    claim_folder(output, names, inputs, force=force)
+    claim_folder(output, pictures.files(names), inputs, force=force)
 
     with progress("reading") as show:
         fitted = [read_log(path, system.channels) for path in logs]
@@ -89,7 +92,7 @@ def identify(
         )
 
     with writing(output) as results:
-        for sentence in results.write_estimate_folder(output, result, system):
+        for sentence in results.write_estimate_folder(output, result, system, pictures):
             errors.print(f"warning: {sentence}", markup=False)
     print_result(
         as_json,

@@ -14,6 +14,7 @@ from mjfim.budget import stop_on_interrupt
 from mjfim.cli.common import (
     ExperimentFile,
     Force,
+    Pictures,
     claim_folder,
     errors,
     keep_result,
@@ -30,6 +31,7 @@ from mjfim.experiment.input_files import input_files
 from mjfim.model.limited_elements import KINDS as LIMIT_KINDS
 from mjfim.output.archive import write_design
 from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.robustness import describe_robustness
 from mjfim.output.text import render
 from mjfim.parallel import cores
@@ -97,6 +99,7 @@ def robustness(
             ),
         ),
     ] = None,
+    pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
 ) -> None:
     """Play a design on simulated robots that differ from the model.
@@ -122,7 +125,7 @@ def robustness(
     # A new design stands in a folder of its own, below that of the study.
     new = [f"design/{name}" for name in DESIGN_ARCHIVE] if design_folder is None else []
     inputs = input_files(stated, [design_folder])
-    claim_folder(output, (*ROBUSTNESS_FILES, *new), inputs, force=force)
+    claim_folder(output, (*pictures.files(ROBUSTNESS_FILES), *new), inputs, force=force)
 
     if design_folder is None:
         shares = parse_reserve(reserve or DEFAULT_RESERVE)
@@ -141,17 +144,19 @@ def robustness(
     seconds = time.perf_counter() - begun
 
     with writing(output) as results:
-        results.write_robustness_folder(output, result, seconds)
-    _report(result, runs, seconds, output)
+        results.write_robustness_folder(output, result, seconds, pictures)
+    _report(result, runs, seconds, output, pictures)
     raise typer.Exit(0 if result.ok and result.runs == runs else 1)
 
 
-def _report(result: Robustness, runs: int, seconds: float, output: Path) -> None:
+def _report(
+    result: Robustness, runs: int, seconds: float, output: Path, pictures: PictureFormat
+) -> None:
     """Print the result, the files and, after Ctrl-C, the number of robots that are missing."""
     out.print(render(describe_robustness(result)))
     errors.print(
-        f"{result.runs} runs in {seconds:.0f} s; wrote playback.json, playback.npz, playback.png "
-        f"to {output}/",
+        f"{result.runs} runs in {seconds:.0f} s; wrote playback.json, playback.npz, "
+        f"{pictures.file_of('playback')} and tables to {output}/",
         markup=False,
     )
     if result.runs < runs:

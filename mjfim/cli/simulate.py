@@ -16,6 +16,7 @@ from mjfim.cli.common import (
     Folder,
     Force,
     InitialOrDesign,
+    Pictures,
     claim_file,
     claim_folder,
     errors,
@@ -33,6 +34,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import study_files
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.monte_carlo import describe_study
 from mjfim.output.text import render
 from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
@@ -86,6 +88,7 @@ def montecarlo(
         typer.Option(min=0.0, help="Rate of the measurements in Hz; overrides measure_rate."),
     ] = None,
     as_json: AsJson = False,
+    pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
 ) -> None:
     """Compare estimates with the Cramér-Rao bound on the initial and on the designed trajectory."""
@@ -97,7 +100,7 @@ def montecarlo(
     for trajectory in named.values():
         archive.check_fits(design_file, trajectory, system)
     inputs = input_files(system.experiment, [design_file])
-    claim_folder(output, study_files(system.parameters.names), inputs, force=force)
+    claim_folder(output, pictures.files(study_files(system.parameters.names)), inputs, force=force)
 
     require_memory_for_trials(system, named, trials)
     announce_trials(system, named, trials)
@@ -107,7 +110,7 @@ def montecarlo(
     if not study.sets:
         raise NoResultError
     with writing(output) as results:
-        results.write_study_folder(output, study)
+        results.write_study_folder(output, study, pictures)
     print_result(as_json, study.summary(), render(describe_study(study, system.units)))
     errors.print(f"wrote {output}/")
     done = {name: found.trials for name, found in study.sets.items()}

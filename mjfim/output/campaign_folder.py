@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,17 @@ from mjfim.output import plots
 from mjfim.output.archive import check_fits, write_design
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.campaign_settings import SETTINGS_FILE
-from mjfim.output.folders import DESIGN_ARCHIVE, IDENTIFIED, parts_of_identified
+from mjfim.output.folders import (
+    DESIGN_ARCHIVE,
+    IDENTIFIED,
+    TABLE_FILES,
+    parts_of_identified,
+    write_pictures,
+    write_tables,
+)
 from mjfim.output.mjcf.write import write_identified
+from mjfim.output.picture_format import PictureFormat
+from mjfim.output.plots.pictures import Pictures
 from mjfim.output.plots.style import format_with_uncertainty
 from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound, Round
@@ -36,6 +46,7 @@ CAMPAIGN_FILES = (
     "campaign.json",
     "campaign.npz",
     "campaign.png",
+    *TABLE_FILES,
     IDENTIFIED,
 )
 
@@ -49,17 +60,22 @@ class CampaignFolder:
     Attributes:
         path: The folder.
         system: The experiment as stated.
+        picture_format: Format of the picture.
     """
 
-    def __init__(self, path: Path, system: System) -> None:
+    def __init__(
+        self, path: Path, system: System, picture_format: PictureFormat = PictureFormat.PNG
+    ) -> None:
         """Describe a folder, which need not exist yet.
 
         Args:
             path: The folder.
             system: The experiment as stated.
+            picture_format: Format of the picture.
         """
         self.path = path
         self.system = system
+        self.picture_format = picture_format
 
     # ---- contents of the folder
 
@@ -106,7 +122,8 @@ class CampaignFolder:
         Returns:
             Names relative to the folder.
         """
-        names = [*CAMPAIGN_FILES, *parts_of_identified(self.path, self.system.model_path)]
+        files = self.picture_format.files(CAMPAIGN_FILES)
+        names = [*files, *parts_of_identified(self.path, self.system.model_path)]
         designed, recorded = self.designed, self.recorded
         for number in self._numbers():
             # Designs and recordings are kept, and all estimates are made again.
@@ -230,7 +247,7 @@ class CampaignFolder:
         finished.estimate.save(self.round(finished.number))
 
     def write_campaign(self, campaign: Campaign, *, simulated: bool) -> str:
-        """Write campaign.json, campaign.npz, campaign.png and identified.xml.
+        """Write campaign.json, campaign.npz, tables, the picture and identified.xml.
 
         Args:
             campaign: The campaign.
@@ -244,6 +261,7 @@ class CampaignFolder:
         if campaign.estimate is None:
             return ""
 
+        write_tables(self.path, campaign)
         run_optional(lambda: self._write_figure(campaign, simulated=simulated))
         try:
             write_identified(self.path / IDENTIFIED, self.system, campaign.estimate.theta)
@@ -252,10 +270,10 @@ class CampaignFolder:
         return ""
 
     def _write_figure(self, campaign: Campaign, *, simulated: bool) -> None:
-        """Write campaign.png."""
+        """Write the picture of the campaign."""
         parameters = CampaignParameters.stated(self.system.parameters, simulated=simulated)
-        figure = plots.campaign_figure(campaign, parameters)
-        plots.save(figure, self.path / "campaign.png")
+        pictures: Pictures = {"campaign": partial(plots.campaign_figure, campaign, parameters)}
+        write_pictures(self.path, pictures, self.picture_format)
 
     def _summary(self, campaign: Campaign, *, simulated: bool) -> dict[str, Any]:
         """Return the contents of campaign.json."""

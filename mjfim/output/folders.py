@@ -7,17 +7,19 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from mjfim.atomic_io import remove_earlier_result
+from mjfim.atomic_io import remove_earlier_result, replacing
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.interruption import run_optional
-from mjfim.output import archive, plots
+from mjfim.output import archive, latex, markdown, plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.mjcf.edited_files import copies_of_included_files
 from mjfim.output.mjcf.write import write_identified
-from mjfim.output.plots.pictures import fit_names, histogram_name, pictures_of
+from mjfim.output.picture_format import PictureFormat
+from mjfim.output.plots.pictures import Pictures, fit_names, histogram_name, pictures_of
+from mjfim.output.presentation import describe
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
@@ -30,10 +32,17 @@ from mjfim.records.shown import ShownRecord
 # The identified model.
 IDENTIFIED = "identified.xml"
 
+# Tables of a result, as Markdown and as LaTeX.
+TABLE_FILES = ("tables.md", "tables.tex")
+
+# Files of earlier versions in place of which tables are written.
+EARLIER_TABLES = ("table_eigenvalues.png", "table_covariance.png")
+
 # Files that a design consists of, without figures.
 DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
 
-# Files that `mjfim design` may write, and further ones with --shortest.
+# Files that `mjfim design` may write, and further ones with --shortest. The names of pictures in
+# these lists end in .png; `PictureFormat.files` has those of another format.
 DESIGN_FILES = (
     *DESIGN_ARCHIVE,
     "design.rrd",
@@ -41,14 +50,14 @@ DESIGN_FILES = (
     "sensitivity_phase.png",
     "convergence.png",
     "standard_deviations.png",
-    "table_eigenvalues.png",
     "limits.png",
+    *TABLE_FILES,
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
 # Files that `mjfim check`, `mjfim robustness` and `mjfim export-sysid` may write.
-CHECK_FILES = ("check.json", "check.npz", "check.png")
-ROBUSTNESS_FILES = ("playback.json", "playback.npz", "playback.png")
+CHECK_FILES = ("check.json", "check.npz", "check.png", *TABLE_FILES)
+ROBUSTNESS_FILES = ("playback.json", "playback.npz", "playback.png", *TABLE_FILES)
 SYSID_FILES = ("comparison.json", "sysid_report.html")
 
 
@@ -70,7 +79,8 @@ def estimate_files(recordings: int) -> tuple[str, ...]:
     """
     figures = ("parameters.png", "spectra.png", "predictions.png")
     fits = tuple(f"{name}.png" for name in fit_names(recordings))
-    return ("estimate.json", "estimate.npz", IDENTIFIED, "estimate.rrd", *figures, *fits)
+    data = ("estimate.json", "estimate.npz", IDENTIFIED, "estimate.rrd")
+    return (*data, *figures, *fits, *TABLE_FILES)
 
 
 def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
@@ -80,7 +90,7 @@ def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
         parameters: Names of the parameters.
     """
     histograms = tuple(f"{histogram_name(name)}.png" for name in parameters)
-    return ("montecarlo.json", "montecarlo.npz", "table_covariance.png", *histograms)
+    return ("montecarlo.json", "montecarlo.npz", *histograms, *TABLE_FILES)
 
 
 def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
@@ -90,7 +100,7 @@ def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
         methods: Keys of the baselines.
     """
     controls = tuple(_control_name(method) for method in dict.fromkeys((*methods, DESIGN)))
-    return ("compare.json", "compare.npz", "compare.png", *controls)
+    return ("compare.json", "compare.npz", "compare.png", *TABLE_FILES, *controls)
 
 
 def find_rerun_file(source: Path) -> Path:
@@ -173,51 +183,73 @@ def check_file(path: Path) -> None:
     check_folder(path.parent)
 
 
-def write_design_folder(folder: Path, design: Design, system: System) -> None:
+def write_design_folder(
+    folder: Path, design: Design, system: System, picture_format: PictureFormat = PictureFormat.PNG
+) -> None:
     """Write a design's files, its Rerun file and its figures.
 
     Args:
         folder: Folder for the results.
         design: The design.
         system: The experiment for which it was made.
+        picture_format: Format of the pictures.
     """
     archive.write_design(folder, design, system)
+    write_tables(folder, design)
 
-    run_optional(lambda: _write_design_pictures(folder, design, system))
+    run_optional(lambda: _write_design_pictures(folder, design, system, picture_format))
 
 
-def _write_design_pictures(folder: Path, design: Design, system: System) -> None:
+def _write_design_pictures(
+    folder: Path, design: Design, system: System, picture_format: PictureFormat
+) -> None:
     """Write the figures of a design and its Rerun file."""
-    _write_figures(folder, design)
+    _write_figures(folder, design, picture_format)
     labels = labels_of_system(system)
     rerun_log.log_design(folder / "design.rrd", system.model_at(system.theta), design, labels)
 
 
-def write_check_folder(folder: Path, check: Check) -> None:
+def write_check_folder(
+    folder: Path, check: Check, picture_format: PictureFormat = PictureFormat.PNG
+) -> None:
     """Write check.json, check.npz and a figure of accuracies and correlations.
 
     Args:
         folder: Folder for the results.
         check: The check.
+        picture_format: Format of the pictures.
     """
     check.save(folder)
-    run_optional(lambda: _write_figures(folder, check))
+    write_tables(folder, check)
+    run_optional(lambda: _write_figures(folder, check, picture_format))
 
 
-def write_robustness_folder(folder: Path, result: Robustness, seconds: float) -> None:
+def write_robustness_folder(
+    folder: Path,
+    result: Robustness,
+    seconds: float,
+    picture_format: PictureFormat = PictureFormat.PNG,
+) -> None:
     """Write playback.json, playback.npz and a figure of limits, errors and coverage.
 
     Args:
         folder: Folder for the results.
         result: The study.
         seconds: Time that the study took [s].
+        picture_format: Format of the pictures.
     """
     result.save_archive(folder)
     write_json(folder / "playback.json", {**result.summary(), "seconds": seconds})
-    run_optional(lambda: _write_figures(folder, result))
+    write_tables(folder, result)
+    run_optional(lambda: _write_figures(folder, result, picture_format))
 
 
-def write_comparison_folder(folder: Path, comparison: Comparison, system: System) -> None:
+def write_comparison_folder(
+    folder: Path,
+    comparison: Comparison,
+    system: System,
+    picture_format: PictureFormat = PictureFormat.PNG,
+) -> None:
     """Write compare.json, compare.npz, a figure, and the control of each method.
 
     An experiment can read each control as its `initial.control`.
@@ -227,16 +259,23 @@ def write_comparison_folder(folder: Path, comparison: Comparison, system: System
             are removed.
         comparison: The comparison.
         system: The experiment that was compared.
+        picture_format: Format of the pictures.
     """
     _clear(folder, r"control_[\w-]+\.csv")
     comparison.save(folder)
     for row in comparison.rows:
         if row.control is not None:
             archive.write_control(folder / _control_name(row.method), row.control, system)
-    run_optional(lambda: _write_figures(folder, comparison))
+    write_tables(folder, comparison)
+    run_optional(lambda: _write_figures(folder, comparison, picture_format))
 
 
-def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> list[str]:
+def write_estimate_folder(
+    folder: Path,
+    estimate: Estimate,
+    system: System,
+    picture_format: PictureFormat = PictureFormat.PNG,
+) -> list[str]:
     """Write estimate.json, estimate.npz, identified.xml, estimate.rrd and figures.
 
     Args:
@@ -244,12 +283,15 @@ def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> l
             replaced are removed.
         estimate: The estimate.
         system: The experiment that was identified.
+        picture_format: Format of the pictures.
 
     Returns:
         Sentences about results that could not be written completely.
     """
-    _clear(folder, r"fit(_\d+)?\.png|identified(_.*)?\.xml|predictions\.png")
+    endings = "|".join(PictureFormat)
+    _clear(folder, rf"(fit(_\d+)?|predictions)\.({endings})|identified(_.*)?\.xml")
     estimate.save(folder)
+    write_tables(folder, estimate)
 
     remarks = []
     try:
@@ -258,13 +300,15 @@ def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> l
     except ModelError as error:
         remarks.append(str(error))
 
-    run_optional(lambda: _write_estimate_pictures(folder, estimate, system))
+    run_optional(lambda: _write_estimate_pictures(folder, estimate, system, picture_format))
     return remarks
 
 
-def _write_estimate_pictures(folder: Path, estimate: Estimate, system: System) -> None:
+def _write_estimate_pictures(
+    folder: Path, estimate: Estimate, system: System, picture_format: PictureFormat
+) -> None:
     """Write the figures of an estimate and its Rerun file."""
-    _write_figures(folder, estimate)
+    _write_figures(folder, estimate, picture_format)
     labels = labels_of_system(system)
     if estimate.motion is not None:
         measured = measured_trajectory(system, estimate.recordings[0])
@@ -273,22 +317,57 @@ def _write_estimate_pictures(folder: Path, estimate: Estimate, system: System) -
         rerun_log.log_estimate(target, model, estimate, measured, estimate.motion, labels)
 
 
-def write_study_folder(folder: Path, study: MonteCarloStudy) -> None:
+def write_study_folder(
+    folder: Path, study: MonteCarloStudy, picture_format: PictureFormat = PictureFormat.PNG
+) -> None:
     """Write montecarlo.json, montecarlo.npz, a histogram per parameter, and the tables as a figure.
 
     Args:
         folder: Folder for the results.
         study: The Monte Carlo study.
+        picture_format: Format of the pictures.
     """
     study.save(folder)
 
-    run_optional(lambda: _write_figures(folder, study))
+    write_tables(folder, study)
+    run_optional(lambda: _write_figures(folder, study, picture_format))
 
 
-def _write_figures(folder: Path, record: ShownRecord) -> None:
+def write_tables(folder: Path, record: ShownRecord) -> None:
+    """Write the tables of a result as Markdown and as LaTeX.
+
+    Args:
+        folder: Folder for the results; pictures of tables that an earlier version wrote are
+            removed.
+        record: The result.
+    """
+    summary = describe(record)
+    texts = (markdown.render_tables(summary), latex.render_tables(summary))
+    for name, text in zip(TABLE_FILES, texts, strict=True):
+        with replacing(folder / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    _clear(folder, "|".join(re.escape(name) for name in EARLIER_TABLES))
+
+
+def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
     """Write all figures of a result."""
-    for name, draw in pictures_of(record).items():
-        plots.save(draw(), folder / f"{name}.png")
+    write_pictures(folder, pictures_of(record), picture_format)
+
+
+def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureFormat) -> None:
+    """Draw pictures and write them; those of an earlier run in another format are removed.
+
+    Args:
+        folder: Folder for the results.
+        pictures: Functions that draw, by name of the picture.
+        picture_format: Format of the pictures.
+    """
+    others = "|".join(other for other in PictureFormat if other is not picture_format)
+    _clear(folder, rf"({'|'.join(re.escape(name) for name in pictures)})\.({others})")
+
+    for name, draw in pictures.items():
+        plots.save(draw(), folder / picture_format.file_of(name))
 
 
 def _control_name(method: str) -> str:

@@ -27,7 +27,14 @@ def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
     result = run("check", study, "--json", "-o", tmp_path / "out")
     found = loads(result.stdout)
     assert found == read(tmp_path / "out" / "check.json")
-    assert names(tmp_path / "out") == {"check.json", "check.npz", "check.png", MANIFEST}
+    assert names(tmp_path / "out") == {
+        "check.json",
+        "check.npz",
+        "check.png",
+        "tables.md",
+        "tables.tex",
+        MANIFEST,
+    }
     assert imread(tmp_path / "out" / "check.png").shape[0] > 300
     assert found["ok"] is True
     assert [row["name"] for row in found["parameters"]] == ["m", "l", "c"]
@@ -101,3 +108,14 @@ def test_a_wrong_horizon_is_refused_with_its_file(tmp_path: Path) -> None:
     """The initial control is made before the check, and its faults name the file as well."""
     wrong = write_experiment(tmp_path, horizon="1.005", start='{ kind = "sine" }')
     misused(run("check", wrong), f"{wrong}: horizon: 1.005 s is not a whole number")
+
+
+@pytest.mark.slow
+def test_the_format_of_the_picture_is_stated(study: Path, tmp_path: Path) -> None:
+    assert run("check", study, "-o", tmp_path, "--format", "svg").exit_code == 0
+    assert {n for n in names(tmp_path) if n.startswith("check.")} == {
+        "check.json",
+        "check.npz",
+        "check.svg",
+    }
+    assert run("check", study, "-o", tmp_path, "--format", "bmp").exit_code == 2

@@ -30,12 +30,9 @@ from mjfim.output.plots.style import (
     quotient_unit,
     squared_unit,
 )
-from mjfim.records.design import Design, Evaluation, HistoryRow, Status
-from mjfim.records.estimate import Estimate
+from mjfim.records.design import Evaluation
 from mjfim.records.labels import Labels
-from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
+from tests.support.made_records import make_design, make_estimate, make_labels, make_study
 from tests.support.paths import ROOT
 
 # Numbers of joints and of parameters of the records that are drawn.
@@ -45,147 +42,6 @@ SIZES = [
     pytest.param(14, 30, marks=pytest.mark.slow),
     pytest.param(1, 70, marks=pytest.mark.slow),
 ]
-
-
-def make_labels(dofs: int, count: int) -> Labels:
-    """Make labels of a chain of hinges."""
-    joints = [f"joint_{i}" for i in range(dofs)]
-    return Labels(
-        qpos=tuple(f"{j} [rad]" for j in joints),
-        positions=tuple(f"{j} [rad]" for j in joints),
-        velocities=tuple(f"{j} [rad/s]" for j in joints),
-        controls=("torque [N m]",),
-        parameters=tuple(f"link_{j}.damping" for j in range(count)),
-        parameter_units=tuple(("N m s/rad", "kg", "")[j % 3] for j in range(count)),
-        outputs={f"qpos:{j}": f"{j} [rad]" for j in joints},
-    )
-
-
-def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
-    """Make sinusoids of the given size; a larger motion is more informative."""
-    t = np.asarray(np.linspace(0.0, 2.0, 51), dtype=np.float64)
-    waves = size * np.sin(np.outer(t, 1.0 + np.arange(dofs)))
-    control = np.asarray(size * np.cos(t[:-1, None]), dtype=np.float64)
-    curve = Trajectory(
-        t=t, qpos=waves, qvel=np.gradient(waves, t, axis=0), act=np.zeros((51, 0)), ctrl=control
-    )
-    psi = size * np.sin(np.multiply.outer(t, 1.0 + np.arange(2 * dofs * count))).reshape(
-        51, 2 * dofs, count
-    )
-    eigenvalues = np.asarray(size**2 * (1.0 + np.arange(count)), dtype=np.float64)
-    std = 0.1 / size / np.sqrt(1.0 + np.arange(count))
-    smallest = np.asarray(size**2 * t / 2.0, dtype=np.float64)
-    criterion = 1.0 / size**2
-    return Evaluation(
-        trajectory=curve,
-        gain=np.zeros((50, 1, 2 * dofs)),
-        sensitivity=psi,
-        information=np.diag(std**-2),
-        eigenvalues=eigenvalues,
-        std=std,
-        min_eigenvalue=smallest,
-        criterion=criterion,
-        cost=criterion + 0.01,
-    )
-
-
-def make_design(dofs: int = 2, count: int = 3) -> Design:
-    """Make a design of ten iterations from a small to a large motion."""
-    rows = tuple(
-        HistoryRow(
-            iteration=i,
-            cost=2.0**-i,
-            criterion=2.0**-i,
-            min_eigenvalue=2.0**i,
-            slope=-(4.0**-i),
-            gamma=1.0,
-            seconds=0.1 * i,
-            steps=100 * i,
-        )
-        for i in range(10)
-    )
-    return Design(
-        status=Status.CONVERGED,
-        parameters=tuple(f"link_{j}.damping" for j in range(count)),
-        theta=np.linspace(1.0, 2.0, count),
-        initial=make_evaluation(dofs, count, 0.1),
-        final=make_evaluation(dofs, count, 1.0),
-        history=rows,
-        slope=1e-8,
-        steps=1000,
-        seconds=1.0,
-    )
-
-
-def make_trials(
-    theta: Array, std: float, failed: int, seed: int, trials: int = 200
-) -> TrialStatistics:
-    """Make efficient estimates; the first `failed` rows are NaN."""
-    count = len(theta)
-    estimates = theta + std * np.random.default_rng(seed).normal(size=(trials, count))
-    estimates[:failed] = np.nan
-    spread = np.diag(np.full(count, std**2))
-    interval = np.tile([0.8, 1.2], (count, 1))
-    return TrialStatistics(
-        estimates=estimates,
-        mean=theta,
-        covariance=spread,
-        crlb=spread,
-        efficiency=np.ones(count),
-        efficiency_interval=interval,
-        trials=trials,
-        failed=failed,
-    )
-
-
-def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
-    """Make a study of two trajectories; the scatter of the second is fifty times smaller."""
-    theta = np.linspace(1.0, 2.0, count)
-    sets = {
-        "initial": make_trials(theta, 0.2, failed, 0),
-        "final": make_trials(theta, 0.004, failed, 1),
-    }
-    information = {name: np.diag(1.0 / np.diagonal(trials.crlb)) for name, trials in sets.items()}
-    return MonteCarloStudy(
-        parameters=tuple(f"link_{j}.damping" for j in range(count)),
-        theta=theta,
-        measure_rate=25.0,
-        sets=sets,
-        information=information,
-    )
-
-
-def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estimate:
-    """Make an estimate from one recording with gaps; the first parameter is at its bound."""
-    t = np.linspace(0.0, 2.0, 51)
-    predicted = np.sin(np.outer(t, 1.0 + np.arange(dofs)))
-    measured = predicted + 0.05 * np.random.default_rng(2).normal(size=predicted.shape)
-    measured[10:20, 0] = np.nan
-    recording = Recording(
-        t=t,
-        ctrl=np.zeros((50, 1)),
-        y=measured,
-        outputs=tuple(f"qpos:joint_{i}" for i in range(dofs)),
-        name="swing",
-    )
-    theta = np.linspace(1.0, 2.0, count)
-    return Estimate(
-        parameters=tuple(f"link_{j}.damping" for j in range(count)),
-        theta=theta,
-        std=0.02 * theta,
-        covariance=np.diag((0.02 * theta) ** 2),
-        initial_theta=1.2 * theta,
-        chi2=50.0,
-        dof=48,
-        status="converged",
-        success=True,
-        misfit=misfit,
-        iterations=4,
-        residual_rms={},
-        at_bound=("link_0.damping",),
-        predicted=(predicted,),
-        recordings=(recording,),
-    )
 
 
 def all_text(figure: Figure) -> str:
@@ -225,10 +81,6 @@ FIGURES: dict[str, Draw] = {
         make_estimate(n, p), make_labels(n, p)
     ),
 }
-TABLES: dict[str, Draw] = {
-    "design_table": lambda n, p: plots.design_table(make_design(n, p), make_labels(n, p)),
-    "study_table": lambda n, p: plots.study_table(make_study(p), make_labels(n, p)),
-}
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -246,29 +98,14 @@ def test_figure_has_units_legend_and_pixels(
     render(figure, tmp_path)
 
 
-@pytest.mark.parametrize("name", TABLES)
-@pytest.mark.parametrize(("dofs", "count"), SIZES)
-def test_table_names_every_parameter_and_unit(
-    name: str, dofs: int, count: int, tmp_path: Path
-) -> None:
-    figure = TABLES[name](dofs, count)
-    text = all_text(figure)
-    labels = make_labels(dofs, count)
-    assert all(labels.parameter(j) in text for j in range(count))
-    assert "initial" in text and "designed" in text
-    render(figure, tmp_path)
-
-
-@pytest.mark.parametrize(
-    "name", [n for n in (*FIGURES, *TABLES) if n not in ("fit", "parameter_intervals")]
-)
+@pytest.mark.parametrize("name", [n for n in FIGURES if n not in ("fit", "parameter_intervals")])
 def test_both_trajectories_are_drawn_in_their_colours(name: str) -> None:
-    assert {INITIAL_COLOUR, DESIGNED_COLOUR} <= all_colours((FIGURES | TABLES)[name](2, 3))
+    assert {INITIAL_COLOUR, DESIGNED_COLOUR} <= all_colours(FIGURES[name](2, 3))
 
 
-@pytest.mark.parametrize("name", [*FIGURES, *TABLES])
+@pytest.mark.parametrize("name", FIGURES)
 def test_artists_stay_inside_the_figure(name: str) -> None:
-    figure = (FIGURES | TABLES)[name](2, 3)
+    figure = FIGURES[name](2, 3)
     figure.canvas.draw()
     box = figure.get_tightbbox()
     assert box.x0 >= -0.01 and box.y0 >= -0.01
@@ -362,31 +199,23 @@ def test_study_of_one_trajectory_is_drawn(tmp_path: Path) -> None:
     study = make_study()
     alone = dataclasses.replace(study, sets={"final": study.sets["final"]})
     render(plots.histogram(alone, 0, make_labels(2, 3)), tmp_path)
-    render(plots.study_table(alone, make_labels(2, 3)), tmp_path)
 
 
 @pytest.mark.parametrize("everything", [False, True])
-def test_bars_and_tables_of_singular_information_are_drawn(
-    everything: bool, tmp_path: Path
-) -> None:
+def test_bars_of_singular_information_are_drawn(everything: bool, tmp_path: Path) -> None:
     design = make_design()
     std = np.full(3, np.inf) if everything else np.array([np.inf, 0.1, 0.1])
     design = dataclasses.replace(design, initial=dataclasses.replace(design.initial, std=std))
     if everything:
         design = dataclasses.replace(design, final=dataclasses.replace(design.final, std=std))
-    bars, table = (
-        plots.std_bars(design, make_labels(2, 3)),
-        plots.design_table(design, make_labels(2, 3)),
-    )
-    assert "∞" in all_text(bars) and "∞" in all_text(table)
+    bars = plots.std_bars(design, make_labels(2, 3))
+    assert "∞" in all_text(bars)
     render(bars, tmp_path)
-    render(table, tmp_path)
 
 
 def test_zero_parameter_has_no_relative_accuracy(tmp_path: Path) -> None:
     design = dataclasses.replace(make_design(), theta=np.array([0.0, 1.0, 2.0]))
     render(plots.std_bars(design, make_labels(2, 3)), tmp_path)
-    render(plots.design_table(design, make_labels(2, 3)), tmp_path)
     estimate = dataclasses.replace(make_estimate(), initial_theta=np.array([0.0, 1.0, 2.0]))
     figure = plots.parameter_intervals(estimate, make_labels(2, 3))
     assert "guess of 0" in all_text(figure)
@@ -592,7 +421,7 @@ def test_a_matplotlibrc_of_the_current_folder_changes_no_figure(tmp_path: Path) 
     script = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from mjfim.output import plots\n"
-        "from tests.output.test_plots import make_design\n"
+        "from tests.support.made_records import make_design\n"
         "plots.save(plots.convergence(make_design()), 'figure.png')\n"
     )
 

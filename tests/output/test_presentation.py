@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,8 +15,12 @@ from matplotlib.figure import Figure
 
 import mjfim
 from mjfim.errors import MjfimError
-from mjfim.output.folders import DESIGN_FILES, estimate_files, study_files
+from mjfim.output.folders import DESIGN_FILES, estimate_files, study_files, write_pictures
 from mjfim.output.html import render
+from mjfim.output.manifest import OutputGuard, claimed
+from mjfim.output.picture_format import PictureFormat
+from mjfim.output.plots.pictures import Pictures
+from mjfim.output.plots.style import new_figure
 from mjfim.output.presentation import describe
 from mjfim.output.summary_parts import (
     Emphasis,
@@ -227,3 +232,46 @@ def test_every_part_of_a_summary_is_escaped() -> None:
 def test_words_in_backquotes_are_code() -> None:
     summary = Summary(title="", outcome="", parts=(Paragraph(text="use `a<b` or ` alone"),))
     assert "<p>use <code>a&lt;b</code> or ` alone</p>" in render(summary)
+
+
+# ---- formats of pictures
+
+
+@pytest.mark.parametrize(
+    ("ending", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")]
+)
+def test_plot_writes_the_format_that_the_file_names(
+    robustness: Robustness, ending: str, start: bytes, tmp_path: Path
+) -> None:
+    file = tmp_path / f"picture.{ending}"
+    robustness.plot(file=file)
+    first = file.read_bytes()
+    assert first.startswith(start)
+
+    # A file holds no time and no random names.
+    robustness.plot(file=file)
+    assert file.read_bytes() == first
+
+
+def test_an_unknown_format_is_an_error_that_lists_the_formats(
+    robustness: Robustness, tmp_path: Path
+) -> None:
+    with pytest.raises(MjfimError, match=r"picture.bmp.*valid: .png, .svg, .pdf"):
+        robustness.plot(file=tmp_path / "picture.bmp")
+
+
+def test_pictures_of_an_earlier_run_in_another_format_are_removed(tmp_path: Path) -> None:
+    """A file of the user with such a name remains."""
+    pictures: Pictures = {"limits": partial(new_figure, 0.5)}
+    for chosen in (PictureFormat.PNG, PictureFormat.SVG):
+        (tmp_path / "limits.pdf").write_text("of the user", encoding="utf-8")
+        guard = OutputGuard([], force=False)
+        with claimed(tmp_path, guard, exclusive=True):
+            write_pictures(tmp_path, pictures, chosen)
+    found = {file.name for file in tmp_path.glob("limits*")}
+    assert found == {"limits.svg", "limits.pdf"}
+
+
+def test_names_of_pictures_follow_their_format() -> None:
+    names = PictureFormat.PDF.files(("check.json", "check.png", "tables.md"))
+    assert names == ("check.json", "check.pdf", "tables.md")

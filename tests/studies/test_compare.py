@@ -326,7 +326,14 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     assert told["budget"] == {"seconds": 60.0, "steps": 60000.0}
     assert all(len(m["std"]) == 3 and m["limits"]["margins"] for m in told["methods"])
     controls = {f"control_{m}.csv" for m in ("chirp", "steps", DESIGN)}
-    assert names(out) - {MANIFEST} == {"compare.json", "compare.npz", "compare.png", *controls}
+    assert names(out) - {MANIFEST} == {
+        "compare.json",
+        "compare.npz",
+        "compare.png",
+        "tables.md",
+        "tables.tex",
+        *controls,
+    }
     assert imread(out / "compare.png").shape[0] > 300
     again = run(
         "compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"

@@ -27,12 +27,13 @@ DESIGN = {
     "sensitivity_phase.png",
     "convergence.png",
     "standard_deviations.png",
-    "table_eigenvalues.png",
+    "tables.md",
+    "tables.tex",
 }
 
 # Files that `mjfim identify` writes.
 ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml"}
-ESTIMATE = {*ESTIMATE_DATA, "estimate.rrd"} | {
+ESTIMATE = {*ESTIMATE_DATA, "estimate.rrd", "tables.md", "tables.tex"} | {
     f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
 }
 
@@ -43,7 +44,8 @@ STUDY = {
     "histogram_m.png",
     "histogram_l.png",
     "histogram_c.png",
-    "table_covariance.png",
+    "tables.md",
+    "tables.tex",
 }
 
 # Command that runs `mjfim` in a new process, where every warning is an error.

@@ -1,6 +1,6 @@
 """All figures of the package.
 
-Each function turns records into a matplotlib Figure; `save` writes it as PNG.
+Each function turns records into a matplotlib Figure; `save` writes it as PNG, SVG or PDF.
 
 Only the modules of this package import matplotlib.
 """
@@ -18,14 +18,12 @@ from mjfim.output.plots.recording_fit import fit
 from mjfim.output.plots.residuals import predictions, residual_spectra
 from mjfim.output.plots.robustness import robustness_figure
 from mjfim.output.plots.style import save
-from mjfim.output.plots.tables import design_table, study_table
 
 __all__ = [
     "campaign_figure",
     "check_figure",
     "compare_figure",
     "convergence",
-    "design_table",
     "fit",
     "histogram",
     "limits",
@@ -36,6 +34,5 @@ __all__ = [
     "save",
     "sensitivity_phase",
     "std_bars",
-    "study_table",
     "trajectories",
 ]

@@ -31,7 +31,7 @@ def campaign_figure(campaign: Campaign, parameters: CampaignParameters) -> Figur
         parameters: Its parameters.
     """
     shown = _shown_parameters(campaign, parameters)
-    figure = style.new_figure(9.0, 1.2 + 1.75 * len(shown))
+    figure = style.new_figure(1.2 + 1.75 * len(shown))
     panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
     for (left, right), j in zip(panels, shown, strict=True):
         name = style.shorten(parameters.names[j], PARAMETER_NAME_WIDTH)

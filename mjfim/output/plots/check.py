@@ -57,7 +57,7 @@ def check_figure(check: Check) -> Figure:
     """
     rows = [row for row in check.rows if not row.nuisance]
     height = float(np.clip(2.2 + 0.32 * len(rows), 4.0, 16.0))
-    figure = new_figure(min(6.2 + height, 22.0), height)
+    figure = new_figure(height)
     left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
     _draw_standard_deviations(left, rows)
     _draw_correlations(right, check)

@@ -66,11 +66,10 @@ def compare_figure(comparison: Comparison) -> Figure:
         comparison: The comparison.
     """
     count = len(comparison.wanted)
-    width = float(np.clip(8.4 + 0.5 * count, 10.0, 20.0))
     height = float(np.clip(1.9 + 0.36 * len(comparison.rows), 3.2, 12.0))
     cells_width = float(np.clip(0.55 * count, 2.2, 9.0))
 
-    figure = new_figure(width, height)
+    figure = new_figure(height)
     left, right = figure.subplots(1, 2, width_ratios=[cells_width, 3.6])
     _draw_cells(left, comparison)
     _draw_worst_combination(right, comparison)

@@ -98,9 +98,8 @@ def trajectories(design: Design, labels: Labels) -> Figure:
     panels = _state_panels(labels)
     columns = 2 if len(panels) <= MAX_PANELS_IN_TWO_COLUMNS else 4
     rows = len(panels) // columns + 1
-    width = 7.4 if columns == 2 else 12.0
 
-    figure = new_figure(width, 1.55 * rows + 0.9)
+    figure = new_figure(1.55 * rows + 0.9)
     grid = figure.add_gridspec(rows, columns)
     first: Axes | None = None
     for k, panel in enumerate(panels):
@@ -212,7 +211,7 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
     dofs = _most_sensitive_dofs(design, nv)
     parameters = _least_known_parameters(design)
 
-    figure = new_figure(max(2.9 * len(parameters), 4.6), 2.6 * len(dofs) + 0.9)
+    figure = new_figure(2.6 * len(dofs) + 0.9)
     grid = figure.add_gridspec(len(dofs), len(parameters))
     for row, dof in enumerate(dofs):
         for column, j in enumerate(parameters):
@@ -369,7 +368,7 @@ def convergence(design: Design) -> Figure:
     if has_slope and not has_barrier:
         relative_slope = slope / np.where(cost == 0.0, np.nan, np.abs(cost))
 
-    figure = new_figure(10.0, 3.3)
+    figure = new_figure(3.3)
     panels = figure.subplots(1, 3 if has_slope else 2)
     _draw_history(panels[0], iterations, cost)
     if has_slope:

@@ -44,7 +44,7 @@ def limits(design: Design) -> Figure:
     columns = 2 if len(kinds) > 1 else 1
     rows = -(-len(kinds) // columns)
 
-    figure = new_figure(5.6 * columns, 2.1 * rows + 0.9)
+    figure = new_figure(2.1 * rows + 0.9)
     grid = figure.add_gridspec(rows, columns)
     for i, kind in enumerate(kinds):
         axes = figure.add_subplot(grid[divmod(i, columns)])

@@ -70,7 +70,7 @@ def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Figure:
 
     label = labels.parameter(index)
     density_unit = quotient_unit("", labels.parameter_units[index])
-    figure = new_figure(max(4.1 * len(study.sets), 5.0), 5.3)
+    figure = new_figure(5.3)
     grid = figure.add_gridspec(2, len(study.sets), height_ratios=(2.6, 1.0))
     for k, trajectory in enumerate(study.sets):
         axes = figure.add_subplot(grid[0, k])

@@ -88,7 +88,7 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     count = len(accuracies.names)
     row_height = 0.5 if count <= MAX_HIGH_ROWS else 0.3
 
-    figure = new_figure(9.0, 1.7 + row_height * count)
+    figure = new_figure(1.7 + row_height * count)
     axes = figure.subplots()
     axes.set_xscale("log")
     axes.set_xlim(*_bar_limits(stds))
@@ -274,7 +274,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     relative = _relative_to_guess(estimate)
     row_height = 0.42 if count <= MAX_HIGH_ROWS else 0.27
 
-    figure = new_figure(9.5, 1.9 + row_height * count)
+    figure = new_figure(1.9 + row_height * count)
     axes = figure.subplots()
     axes.set(xlim=_interval_limits(relative), ylim=(count - 0.4, -0.6))
     axes.axvline(0.0, color=NOMINAL_COLOUR, linewidth=1.6)

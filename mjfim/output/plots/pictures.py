@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from functools import partial, singledispatch
@@ -34,15 +35,19 @@ def picture_names(record: ShownRecord) -> tuple[str, ...]:
     return tuple(pictures_of(record))
 
 
-def draw(record: ShownRecord, picture: str | None = None) -> Figure:
+def draw(
+    record: ShownRecord, picture: str | None = None, file: str | os.PathLike[str] = ""
+) -> Figure:
     """Draw a figure of a record.
 
     Args:
         record: The record.
         picture: Name of the figure; default: the first one.
+        file: File to which the figure is written; empty: none.
 
     Raises:
-        MjfimError: The record has no such figure.
+        MjfimError: The record has no such figure, or the ending of the file is not that of a
+            picture.
     """
     pictures = pictures_of(record)
     if not pictures:
@@ -51,7 +56,10 @@ def draw(record: ShownRecord, picture: str | None = None) -> Figure:
     name = next(iter(pictures)) if picture is None else picture
     if name not in pictures:
         raise MjfimError(unknown(f"picture of a {type(record).__name__}", name, pictures))
-    return pictures[name]()
+    figure = pictures[name]()
+    if os.fspath(file):
+        plots.save(figure, file)
+    return figure
 
 
 @singledispatch
@@ -76,7 +84,6 @@ def _(design: Design) -> Pictures:
         "sensitivity_phase": partial(plots.sensitivity_phase, design, labels),
         "convergence": partial(plots.convergence, design),
         "standard_deviations": partial(plots.std_bars, design, labels),
-        "table_eigenvalues": partial(plots.design_table, design, labels),
     }
     if design.usage:
         pictures["limits"] = partial(plots.limits, design)
@@ -104,12 +111,10 @@ def _(estimate: Estimate) -> Pictures:
 def _(study: MonteCarloStudy) -> Pictures:
     """The figures of a Monte Carlo study."""
     labels = complete_labels(study)
-    pictures: Pictures = {
+    return {
         histogram_name(name): partial(plots.histogram, study, i, labels)
         for i, name in enumerate(study.parameters)
     }
-    pictures["table_covariance"] = partial(plots.study_table, study, labels)
-    return pictures
 
 
 @pictures_of.register

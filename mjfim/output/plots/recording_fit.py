@@ -57,7 +57,7 @@ def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] |
     residual = recording.y - predicted
     columns = shown_outputs(residual, noise)
 
-    figure = new_figure(10.0, 1.45 * len(columns) + 1.1)
+    figure = new_figure(1.45 * len(columns) + 1.1)
     grid = figure.subplots(len(columns), 2, squeeze=False, sharex=True, width_ratios=(1.5, 1.0))
     for (left, right), column in zip(grid, columns, strict=True):
         label = labels.output(recording.outputs[column])

@@ -71,7 +71,7 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
     columns = shown_outputs(np.concatenate(residuals), sigma)
 
     rows = -(-len(columns) // 2)
-    figure = new_figure(10.0, 2.2 * rows + 1.2)
+    figure = new_figure(2.2 * rows + 1.2)
     grid = figure.subplots(rows, min(2, len(columns)), squeeze=False)
     for axes in grid.ravel()[len(columns) :]:
         axes.set_visible(False)
@@ -196,7 +196,7 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
     ]
     shown = measured[:MAX_OUTPUTS]
 
-    figure = new_figure(10.0, 1.5 + len(shown) * (0.5 + 0.32 * len(found)))
+    figure = new_figure(1.5 + len(shown) * (0.5 + 0.32 * len(found)))
     grid = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     for axes, j in zip(grid, shown, strict=True):
         name, unit = split_unit(labels.output(outputs[j]))

@@ -36,7 +36,7 @@ def robustness_figure(result: Robustness) -> Figure:
     Args:
         result: The study.
     """
-    figure = style.new_figure(13.0, max(7.0, 0.8 + 0.27 * len(result.limits)))
+    figure = style.new_figure(max(7.0, 0.8 + 0.27 * len(result.limits)))
     grid = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.25))
     left, right = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
 

@@ -1,7 +1,8 @@
 """Style of the figures: colours, fonts, number formats, labels, blank figures, atomic saving.
 
-Only Figure and Agg objects are used: pyplot and its global state stay untouched. Settings of the
-user, from a `matplotlibrc` or in Python, change no figure.
+The style sheet `mjfim.mplstyle` beside this file has the width of all figures and the sizes of the
+fonts. Only Figure and Agg objects are used: pyplot and its global state stay untouched. Settings of
+the user, from a `matplotlibrc` or in Python, change no figure.
 """
 
 from __future__ import annotations
@@ -11,16 +12,18 @@ import os
 import textwrap
 import threading
 from collections.abc import Callable, Sequence
-from functools import wraps
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib.style
 import numpy as np
+from matplotlib import rc_params_from_file
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
@@ -28,6 +31,7 @@ from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
 from mjfim.model.coordinates import split_unit
 from mjfim.output import vocabulary
+from mjfim.output.picture_format import PictureFormat
 
 # Arguments and result of a function that draws.
 Arguments = ParamSpec("Arguments")
@@ -63,14 +67,32 @@ OTHER_COLOUR = vocabulary.OTHER.colour
 # Colour of measurements and of residuals.
 MEASURED_COLOUR = vocabulary.MEASURED.colour
 
+# The style sheet of all figures.
+STYLE_SHEET: dict[str, Any] = dict(
+    rc_params_from_file(
+        Path(__file__).with_name("mjfim.mplstyle"), use_default_template=False
+    ).items()
+)
+
+# Width of every figure [inch].
+WIDTH = float(STYLE_SHEET["figure.figsize"][0])
+
 # Font sizes of tick labels and notes, of axis labels, and of titles [points].
-SMALL_FONT, NORMAL_FONT, LARGE_FONT = 8.0, 9.0, 11.0
+SMALL_FONT = float(STYLE_SHEET["xtick.labelsize"])
+NORMAL_FONT = float(STYLE_SHEET["font.size"])
+LARGE_FONT = float(STYLE_SHEET["figure.titlesize"])
 
 # Font size of the footnote below a figure [points].
 NOTE_FONT = 7.5
 
-# Characters of a footnote that fit in one inch.
-NOTE_CHARACTERS_PER_INCH = 17
+# Height of a line of the title, and space above it [inch].
+TITLE_LINE, TITLE_SPACE = 0.2, 0.07
+
+# Space at both sides of titles, legends and notes [inch].
+SIDE_SPACE = 0.12
+
+# Width of a line with its gap in a legend, and space between two entries, over the font size.
+LEGEND_LINE, LEGEND_GAP = 2.8, 2.0
 
 # Resolution at which a notebook shows figures; their files in it are twice as fine [pixels/inch].
 NOTEBOOK_DPI = 80.0
@@ -81,6 +103,9 @@ TRAJECTORY_STYLES: dict[str, tuple[str, str]] = {
     key: (term.word, term.colour) for key, term in vocabulary.TRAJECTORY_TERMS.items()
 }
 
+# Entries without a time in the files of the formats that hold one.
+DATELESS: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -89,7 +114,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def own_style(draw: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Let a function draw with the defaults of matplotlib; the user's settings return after it.
+    """Let a function draw with the style sheet; the user's settings return after it.
 
     Args:
         draw: The function.
@@ -100,8 +125,8 @@ def own_style(draw: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
 
     @wraps(draw)
     def with_own_style(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
-        """Draw with matplotlib's default style, whatever the user has set."""
-        with STYLE_LOCK, matplotlib.style.context("default"):
+        """Draw with the style sheet, whatever the user has set."""
+        with STYLE_LOCK, matplotlib.style.context(["default", STYLE_SHEET]):
             return draw(*arguments, **options)
 
     return with_own_style
@@ -269,26 +294,25 @@ class NotebookFigure(Figure):
     def _repr_png_(self) -> tuple[bytes, dict[str, float]]:
         """Return the figure as PNG, and the width at which it is shown [pixels]."""
         stream = io.BytesIO()
-        with STYLE_LOCK, matplotlib.style.context("default"):
+        with STYLE_LOCK, matplotlib.style.context(["default", STYLE_SHEET]):
             self.savefig(stream, format="png", dpi=2.0 * NOTEBOOK_DPI)
         return stream.getvalue(), {"width": NOTEBOOK_DPI * self.get_figwidth()}
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Return a blank figure with an Agg canvas and constrained layout.
+def new_figure(height: float) -> Figure:
+    """Return a blank figure of the usual width, with an Agg canvas and constrained layout.
 
     Args:
-        width: Width [inch].
         height: Height [inch].
     """
     layout = ConstrainedLayoutEngine(w_pad=0.09, h_pad=0.07)
-    figure = NotebookFigure(figsize=(width, height), layout=layout, facecolor="white")
+    figure = NotebookFigure(figsize=(WIDTH, height), layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
 
 def format_axes(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
-    """Give axes an open frame, a pale grid, small ticks and labels.
+    """Label axes, and put the common power of ten of their ticks where no label is.
 
     Args:
         axes: The axes.
@@ -298,18 +322,12 @@ def format_axes(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
     Returns:
         The axes.
     """
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(MUTED_COLOUR)
-    axes.grid(True, color=GRID_COLOUR, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(labelsize=SMALL_FONT, color=MUTED_COLOUR, labelcolor=TEXT_COLOUR)
-
     # A common power of ten of the ticks stands beside the axis, where no label is.
     axes.xaxis.get_offset_text().set(x=1.02, ha="left", fontsize=SMALL_FONT)
     axes.yaxis.get_offset_text().set(fontsize=SMALL_FONT)
 
-    axes.set_xlabel(xlabel, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
-    axes.set_ylabel(ylabel, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
     return axes
 
 
@@ -333,7 +351,9 @@ def write_message(axes: Axes, sentence: str) -> None:
 
 
 def add_title(figure: Figure, title: str, handles: Sequence[Artist] = (), note: str = "") -> None:
-    """Write a title at the top left, a legend under it, and a wrapped footnote at the bottom left.
+    """Write a title at the top left, a legend under it, and a footnote at the bottom left.
+
+    All three are broken into as many lines as the width of the figure needs.
 
     Args:
         figure: The figure.
@@ -341,28 +361,81 @@ def add_title(figure: Figure, title: str, handles: Sequence[Artist] = (), note: 
         handles: Entries of the legend.
         note: The footnote.
     """
-    left = 0.12 / figure.get_figwidth()
+    width = figure.get_figwidth() - 2.0 * SIDE_SPACE
+    left = SIDE_SPACE / figure.get_figwidth()
+    lines = wrap(title, width, LARGE_FONT)
 
-    # A second, empty line of the title keeps room for the legend.
-    lines = f"{title}\n " if handles else title
-    figure.suptitle(
-        lines, x=left, ha="left", fontsize=LARGE_FONT, color=TEXT_COLOUR, linespacing=1.3
-    )
+    # Empty lines of the title keep room for the legend.
+    columns = legend_columns([str(handle.get_label()) for handle in handles], width)
+    legend_lines = -(-len(handles) // columns)
+    text = "\n".join([*lines, *[" "] * legend_lines])
+    figure.suptitle(text, x=left, ha="left", fontsize=LARGE_FONT, linespacing=1.3)
     if handles:
+        top = TITLE_SPACE + TITLE_LINE * len(lines)
         figure.legend(
             handles=list(handles),
             loc="upper left",
-            bbox_to_anchor=(left, 1.0 - 0.27 / figure.get_figheight()),
-            ncols=len(handles),
-            frameon=False,
-            fontsize=NORMAL_FONT,
+            bbox_to_anchor=(left, 1.0 - top / figure.get_figheight()),
+            ncols=columns,
             borderaxespad=0.0,
             borderpad=0.2,
         )
     if note:
-        width = int(figure.get_figwidth() * NOTE_CHARACTERS_PER_INCH)
-        wrapped = textwrap.fill(note, width)
+        wrapped = "\n".join(wrap(note, width, NOTE_FONT))
         figure.supxlabel(wrapped, x=left, ha="left", fontsize=NOTE_FONT, color=MUTED_COLOUR)
+
+
+def legend_columns(labels: Sequence[str], width: float, size: float = NORMAL_FONT) -> int:
+    """Return into how many columns a legend is put, so that it fits.
+
+    Args:
+        labels: Texts of the entries.
+        width: Width that is free [inch].
+        size: Size of the font [points].
+
+    Returns:
+        The number of columns, at least 1.
+    """
+    entry = (LEGEND_LINE + LEGEND_GAP) * size / 72.0
+    widths = [text_width(label, size) + entry for label in labels]
+    for columns in range(len(labels), 1, -1):
+        # The entries of a legend run down its columns.
+        rows = -(-len(labels) // columns)
+        total = sum(max(widths[k : k + rows]) for k in range(0, len(widths), rows))
+        if total <= width:
+            return columns
+    return 1
+
+
+def wrap(text: str, width: float, size: float) -> list[str]:
+    """Break a text into lines.
+
+    Args:
+        text: The text.
+        width: Width of the lines [inch].
+        size: Size of the font [points].
+    """
+    # The printed width of the text says how many characters of it fit, up to long words.
+    characters = int(len(text) * width / max(text_width(text, size), 1e-9))
+    lines = textwrap.wrap(text, max(characters, 1), break_long_words=True)
+    while characters > 8 and any(text_width(line, size) > width for line in lines):
+        characters -= 4
+        lines = textwrap.wrap(text, characters, break_long_words=True)
+    return lines or [""]
+
+
+@lru_cache(maxsize=4096)
+def text_width(text: str, size: float = NORMAL_FONT) -> float:
+    """Return the printed width of a text [inch].
+
+    Args:
+        text: The text.
+        size: Size of the font [points].
+    """
+    font = get_font(findfont(FontProperties()))
+    font.set_size(size, 72)
+    font.set_text(text)
+    return float(font.get_width_height()[0]) / 64.0 / 72.0
 
 
 def trajectory_handles() -> list[Line2D]:
@@ -374,24 +447,32 @@ def trajectory_handles() -> list[Line2D]:
 
 
 @own_style
-def save(figure: Figure, path: str | os.PathLike[str], dpi: float = 200.0) -> Path:
-    """Write a figure as PNG in one step: readers find the old file or the complete new one.
+def save(figure: Figure, path: str | os.PathLike[str], dpi: float | None = None) -> Path:
+    """Write a figure in one step: readers find the old file or the complete new one.
 
     Args:
         figure: The figure.
-        path: The file; its name ends in .png.
-        dpi: Resolution [pixels/inch].
+        path: The file; the ending .png, .svg or .pdf of its name states the format.
+        dpi: Resolution [pixels/inch]. Default: that of the style sheet.
 
     Returns:
         The file.
 
     Raises:
-        MjfimError: The name does not end in .png.
+        MjfimError: The name has another ending.
     """
     target = Path(path)
-    if target.suffix.lower() != ".png":
-        raise MjfimError(f"figures are saved as PNG: {target.name!r} should end in .png")
+    format_name = target.suffix.lower().removeprefix(".")
+    if format_name not in tuple(PictureFormat):
+        raise MjfimError(
+            f"{target.name!r}: the ending of a figure's file states its format; "
+            f"valid: {', '.join(f'.{known}' for known in PictureFormat)}"
+        )
 
+    # Files of equal figures are equal, so they do not hold the time at which they were written.
+    metadata = DATELESS.get(format_name)
     with replacing(target) as temporary:
-        figure.savefig(temporary, format="png", dpi=dpi)
+        figure.savefig(
+            temporary, format=format_name, dpi=dpi or STYLE_SHEET["savefig.dpi"], metadata=metadata
+        )
     return target

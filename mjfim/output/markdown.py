@@ -1,0 +1,60 @@
+"""Tables of results as Markdown, for texts and wikis."""
+
+from __future__ import annotations
+
+import re
+
+from mjfim.output.summary_parts import Cell, Column, Summary, SummaryTable
+from mjfim.output.vocabulary import shown_word
+
+# Characters that Markdown would take for its own marks; an underscore only at the edge of a word.
+MARKS = re.compile(r"[\\|*`<>\[\]~]|(?<!\w)_|_(?!\w)")
+
+
+def render_tables(summary: Summary) -> str:
+    """Render all tables of a summary, each with its title and its note.
+
+    Args:
+        summary: The summary.
+    """
+    blocks = [f"# {escape(summary.title)}"]
+    for table in summary.tables:
+        blocks += [f"## {escape(table.title)}", render_table(table)]
+        if table.note:
+            blocks.append(escape(table.note))
+    return "\n\n".join(blocks) + "\n"
+
+
+def render_table(table: SummaryTable) -> str:
+    """Render a table; Markdown has no headings above several columns, so each column names them.
+
+    Args:
+        table: The table.
+    """
+    headings = [_heading(table, i, column) for i, column in enumerate(table.columns)]
+    rules = [":--" if column.left else "--:" for column in table.columns]
+    rows = [[_text(cell) for cell in row.cells] for row in table.rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (headings, rules, *rows))
+
+
+def escape(text: str) -> str:
+    """Return a text on one line, without a character that Markdown takes for a mark.
+
+    Args:
+        text: The text.
+    """
+    return MARKS.sub(lambda mark: f"\\{mark[0]}", " ".join(text.split()))
+
+
+def _heading(table: SummaryTable, index: int, column: Column) -> str:
+    """Return the heading of a column behind that of its group."""
+    heading = _text(column.heading)
+    for group in table.groups:
+        if group.first <= index <= group.last:
+            return f"{escape(shown_word(group.trajectory))}: {heading}"
+    return heading
+
+
+def _text(cell: Cell) -> str:
+    """Return the text of a cell."""
+    return escape(str(cell))

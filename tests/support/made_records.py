@@ -1,0 +1,154 @@
+"""Hand-made records of results of any size, for figures and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.records.design import Design, Evaluation, HistoryRow, Status
+from mjfim.records.estimate import Estimate
+from mjfim.records.labels import Labels
+from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
+
+
+def make_labels(dofs: int, count: int) -> Labels:
+    """Make labels of a chain of hinges."""
+    joints = [f"joint_{i}" for i in range(dofs)]
+    return Labels(
+        qpos=tuple(f"{j} [rad]" for j in joints),
+        positions=tuple(f"{j} [rad]" for j in joints),
+        velocities=tuple(f"{j} [rad/s]" for j in joints),
+        controls=("torque [N m]",),
+        parameters=tuple(f"link_{j}.damping" for j in range(count)),
+        parameter_units=tuple(("N m s/rad", "kg", "")[j % 3] for j in range(count)),
+        outputs={f"qpos:{j}": f"{j} [rad]" for j in joints},
+    )
+
+
+def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
+    """Make sinusoids of the given size; a larger motion is more informative."""
+    t = np.asarray(np.linspace(0.0, 2.0, 51), dtype=np.float64)
+    waves = size * np.sin(np.outer(t, 1.0 + np.arange(dofs)))
+    control = np.asarray(size * np.cos(t[:-1, None]), dtype=np.float64)
+    curve = Trajectory(
+        t=t, qpos=waves, qvel=np.gradient(waves, t, axis=0), act=np.zeros((51, 0)), ctrl=control
+    )
+    psi = size * np.sin(np.multiply.outer(t, 1.0 + np.arange(2 * dofs * count))).reshape(
+        51, 2 * dofs, count
+    )
+    eigenvalues = np.asarray(size**2 * (1.0 + np.arange(count)), dtype=np.float64)
+    std = 0.1 / size / np.sqrt(1.0 + np.arange(count))
+    smallest = np.asarray(size**2 * t / 2.0, dtype=np.float64)
+    criterion = 1.0 / size**2
+    return Evaluation(
+        trajectory=curve,
+        gain=np.zeros((50, 1, 2 * dofs)),
+        sensitivity=psi,
+        information=np.diag(std**-2),
+        eigenvalues=eigenvalues,
+        std=std,
+        min_eigenvalue=smallest,
+        criterion=criterion,
+        cost=criterion + 0.01,
+    )
+
+
+def make_design(dofs: int = 2, count: int = 3) -> Design:
+    """Make a design of ten iterations from a small to a large motion."""
+    rows = tuple(
+        HistoryRow(
+            iteration=i,
+            cost=2.0**-i,
+            criterion=2.0**-i,
+            min_eigenvalue=2.0**i,
+            slope=-(4.0**-i),
+            gamma=1.0,
+            seconds=0.1 * i,
+            steps=100 * i,
+        )
+        for i in range(10)
+    )
+    return Design(
+        status=Status.CONVERGED,
+        parameters=tuple(f"link_{j}.damping" for j in range(count)),
+        theta=np.linspace(1.0, 2.0, count),
+        initial=make_evaluation(dofs, count, 0.1),
+        final=make_evaluation(dofs, count, 1.0),
+        history=rows,
+        slope=1e-8,
+        steps=1000,
+        seconds=1.0,
+    )
+
+
+def make_trials(
+    theta: Array, std: float, failed: int, seed: int, trials: int = 200
+) -> TrialStatistics:
+    """Make efficient estimates; the first `failed` rows are NaN."""
+    count = len(theta)
+    estimates = theta + std * np.random.default_rng(seed).normal(size=(trials, count))
+    estimates[:failed] = np.nan
+    spread = np.diag(np.full(count, std**2))
+    interval = np.tile([0.8, 1.2], (count, 1))
+    return TrialStatistics(
+        estimates=estimates,
+        mean=theta,
+        covariance=spread,
+        crlb=spread,
+        efficiency=np.ones(count),
+        efficiency_interval=interval,
+        trials=trials,
+        failed=failed,
+    )
+
+
+def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
+    """Make a study of two trajectories; the scatter of the second is fifty times smaller."""
+    theta = np.linspace(1.0, 2.0, count)
+    sets = {
+        "initial": make_trials(theta, 0.2, failed, 0),
+        "final": make_trials(theta, 0.004, failed, 1),
+    }
+    information = {name: np.diag(1.0 / np.diagonal(trials.crlb)) for name, trials in sets.items()}
+    return MonteCarloStudy(
+        parameters=tuple(f"link_{j}.damping" for j in range(count)),
+        theta=theta,
+        measure_rate=25.0,
+        sets=sets,
+        information=information,
+    )
+
+
+def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estimate:
+    """Make an estimate from one recording with gaps; the first parameter is at its bound."""
+    t = np.linspace(0.0, 2.0, 51)
+    predicted = np.sin(np.outer(t, 1.0 + np.arange(dofs)))
+    measured = predicted + 0.05 * np.random.default_rng(2).normal(size=predicted.shape)
+    measured[10:20, 0] = np.nan
+    recording = Recording(
+        t=t,
+        ctrl=np.zeros((50, 1)),
+        y=measured,
+        outputs=tuple(f"qpos:joint_{i}" for i in range(dofs)),
+        name="swing",
+    )
+    theta = np.linspace(1.0, 2.0, count)
+    return Estimate(
+        parameters=tuple(f"link_{j}.damping" for j in range(count)),
+        theta=theta,
+        std=0.02 * theta,
+        covariance=np.diag((0.02 * theta) ** 2),
+        initial_theta=1.2 * theta,
+        chi2=50.0,
+        dof=48,
+        status="converged",
+        success=True,
+        misfit=misfit,
+        iterations=4,
+        residual_rms={},
+        at_bound=("link_0.damping",),
+        predicted=(predicted,),
+        recordings=(recording,),
+    )
