@@ -344,6 +344,8 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         "compare.json",
         "compare.npz",
         "compare.png",
+        "tables.md",
+        "tables.tex",
         "control_chirp.csv",
         f"control_{DESIGN}.csv",
     }

@@ -32,8 +32,8 @@ DESIGN = {
 }
 
 # Files that `mjfim identify` writes.
-ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml"}
-ESTIMATE = {*ESTIMATE_DATA, "estimate.rrd", "tables.md", "tables.tex"} | {
+ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml", "tables.md", "tables.tex"}
+ESTIMATE = {*ESTIMATE_DATA, "estimate.rrd"} | {
     f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
 }
 
