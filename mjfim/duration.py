@@ -8,6 +8,10 @@ from collections.abc import Callable
 # Time that a part has to take, so that its duration can be measured [s].
 LEAST_SECONDS = 0.2
 
+# Time of the first call from which it counts itself. What it allocates takes much less, and to
+# repeat it would delay the message.
+LONG_SECONDS = 5.0
+
 # Number of times that a part is done. The quickest counts, because other processes disturb some.
 REPEATS = 2
 
@@ -44,7 +48,10 @@ def estimated_seconds(
     items = min(first, count)
 
     # What is allocated at the first call takes no time later.
-    work(items)
+    seconds = _seconds_of(work, items, clock)
+    if seconds >= LONG_SECONDS:
+        return seconds * count / items
+
     while True:
         seconds = min(_seconds_of(work, items, clock) for _ in range(REPEATS))
         total = seconds * count / items

@@ -31,7 +31,7 @@ def require_memory(numbers: float, cause: str, *, available: float | None = None
     """
     free = available_memory() if available is None else available
     needed, usable = NUMBER_BYTES * numbers, USABLE_FRACTION * free
-    if needed <= usable:
+    if fits_memory(needed, free):
         return
 
     raise ExperimentError(
@@ -39,3 +39,14 @@ def require_memory(numbers: float, cause: str, *, available: float | None = None
         f"{usable / 2**30:.3g} GiB are available; at most {usable / needed:.2g} times this size is "
         "possible"
     )
+
+
+def fits_memory(needed: float, available: float | None = None) -> bool:
+    """Whether work fits into the available memory.
+
+    Args:
+        needed: Memory of the work [bytes].
+        available: Memory that is there [bytes]; None for that of this machine.
+    """
+    free = available_memory() if available is None else available
+    return needed <= USABLE_FRACTION * free

@@ -22,7 +22,7 @@ class Clock:
         self.now += self._overhead + self._per_item * count
 
 
-@pytest.mark.parametrize("per_item", [1e-6, 1e-3, 10.0])
+@pytest.mark.parametrize("per_item", [1e-6, 1e-3, 0.1])
 def test_the_duration_is_proportional_to_the_items(per_item: float) -> None:
     """The part grows until it can be measured; a first call is not measured."""
     clock = Clock(per_item)
@@ -30,6 +30,13 @@ def test_the_duration_is_proportional_to_the_items(per_item: float) -> None:
     assert found == pytest.approx(per_item * 1e7)
     assert clock.parts[0] == clock.parts[1]
     assert clock.now <= max(3.0, 3 * 16 * per_item)
+
+
+def test_long_work_is_done_once() -> None:
+    """The model of a dog takes half a minute for the first samples; the message does not wait."""
+    clock = Clock(2.0)
+    assert estimated_seconds(clock.work, 100, clock=lambda: clock.now) == pytest.approx(200.0)
+    assert clock.parts == [16]
 
 
 def test_overhead_counts_little() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -42,6 +42,21 @@ def identifiable(F: Array, sizes: Array, *, most: int = MOST_PARAMETERS) -> Sequ
             chosen.append(i)
 
     return chosen or [int(np.argmax(np.diag(relative)))]
+
+
+def largest_fitting(count: int, fits: Callable[[int], bool]) -> int:
+    """Halve a number of parameters until their information fits into memory.
+
+    Args:
+        count: Number of parameters.
+        fits: Whether the information about this number of parameters fits.
+
+    Returns:
+        The number, at least 1.
+    """
+    while count > 1 and not fits(count):
+        count //= 2
+    return count
 
 
 def _largest_std(F: Array, members: list[int]) -> float:
