@@ -72,9 +72,9 @@ def place_camera(
         views: Number of views that share a region of the layout.
         aspect: Width of that region over its height.
     """
-    clouds = _moving_points(model, motions)
-    towards_camera = _view_direction(_extents(clouds))
-    axes = _camera_axes(towards_camera)
+    clouds = moving_points(model, motions)
+    towards_camera = view_direction(extents(clouds))
+    axes = camera_axes(towards_camera)
     low, high = _bounding_box(model, clouds, axes)
     width, height, depth = np.maximum(high - low, 1e-6)
 
@@ -96,10 +96,14 @@ def place_camera(
     )
 
 
-def _moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[Array]:
+def moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[Array]:
     """Return (samples, n, 3) world paths of the corners of all moving geoms [m].
 
     There is an array for each motion.
+
+    Args:
+        model: The model.
+        motions: Poses along each trajectory.
     """
     bodies, points = _moving_corners(model)
     clouds = []
@@ -131,16 +135,23 @@ def _moving_corners(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
     return np.concatenate(bodies).astype(np.intp), np.concatenate(points)
 
 
-def _extents(clouds: Sequence[Array]) -> Array:
-    """Return the (3,) largest distance that any point travels along each world axis [m]."""
+def extents(clouds: Sequence[Array]) -> Array:
+    """Return the (3,) largest distance that any point travels along each world axis [m].
+
+    Args:
+        clouds: (samples, n, 3) world paths of each motion [m].
+    """
     travelled = [np.ptp(cloud, axis=0).max(axis=0, initial=0.0) for cloud in clouds]
     return np.asarray(np.max(travelled, axis=0))
 
 
-def _view_direction(extents: Array) -> Array:
+def view_direction(extents: Array) -> Array:
     """Return the (3,) unit vector towards the camera.
 
     It is along the normal of a planar motion, else from the front right.
+
+    Args:
+        extents: (3,) largest distance that any point travels along each world axis [m].
     """
     x, y = extents[0], extents[1]
     if y < PLANAR_RATIO * x:
@@ -152,8 +163,12 @@ def _view_direction(extents: Array) -> Array:
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def _camera_axes(towards_camera: Array) -> Array:
-    """Return the (3, 3) axes of the camera as rows: right, up, and towards the camera."""
+def camera_axes(towards_camera: Array) -> Array:
+    """Return the (3, 3) axes of the camera as rows: right, up, and towards the camera.
+
+    Args:
+        towards_camera: (3,) unit vector from the scene towards the camera.
+    """
     right = np.cross((0.0, 0.0, 1.0), towards_camera) / np.linalg.norm(towards_camera[:2])
     up = np.cross(towards_camera, right)
     return np.stack([right, up, towards_camera])

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.output import vocabulary
-from mjfim.output.rerun.camera import FIELD_OF_VIEW, Camera, place_camera
 from mjfim.output.rerun.scene import BodyPoses, body_poses
+from mjfim.output.video.camera import FilmCamera, lowered, place_film_camera
 from mjfim.output.vocabulary import Term
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Trajectory
@@ -43,8 +43,11 @@ FOLLOWED_TRAVEL = 1.5
 # Time over which the motion of a camera that follows a body is averaged [s of the film].
 CAMERA_SECONDS = 0.5
 
-# Share of the colour of its word in a robot that keeps the colours of its model, and in a ghost.
-TINT, GHOST_TINT = 0.3, 0.9
+# Points of the line along the path of a body that the camera follows.
+TRAIL_POINTS = 100
+
+# Share of the colour of its word in the grey parts of a robot, and in a ghost.
+TINT, GHOST_TINT = 0.45, 0.9
 
 # Opacity of a ghost.
 GHOST_OPACITY = 0.4
@@ -58,7 +61,8 @@ class Track:
         word: Word in the title of the view.
         colour: Colour of the word and of the tint (0..255).
         qpos: (F, nq) positions in each frame of the film.
-        tint: Share of the colour in the moving parts (0..1).
+        tint: Share of the colour in the moving parts (0..1). Parts of a robot that have a colour in
+            the model nearly keep it, those of a ghost do not.
         opacity: Opacity of the moving parts (0..1).
     """
 
@@ -76,10 +80,12 @@ class FilmView:
     Attributes:
         tracks: Its robots; those after the first one are ghosts over it.
         target: (F, 3) point at which the camera looks in each frame [m].
+        trail: (n, 3) path of the body that the camera follows [m]; empty where it follows none.
     """
 
     tracks: tuple[Track, ...]
     target: Array
+    trail: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,8 +96,7 @@ class Film:
         model: The model.
         t: (F,) time of the motion in each frame [s].
         views: Views side by side.
-        offset: (3,) vector from the point at which the camera looks to the camera [m].
-        field_of_view: Vertical field of view [rad].
+        camera: The camera in the first frame.
         speed: Speed in multiples of real time.
         follows: True if the camera moves with the robot.
         left_out: Time at the end of the motion that is not shown [s].
@@ -100,8 +105,7 @@ class Film:
     model: mujoco.MjModel = field(repr=False)
     t: Array
     views: tuple[FilmView, ...]
-    offset: Array
-    field_of_view: float
+    camera: FilmCamera
     speed: float
     follows: bool
     left_out: float
@@ -198,22 +202,22 @@ def _film(model: mujoco.MjModel, motions: Sequence[Sequence[tuple[Term, Trajecto
         for view in motions
     ]
     poses = [[body_poses(model, t, track.qpos) for track in view] for view in tracks]
-    centres = _followed_centres(model, poses, speed)
-    camera = _camera(model, poses, centres)
-    target = np.array(camera.target)
-    views = []
-    for k, view in enumerate(tracks):
-        shift = np.zeros((frames, 3)) if centres is None else centres[k]
-        views.append(FilmView(tracks=view, target=target + shift))
+    paths = _followed_paths(model, poses)
+    shifts = [_smooth(path - path[0]) for path in paths] or [np.zeros((frames, 3))] * len(poses)
+    camera = _camera(model, poses, shifts)
+    trails = [_thinned(path) for path in paths] or [np.zeros((0, 3))] * len(poses)
+    views = tuple(
+        FilmView(tracks=view, target=camera.target + shift, trail=trail)
+        for view, shift, trail in zip(tracks, shifts, trails, strict=True)
+    )
 
     return Film(
         model=model,
         t=t,
-        views=tuple(views),
-        offset=np.array(camera.position) - target,
-        field_of_view=float(FIELD_OF_VIEW),
+        views=views,
+        camera=camera,
         speed=speed,
-        follows=centres is not None,
+        follows=bool(paths),
         left_out=end - begin - shown,
     )
 
@@ -271,41 +275,34 @@ def positions_at(model: mujoco.MjModel, t: Array, qpos: Array, times: Array) -> 
 
 
 def _camera(
-    model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]], centres: Sequence[Array] | None
-) -> Camera:
-    """Place a camera that has every motion in view, relative to the body that it follows."""
-    seen = []
-    for k, view in enumerate(poses):
-        for each in view:
-            positions = each.positions
-            if centres is not None:
-                positions = positions - centres[k][:, None]
-            seen.append(replace(each, positions=positions))
-    return place_camera(model, seen, views=1, aspect=VIEW_WIDTH / VIEW_HEIGHT)
+    model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]], shifts: Sequence[Array]
+) -> FilmCamera:
+    """Place a camera that has every motion in view while it is shifted, (F, 3) in each view [m]."""
+    seen = [
+        replace(each, positions=each.positions - shift[:, None])
+        for view, shift in zip(poses, shifts, strict=True)
+        for each in view
+    ]
+    camera = place_film_camera(model, seen, VIEW_WIDTH / VIEW_HEIGHT)
+    heights = np.concatenate([shift[:, 2] for shift in shifts])
+    return lowered(camera, float(heights.min()), float(heights.max()))
 
 
-def _followed_centres(
-    model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]], speed: float
-) -> list[Array] | None:
-    """Return the smooth path of the free body that the camera follows, from its begin.
+def _followed_paths(model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]]) -> list[Array]:
+    """Return the (F, 3) path in each view of the free body that the camera follows [m].
 
-    Returns:
-        (F, 3) shift for each view [m]; None where no free body travels far.
+    There are none where no free body travels far.
     """
     free = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
     if not len(free):
-        return None
+        return []
 
     # The free body that carries most of the mass.
     bodies = model.jnt_bodyid[free]
     body = int(bodies[np.argmax(model.body_subtreemass[bodies])])
     paths = [view[0].positions[:, body] for view in poses]
     travel = max(float(np.ptp(path, axis=0).max()) for path in paths)
-    if travel < FOLLOWED_TRAVEL * _size(model, body):
-        return None
-
-    window = max(1, round(CAMERA_SECONDS * FRAME_RATE))
-    return [_averaged(path - path[0], window) for path in paths]
+    return paths if travel >= FOLLOWED_TRAVEL * _size(model, body) else []
 
 
 def _size(model: mujoco.MjModel, body: int) -> float:
@@ -316,9 +313,15 @@ def _size(model: mujoco.MjModel, body: int) -> float:
     return 2.0 * float(reach) or float(model.stat.extent)
 
 
-def _averaged(path: Array, window: int) -> Array:
-    """Moving average of a path (F, 3) over a window of frames; the ends continue."""
+def _smooth(path: Array) -> Array:
+    """Moving average of a path (F, 3) over `CAMERA_SECONDS`; the ends continue."""
+    window = round(CAMERA_SECONDS * FRAME_RATE)
     before, after = window // 2, window - 1 - window // 2
     wide = np.pad(path, ((before, after), (0, 0)), mode="edge")
     kernel = np.full(window, 1.0 / window)
     return np.stack([np.convolve(column, kernel, mode="valid") for column in wide.T], axis=1)
+
+
+def _thinned(path: Array) -> Array:
+    """Points of a path (F, 3) from which its line is drawn."""
+    return path[evenly_spread_indices(len(path), TRAIL_POINTS)]

@@ -35,7 +35,6 @@ class FrameLayout:
         """
         count = len(job["views"])
         self._width, self._height = int(job["width"]), int(job["height"])
-        self._speed = float(job["speed"])
         self._font = _font("DejaVuSans.ttf", FOOT_SIZE)
         self.width = count * self._width + (count - 1) * GAP
         self.height = TITLE_HEIGHT + self._height + FOOT_HEIGHT

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import mujoco
@@ -22,6 +23,16 @@ BACKGROUND_EMISSION = 10.0
 
 # Distance of the background, as a share of that of the far clipping plane.
 BACKGROUND_DISTANCE = 0.7
+
+# Colour of the lines of a floor (0..1), and their number to each side of the camera's target.
+FLOOR_COLOUR = np.array([0.70, 0.74, 0.79, 1.0], dtype=np.float32)
+FLOOR_LINES = 16
+
+# Width of lines [pixels].
+LINE_WIDTH = 1.5
+
+# Share of its colour by which the tint of a part is smaller, where this colour is pure.
+KEPT_COLOUR = 0.85
 
 # Size of the map of shadows [pixels]; MuJoCo's own takes twice as long without a graphics card.
 SHADOW_SIZE = 1024
@@ -84,7 +95,11 @@ class PaintedRobot:
         Args:
             geom: The part in the scene.
         """
-        geom.rgba[:3] = (1.0 - self.tint) * geom.rgba[:3] + self.tint * self.colour
+        own = np.array(geom.rgba[:3], dtype=np.float64)
+        purity = float(np.ptp(own)) / max(float(own.max()), 1e-3)
+        is_ghost = self.opacity < 1.0
+        share = self.tint if is_ghost else self.tint * (1.0 - KEPT_COLOUR * purity)
+        geom.rgba[:3] = (1.0 - share) * own + share * self.colour
         geom.rgba[3] *= self.opacity
 
 
@@ -109,6 +124,8 @@ class Painter:
         self._is_moving = model.body_weldid[model.geom_bodyid] != 0
         self._option = _options(model, self._is_moving)
         self._camera = _camera(offset)
+        self._floor = None if job["floor"] is None else float(job["floor"])
+        self._spacing = float(job["spacing"])
         self._has_sky = bool(np.any(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)))
 
         model.vis.quality.offsamples = quality.samples
@@ -121,7 +138,11 @@ class Painter:
         self._renderer.close()
 
     def picture(
-        self, robots: Sequence[PaintedRobot], positions: Sequence[Array], target: Array
+        self,
+        robots: Sequence[PaintedRobot],
+        positions: Sequence[Array],
+        target: Array,
+        trail: Array,
     ) -> Image:
         """Draw robots into one picture.
 
@@ -129,6 +150,7 @@ class Painter:
             robots: How they are drawn; those after the first one are ghosts.
             positions: (nq,) positions of each robot.
             target: (3,) point at which the camera looks [m].
+            trail: (n, 3) points of a line in the colour of the first robot [m]; may be empty.
         """
         self._camera.lookat[:] = target
         scene = self._renderer.scene
@@ -147,8 +169,13 @@ class Painter:
                 )
             self._paint(scene, first, robot)
 
+        colour = np.array([*robots[0].colour, 1.0], dtype=np.float32)
+        for begin, end in pairwise(trail):
+            _add_line(scene, begin, end, colour)
+        if self._floor is not None:
+            self._add_floor(scene, target, self._floor)
         if not self._has_sky:
-            self._add_background(scene, target)
+            self._add_background(scene)
         return np.asarray(self._renderer.render())
 
     def _paint(self, scene: mujoco.MjvScene, first: int, robot: PaintedRobot) -> None:
@@ -159,7 +186,21 @@ class Painter:
             if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
                 robot.paint(geom)
 
-    def _add_background(self, scene: mujoco.MjvScene, target: Array) -> None:
+    def _add_floor(self, scene: mujoco.MjvScene, target: Array, height: float) -> None:
+        """Add the lines of a floor around the point at which the camera looks."""
+        spacing = self._spacing
+        centre = spacing * np.round(target[:2] / spacing)
+        reach = FLOOR_LINES * spacing
+        for k in range(-FLOOR_LINES, FLOOR_LINES + 1):
+            for axis in (0, 1):
+                begin = np.array([*centre, height])
+                begin[axis] += k * spacing
+                end = begin.copy()
+                begin[1 - axis] -= reach
+                end[1 - axis] += reach
+                _add_line(scene, begin, end, FLOOR_COLOUR)
+
+    def _add_background(self, scene: mujoco.MjvScene) -> None:
         """Add a bright wall behind everything, because MuJoCo's background is black."""
         camera = scene.camera[0]
         forward = np.array(camera.forward, dtype=np.float64)
@@ -176,6 +217,18 @@ class Painter:
         wall.emission, wall.specular, wall.shininess = BACKGROUND_EMISSION, 0.0, 0.0
         wall.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
         scene.ngeom += 1
+
+
+def _add_line(
+    scene: mujoco.MjvScene, begin: Array, end: Array, colour: NDArray[np.float32]
+) -> None:
+    """Add a line of a colour (4,) between two points (3,) [m]."""
+    line = scene.geoms[scene.ngeom]
+    kind = mujoco.mjtGeom.mjGEOM_LINE
+    nothing = np.zeros(3)
+    mujoco.mjv_initGeom(line, kind, nothing, nothing, np.eye(3).ravel(), colour)
+    mujoco.mjv_connector(line, kind, LINE_WIDTH, begin, end)
+    scene.ngeom += 1
 
 
 def _set_visual(model: mujoco.MjModel, width: int, height: int, field_of_view: float) -> None:

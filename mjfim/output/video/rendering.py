@@ -123,10 +123,10 @@ def _write_job(folder: Path, film: Film, kind: Format, effort: Effort) -> None:
     """Write what the other process reads."""
     mujoco.mj_saveModel(film.model, str(folder / MODEL_FILE), None)
 
-    arrays: dict[str, Any] = {"t": film.t, "offset": film.offset}
+    arrays: dict[str, Any] = {"t": film.t, "offset": film.camera.offset}
     views = []
     for k, view in enumerate(film.views):
-        arrays[f"target_{k}"] = view.target
+        arrays[f"target_{k}"], arrays[f"trail_{k}"] = view.target, view.trail
         tracks = []
         for j, track in enumerate(view.tracks):
             arrays[f"qpos_{k}_{j}"] = track.qpos
@@ -145,9 +145,9 @@ def _write_job(folder: Path, film: Film, kind: Format, effort: Effort) -> None:
         "views": views,
         "width": VIEW_WIDTH,
         "height": VIEW_HEIGHT,
-        "field_of_view": film.field_of_view,
-        "follows": film.follows,
-        "speed": film.speed,
+        "field_of_view": film.camera.field_of_view,
+        "floor": film.camera.floor,
+        "spacing": film.camera.spacing,
         "remark": speed_text(film.speed),
         "kind": kind,
         "rate": FRAME_RATE,

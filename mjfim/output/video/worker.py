@@ -59,7 +59,8 @@ class Drawing:
         for i, robots in enumerate(self._robots):
             positions = [self._arrays[f"qpos_{i}_{j}"][k] for j in range(len(robots))]
             target = self._arrays[f"target_{i}"][k]
-            pictures.append(self._painter.picture(robots, positions, target))
+            trail = self._arrays[f"trail_{i}"]
+            pictures.append(self._painter.picture(robots, positions, target, trail))
         return self._layout.image(pictures, float(self._arrays["t"][k]))
 
     @property
