@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mjfim.identification.cross_validation import predict
     from mjfim.identification.identify import identify
     from mjfim.output.robot.export import export_design
+    from mjfim.output.video.results import save_video
     from mjfim.parallel import Pool
     from mjfim.records.campaign import Campaign
     from mjfim.records.check import Check
@@ -66,6 +67,7 @@ __all__ = [
     "monte_carlo",
     "predict",
     "run_campaign",
+    "save_video",
     "shortest_experiment",
     "simulate",
 ]
@@ -86,6 +88,7 @@ MODULES = {
     "predict": "mjfim.identification.cross_validation",
     "identify": "mjfim.identification.identify",
     "export_design": "mjfim.output.robot.export",
+    "save_video": "mjfim.output.video.results",
     "Pool": "mjfim.parallel",
     "Campaign": "mjfim.records.campaign",
     "Check": "mjfim.records.check",

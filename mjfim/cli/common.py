@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console, RenderableType
@@ -26,12 +26,18 @@ from mjfim.interruption import (
     NOTHING_SENTENCE,
     Interruption,
     current_interruption,
+    run_optional,
 )
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.progress_text import design_text, fit_text, part_text
+from mjfim.output.video.record import NoVideoError, format_of, require_encoder
 from mjfim.parallel import LOST_SENTENCE, MAX_THREADS, Pool
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.serialization import as_json as records_as_json
+
+if TYPE_CHECKING:
+    from mjfim.experiment.system import System
+    from mjfim.output.video.results import Filmed
 
 app = typer.Typer(
     add_completion=False,
@@ -123,6 +129,15 @@ Force = Annotated[
     ),
 ]
 
+VideoFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--video",
+        metavar="FILE.mp4 | FILE.gif",
+        help="Video of the robot, drawn by MuJoCo; no display is needed.",
+    ),
+]
+
 # Folders that the running verb has claimed; they are given back at its end.
 _claims = ExitStack()
 
@@ -172,6 +187,52 @@ def claim_file(file: Path, inputs: Sequence[Path], *, force: bool) -> None:
     guard = OutputGuard(inputs, force=force)
     guard.check([file])
     _claims.enter_context(claimed(file.parent, guard, exclusive=False))
+
+
+def claim_video(video: Path | None, inputs: Sequence[Path], *, force: bool) -> None:
+    """Make sure before the work that a video can be written.
+
+    Args:
+        video: The file, or None without a video.
+        inputs: Files that the verb reads.
+        force: Whether the user permits to replace a file that mjfim did not write.
+
+    Raises:
+        RecordingError: The file has another ending, is a folder, or writing is not permitted.
+        NoVideoError: A package is missing.
+        OutputError: The file may not be replaced.
+    """
+    if video is None:
+        return
+
+    require_encoder(format_of(video))
+    claim_file(video, inputs, force=force)
+
+
+def write_wanted_video(video: Path | None, system: System, result: Filmed) -> None:
+    """Write the video that the user asks for; where that is impossible, say why.
+
+    Args:
+        video: The file, or None without a video.
+        system: The experiment.
+        result: What the video shows.
+    """
+    if video is None:
+        return
+
+    from mjfim.output.video.results import write_video
+
+    def write() -> None:
+        """Write the file and say what it shows."""
+        try:
+            with progress("drawing the video"):
+                written = write_video(video, system, result)
+        except NoVideoError as reason:
+            errors.print(f"mjfim: there is no video: {reason}", markup=False)
+            return
+        errors.print(f"wrote {video}: {written.caption}", markup=False)
+
+    run_optional(write)
 
 
 def keep_result(folder: Path | None = None) -> None:

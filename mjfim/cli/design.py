@@ -20,12 +20,15 @@ from mjfim.cli.common import (
     Force,
     Pictures,
     Threads,
+    VideoFile,
     claim_folder,
+    claim_video,
     errors,
     print_result,
     progress,
     verb,
     worker_processes,
+    write_wanted_video,
     writing,
 )
 from mjfim.errors import first_ones
@@ -81,6 +84,7 @@ def design(
         ),
     ] = False,
     pictures: Pictures = PictureFormat.PNG,
+    video: VideoFile = None,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -95,6 +99,7 @@ def design(
     has_default = stated.descent.seconds is None and not shortest
     task = DesignTask.of(_announced(system, has_default))
     names = (*DESIGN_FILES, *(SHORTEST_FILES if shortest else ()))
+    claim_video(video, input_files(stated), force=force)
     claim_folder(output, pictures.files(names), input_files(stated), force=force)
 
     with (
@@ -116,6 +121,7 @@ def design(
         results.write_design_folder(output, result, task.system, pictures)
         if found is not None:
             found.save(output)
+    write_wanted_video(video, task.system, result)
 
     summary = result.summary()
     if found is not None:

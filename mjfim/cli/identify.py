@@ -16,12 +16,15 @@ from mjfim.cli.common import (
     Force,
     Pictures,
     Threads,
+    VideoFile,
     claim_folder,
+    claim_video,
     errors,
     out,
     print_result,
     progress,
     verb,
+    write_wanted_video,
     writing,
 )
 from mjfim.errors import ExperimentError
@@ -59,6 +62,7 @@ def identify(
         str,
         typer.Option(help="least_squares, which keeps bounds, or newton, the paper's method."),
     ] = "least_squares",
+    video: VideoFile = None,
     as_json: AsJson = False,
     pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
@@ -72,6 +76,7 @@ def identify(
     logs = recording_paths(recordings, system.channels)
     held_out_logs = recording_paths(held_out or [], system.channels)
     names = (*estimate_files(len(logs)), *parts_of_identified(output, system.model_path))
+    claim_video(video, inputs, force=force)
     claim_folder(output, pictures.files(names), inputs, force=force)
 
     with progress("reading") as show:
@@ -94,6 +99,7 @@ def identify(
     with writing(output) as results:
         for sentence in results.write_estimate_folder(output, result, system, pictures):
             errors.print(f"warning: {sentence}", markup=False)
+    write_wanted_video(video, system, result)
     print_result(
         as_json,
         result.summary(),

@@ -17,13 +17,16 @@ from mjfim.cli.common import (
     Force,
     InitialOrDesign,
     Pictures,
+    VideoFile,
     claim_file,
     claim_folder,
+    claim_video,
     errors,
     keep_result,
     print_result,
     progress,
     verb,
+    write_wanted_video,
     writing,
 )
 from mjfim.errors import NoResultError
@@ -37,6 +40,7 @@ from mjfim.output.folders import study_files
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.monte_carlo import describe_study
 from mjfim.output.text import render
+from mjfim.records.trajectory import Trajectory
 from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
 
 
@@ -54,6 +58,7 @@ def simulate(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    video: VideoFile = None,
     force: Force = False,
 ) -> None:
     """Simulate a recording of a design at the `true` parameter values, with noise.
@@ -63,7 +68,9 @@ def simulate(
     """
     system = System.resolve(mjfim.Experiment.from_file(experiment))
     output = output or (design_file or experiment).with_name("recording.csv")
-    claim_file(output, input_files(system.experiment, [design_file]), force=force)
+    inputs = input_files(system.experiment, [design_file])
+    claim_video(video, inputs, force=force)
+    claim_file(output, inputs, force=force)
     if design_file is None:
         require_design_keys(system, "simulate without a design")
         trajectory = DesignTask.of(system).initial
@@ -74,6 +81,16 @@ def simulate(
     keep_result(output.parent)
     archive.write_recording(output, recording, system)
     errors.print(f"wrote {output}")
+
+    # The motion of the recording, without its noise.
+    if video is not None:
+        write_wanted_video(video, system, _true_motion(system, trajectory))
+
+
+def _true_motion(system: System, trajectory: Trajectory) -> Trajectory:
+    """The motion of a recording at the `true` parameter values."""
+    released = system.released_as(trajectory.state[0])
+    return released.plant.simulate(released.parameters.true, trajectory.ctrl)
 
 
 @verb

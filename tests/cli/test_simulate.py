@@ -77,3 +77,45 @@ def test_a_foreign_recording_beside_the_design_stays(
     (tmp_path / "recording.csv").write_text("t\n", encoding="utf-8")
     misused(run("simulate", study, tmp_path), "recording.csv", "--force")
     assert (tmp_path / "recording.csv").read_text(encoding="utf-8") == "t\n"
+
+
+def test_another_ending_of_a_video_is_refused_before_the_work(study: Path, tmp_path: Path) -> None:
+    result = run("design", study, "-o", tmp_path / "out", "--video", tmp_path / "film.avi")
+    misused(result, "film.avi", ".mp4 or .gif")
+    assert names(tmp_path) == set()
+
+
+def test_a_video_does_not_replace_a_file_of_the_user(
+    study: Path, archived: Path, tmp_path: Path
+) -> None:
+    film = tmp_path / "film.gif"
+    film.write_text("mine", encoding="utf-8")
+    target = tmp_path / "recording.csv"
+    misused(run("simulate", study, archived, "-o", target, "--video", film), "film.gif", "--force")
+    assert film.read_text(encoding="utf-8") == "mine"
+    assert names(tmp_path) == {"film.gif"}
+
+
+def test_without_a_renderer_there_is_no_video_and_a_sentence_says_so(
+    study: Path, archived: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    target, film = tmp_path / "recording.csv", tmp_path / "film.gif"
+    result = run("simulate", study, archived, "-o", target, "--video", film)
+    assert result.exit_code == 0
+    assert "there is no video: the variable MUJOCO_GL turns drawing off" in result.stderr
+    assert not film.exists()
+    assert target.exists()
+
+
+@pytest.mark.slow
+def test_video_of_a_recording_is_written_again(study: Path, archived: Path, tmp_path: Path) -> None:
+    """A second run replaces what the first one wrote."""
+    target, film = tmp_path / "recording.csv", tmp_path / "film.gif"
+    for _ in range(2):
+        result = run("simulate", study, archived, "-o", target, "--video", film)
+        assert result.exit_code == 0, result.stderr
+        if "there is no video" in result.stderr:
+            pytest.skip(result.stderr)
+        assert "The simulated motion, in real time." in result.stderr
+    assert film.read_bytes()[:3] == b"GIF"

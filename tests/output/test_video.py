@@ -106,6 +106,9 @@ class TestFilm:
         assert (robot.word, ghost.word) == ("identified", "measured")
         assert robot.opacity == 1.0 > ghost.opacity
         assert ghost.colour == vocabulary.MEASURED.rgb
+        assert film.caption.startswith(
+            "The identified motion and the measured motion (transparent)"
+        )
 
     def test_positions_between_samples_turn_the_shortest_way(self, flying: mujoco.MjModel) -> None:
         begin = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])

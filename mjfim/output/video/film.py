@@ -113,7 +113,7 @@ class Film:
     @property
     def caption(self) -> str:
         """What the film shows, in one or two sentences."""
-        pictures = [" under ".join(_robot(track) for track in view.tracks) for view in self.views]
+        pictures = [" and ".join(_robot(track) for track in view.tracks) for view in self.views]
         shown = " beside ".join(pictures)
         sentences = [f"{shown[:1].upper()}{shown[1:]}, {speed_text(self.speed)}."]
         if self.left_out > 0.0:
@@ -139,7 +139,7 @@ def speed_text(speed: float) -> str:
 
 def _robot(track: Track) -> str:
     """Name the robot of a track."""
-    return f"the {track.word} motion"
+    return f"the {track.word} motion" + (" (transparent)" if track.opacity < 1.0 else "")
 
 
 # ---- films of results

@@ -70,12 +70,13 @@ class FrameLayout:
         for k, tracks in enumerate(job["views"]):
             x = float(k * (self._width + GAP) + MARGIN)
             for j, track in enumerate(tracks):
-                if j:
-                    text.text((x, TITLE_HEIGHT // 2), "  under  ", FAINT_INK, plain, anchor="lm")
-                    x += plain.getlength("  under  ")
-                word = str(track["word"])
-                text.text((x, TITLE_HEIGHT // 2), word, tuple(track["colour"]), bold, anchor="lm")
-                x += bold.getlength(word)
+                words = [(" and ", FAINT_INK, plain)] if j else []
+                words.append((str(track["word"]), tuple(track["colour"]), bold))
+                if float(track["opacity"]) < 1.0:
+                    words.append((" (transparent)", FAINT_INK, plain))
+                for word, colour, font in words:
+                    text.text((x, TITLE_HEIGHT // 2), word, colour, font, anchor="lm")
+                    x += font.getlength(word)
 
         place = (self.width - MARGIN, self.height - FOOT_HEIGHT // 2)
         text.text(place, str(job["remark"]), FAINT_INK, self._font, anchor="rm")

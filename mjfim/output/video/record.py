@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -65,3 +66,19 @@ def format_of(path: Path) -> Format:
     if found is None:
         raise RecordingError(f"--video {path}: the name of a video ends in .mp4 or .gif")
     return found
+
+
+def require_encoder(kind: Format) -> None:
+    """Make sure before the work that a format can be written.
+
+    Args:
+        kind: The format.
+
+    Raises:
+        NoVideoError: A package is missing.
+    """
+    if kind == "mp4" and find_spec("av") is None:
+        raise NoVideoError(
+            "mp4 needs the package av; install it with `pip install 'mjfim[video]'`, or write a "
+            "file that ends in .gif"
+        )

@@ -15,7 +15,6 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ import mujoco
 import numpy as np
 
 from mjfim.output.video.film import FRAME_RATE, VIEW_HEIGHT, VIEW_WIDTH, Film, speed_text
-from mjfim.output.video.record import MEDIA_TYPES, Format, NoVideoError, Video
+from mjfim.output.video.record import MEDIA_TYPES, Format, NoVideoError, Video, require_encoder
 
 # Kinds of OpenGL contexts by system, in the order in which they are tried: without a display first.
 BACK_ENDS = {"Linux": ("egl", "osmesa", "glfw")}
@@ -101,22 +100,6 @@ def render(film: Film, kind: Format, effort: Effort = WANTED) -> Video:
         width=result["width"],
         height=result["height"],
     )
-
-
-def require_encoder(kind: Format) -> None:
-    """Make sure before the work that a format can be written.
-
-    Args:
-        kind: The format.
-
-    Raises:
-        NoVideoError: A package is missing.
-    """
-    if kind == "mp4" and find_spec("av") is None:
-        raise NoVideoError(
-            "mp4 needs the package av; install it with `pip install 'mjfim[video]'`, or write a "
-            "file that ends in .gif"
-        )
 
 
 def _write_job(folder: Path, film: Film, kind: Format, effort: Effort) -> None:
