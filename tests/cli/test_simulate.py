@@ -117,5 +117,5 @@ def test_video_of_a_recording_is_written_again(study: Path, archived: Path, tmp_
         assert result.exit_code == 0, result.stderr
         if "there is no video" in result.stderr:
             pytest.skip(result.stderr)
-        assert "The simulated motion, in real time." in result.stderr
+        assert "film.gif: The simulated motion, 5 times slower" in result.stderr
     assert film.read_bytes()[:3] == b"GIF"
