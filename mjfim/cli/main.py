@@ -20,6 +20,7 @@ from mjfim.cli import (  # noqa: F401 - each registers its verbs
     init,
     list,
     replay,
+    report,
     robustness,
     simulate,
     validate,
@@ -41,6 +42,7 @@ ORDER = (
     "campaign",
     "export",
     "export-sysid",
+    "report",
     "replay",
 )
 

@@ -20,6 +20,8 @@ from mjfim.output.mjcf.write import write_identified
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import Pictures, fit_names, histogram_name, pictures_of
 from mjfim.output.presentation import describe
+from mjfim.output.report import REPORT
+from mjfim.output.report.build import write_report
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
@@ -45,6 +47,7 @@ DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
 # these lists end in .png; `PictureFormat.files` has those of another format.
 DESIGN_FILES = (
     *DESIGN_ARCHIVE,
+    REPORT,
     "design.rrd",
     "trajectories.png",
     "sensitivity_phase.png",
@@ -79,7 +82,7 @@ def estimate_files(recordings: int) -> tuple[str, ...]:
     """
     figures = ("parameters.png", "spectra.png", "predictions.png")
     fits = tuple(f"{name}.png" for name in fit_names(recordings))
-    data = ("estimate.json", "estimate.npz", IDENTIFIED, "estimate.rrd")
+    data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
     return (*data, *figures, *fits, *TABLE_FILES)
 
 
@@ -186,7 +189,7 @@ def check_file(path: Path) -> None:
 def write_design_folder(
     folder: Path, design: Design, system: System, picture_format: PictureFormat = PictureFormat.PNG
 ) -> None:
-    """Write a design's files, its Rerun file and its figures.
+    """Write a design's files, its report, its Rerun file and its figures.
 
     Args:
         folder: Folder for the results.
@@ -197,6 +200,7 @@ def write_design_folder(
     archive.write_design(folder, design, system)
     write_tables(folder, design)
 
+    run_optional(lambda: write_report(folder, Design))
     run_optional(lambda: _write_design_pictures(folder, design, system, picture_format))
 
 
@@ -276,7 +280,7 @@ def write_estimate_folder(
     system: System,
     picture_format: PictureFormat = PictureFormat.PNG,
 ) -> list[str]:
-    """Write estimate.json, estimate.npz, identified.xml, estimate.rrd and figures.
+    """Write estimate.json, estimate.npz, identified.xml, report.html, estimate.rrd and figures.
 
     Args:
         folder: Folder for the results; those that an earlier estimate wrote and that are not
@@ -300,6 +304,7 @@ def write_estimate_folder(
     except ModelError as error:
         remarks.append(str(error))
 
+    run_optional(lambda: write_report(folder, Estimate))
     run_optional(lambda: _write_estimate_pictures(folder, estimate, system, picture_format))
     return remarks
 

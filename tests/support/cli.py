@@ -22,6 +22,7 @@ DESIGN = {
     "design.npz",
     "design.csv",
     "reference.csv",
+    "report.html",
     "design.rrd",
     "trajectories.png",
     "sensitivity_phase.png",
@@ -33,7 +34,7 @@ DESIGN = {
 
 # Files that `mjfim identify` writes.
 ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml", "tables.md", "tables.tex"}
-ESTIMATE = {*ESTIMATE_DATA, "estimate.rrd"} | {
+ESTIMATE = {*ESTIMATE_DATA, "report.html", "estimate.rrd"} | {
     f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
 }
 

@@ -1,0 +1,376 @@
+"""Curves, bars and cells for the plotting library, small enough for one file."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.output.report.page import Panel, Plotly
+
+# Number of points of all curves of a report together; a longer log is thinned for display.
+MAX_POINTS = 120_000
+
+# Smallest and largest number of points of one curve.
+FEWEST_POINTS, MOST_POINTS = 200, 4000
+
+# Share of the range of values below which single precision is exact enough for display.
+DISPLAY_PRECISION = 1e-5
+
+# Decades of a logarithmic axis below which values between the powers of ten have labels, too.
+SHORT_LOG_AXIS = 2.5
+
+# Characters to which names are shortened on an axis with names.
+AXIS_NAME_WIDTH = 22
+
+# Largest number of parameters for which correlations are written into the cells.
+MAX_WRITTEN_CELLS = 14
+
+# Heights of a row of bars and of cells, and of what surrounds them [CSS pixels].
+BAR_ROW, CELL_ROW, AXES_HEIGHT = 34, 34, 90
+
+# Largest height of a plot with a row per parameter [CSS pixels].
+MAX_ROWS_HEIGHT = 1400
+
+
+# ---- arrays
+
+
+def packed(values: Array | Sequence[float]) -> dict[str, str]:
+    """Return numbers as the plotting library reads them from text, in single precision if possible.
+
+    Args:
+        values: (n,) numbers; NaN is a gap.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    with np.errstate(over="ignore"):
+        single = array.astype(np.float32)
+    finite = np.isfinite(array)
+    extent = float(np.ptp(array[finite])) if finite.any() else 0.0
+    with np.errstate(invalid="ignore"):
+        rounding = np.abs(single - array)[finite]
+
+    is_exact = bool((rounding <= DISPLAY_PRECISION * extent).all())
+    kind, stored = ("f4", single) if is_exact else ("f8", array)
+    content = stored.astype(f"<{kind}").tobytes()
+    return {"dtype": kind, "bdata": base64.b64encode(content).decode("ascii")}
+
+
+def points_per_curve(curves: int) -> int:
+    """Return how many points each of several curves may have.
+
+    Args:
+        curves: Number of all curves of a report.
+    """
+    return int(np.clip(MAX_POINTS // max(curves, 1), FEWEST_POINTS, MOST_POINTS))
+
+
+def thinned(values: Array, limit: int) -> np.ndarray:
+    """Return which points of a curve are drawn, so that all of its peaks stay.
+
+    The curve is divided into intervals, and the smallest and the largest value of each interval
+    remain, with the first and the last point of all.
+
+    Args:
+        values: (n,) values; NaN is a gap.
+        limit: Largest number of points.
+
+    Returns:
+        (m,) ascending indices, m <= limit; all indices of a curve that is short enough.
+    """
+    count = len(values)
+    if count <= limit:
+        return np.arange(count)
+
+    # The last interval is filled up with its last value.
+    bins = max((limit - 2) // 2, 1)
+    width = -(-count // bins)
+    bins = -(-count // width)
+    filled = np.pad(values, (0, bins * width - count), mode="edge").reshape(bins, width)
+
+    # A gap is shown only where an interval has no value at all.
+    measured = np.isfinite(filled)
+    starts = width * np.arange(bins)
+    smallest = starts + np.where(measured, filled, np.inf).argmin(axis=1)
+    largest = starts + np.where(measured, filled, -np.inf).argmax(axis=1)
+    ends = np.concatenate([[0], smallest, largest, [count - 1]])
+    return np.unique(np.minimum(ends, count - 1))
+
+
+# ---- traces
+
+
+def curve(
+    x: Array,
+    y: Array,
+    name: str,
+    role: str,
+    *,
+    limit: int = MOST_POINTS,
+    width: float = 1.6,
+    dash: str = "solid",
+    held: bool = False,
+) -> Plotly:
+    """Return a line.
+
+    Args:
+        x: (n,) horizontal values.
+        y: (n,) vertical values; NaN is a gap.
+        name: Name in the legend.
+        role: Role of its colour.
+        limit: Largest number of points.
+        width: Line width [CSS pixels].
+        dash: "solid", "dot" or "dash".
+        held: True where a value is held until the next one.
+    """
+    kept = thinned(y, limit)
+    line = {"color": f"role:{role}", "width": width, "dash": dash}
+    if held:
+        line["shape"] = "hv"
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "x": packed(x[kept]),
+        "y": packed(y[kept]),
+        "name": escape(name),
+        "legendgroup": name,
+        "line": line,
+    }
+
+
+def dots(
+    x: Array,
+    y: Array,
+    name: str,
+    role: str,
+    *,
+    limit: int = MOST_POINTS,
+    size: float = 4.0,
+    symbol: str = "circle",
+    texts: Sequence[str] | None = None,
+) -> Plotly:
+    """Return dots.
+
+    Args:
+        x: (n,) horizontal values.
+        y: (n,) vertical values.
+        name: Name in the legend.
+        role: Role of their colour.
+        limit: Largest number of dots.
+        size: Diameter [CSS pixels].
+        symbol: Symbol of the plotting library.
+        texts: n texts that are shown at the pointer.
+    """
+    kept = thinned(y, limit)
+    trace: Plotly = {
+        "type": "scatter",
+        "mode": "markers",
+        "x": packed(x[kept]),
+        "y": packed(y[kept]),
+        "name": escape(name),
+        "legendgroup": name,
+        "marker": {"color": f"role:{role}", "size": size, "symbol": symbol},
+    }
+    if texts is not None:
+        trace["text"] = [escape(texts[i]) for i in kept]
+        trace["hoverinfo"] = "text+name"
+    return trace
+
+
+def rows_of_bars(
+    values: Array, name: str, role: str, *, texts: Sequence[str], outside: bool = True
+) -> Plotly:
+    """Return horizontal bars, one for each row.
+
+    Args:
+        values: (n,) lengths; NaN is no bar.
+        name: Name in the legend.
+        role: Role of their colour.
+        texts: n texts beside the bars.
+        outside: True where the texts stand at the ends of the bars.
+    """
+    return {
+        "type": "bar",
+        "orientation": "h",
+        "x": packed(values),
+        "y": packed(np.arange(float(len(values)))),
+        "name": escape(name),
+        "legendgroup": name,
+        "marker": {"color": f"role:{role}"},
+        "text": [escape(text) for text in texts],
+        "textposition": "outside" if outside else "none",
+        "hoverinfo": "text+name",
+        "cliponaxis": False,
+    }
+
+
+# ---- layouts
+
+
+def axis(title: str = "", **settings: Any) -> Plotly:
+    """Return an axis.
+
+    Args:
+        title: Its title with the unit.
+        settings: Further settings of the plotting library.
+    """
+    named = {"title": {"text": escape(title)}} if title else {}
+    return {**named, **settings}
+
+
+def log_axis(title: str, values: Array, *, room: tuple[float, float] = (0.0, 0.0)) -> Plotly:
+    """Return a logarithmic axis with few, complete tick labels.
+
+    Args:
+        title: Its title with the unit.
+        values: (n,) values on it; those that are not positive are left out.
+        room: Decades that the axis has beyond the smallest and the largest value; without them the
+            plotting library chooses its ends.
+    """
+    usable = values[np.isfinite(values) & (values > 0.0)]
+    low, high = (
+        (float(v) for v in np.log10([usable.min(), usable.max()])) if usable.size else (0, 1)
+    )
+    span = high - low + sum(room)
+    settings: Plotly = {"type": "log", "dtick": max(1, int(np.ceil(span / 6.0)))}
+    if span < SHORT_LOG_AXIS:
+        settings = {"type": "log", "dtick": "D2", "tickformat": "~g", "minorloglabels": "complete"}
+    if any(room):
+        settings["range"] = [low - room[0], high + room[1]]
+    return axis(title, **settings)
+
+
+def row_axis(names: Sequence[str], width: int = AXIS_NAME_WIDTH) -> Plotly:
+    """Return a vertical axis with a name for each row, the first at the top.
+
+    Args:
+        names: The names.
+        width: Characters to which they are shortened.
+    """
+    count = len(names)
+    return {
+        "tickmode": "array",
+        "tickvals": list(range(count)),
+        "ticktext": [escape(shortened_name(name, width)) for name in names],
+        "range": [count - 0.45, -0.55],
+        "showgrid": False,
+        "zeroline": False,
+        "automargin": True,
+        "fixedrange": True,
+    }
+
+
+def rows_height(count: int, row: int = BAR_ROW) -> int:
+    """Return the height of a plot with a row for each name [CSS pixels].
+
+    Args:
+        count: Number of rows.
+        row: Height of a row [CSS pixels].
+    """
+    return min(AXES_HEIGHT + row * count, MAX_ROWS_HEIGHT)
+
+
+def shortened_name(name: str, width: int = AXIS_NAME_WIDTH) -> str:
+    """Shorten a long name; both of its ends stay.
+
+    Args:
+        name: The name.
+        width: Largest number of characters.
+    """
+    if len(name) <= width:
+        return name
+    kept = (width - 1) // 2
+    return f"{name[:kept]}…{name[-kept:]}"
+
+
+def level(value: float, role: str, *, across: str = "x", dash: str = "dash") -> Plotly:
+    """Return a straight line through a plot.
+
+    Args:
+        value: Place of the line on the other axis.
+        role: Role of its colour.
+        across: "x" for a line along the horizontal axis, "y" for one along the vertical axis.
+        dash: "solid", "dot" or "dash".
+    """
+    ends = {"xref": "x domain", "x0": 0, "x1": 1, "y0": value, "y1": value}
+    if across == "y":
+        ends = {"yref": "y domain", "y0": 0, "y1": 1, "x0": value, "x1": value}
+    line = {"color": f"role:{role}", "width": 1, "dash": dash}
+    return {"type": "line", **ends, "line": line, "layer": "below"}
+
+
+def band(low: float, high: float, role: str = "band", *, across: str = "x") -> Plotly:
+    """Return a shaded strip through a plot.
+
+    Args:
+        low: Its lower end.
+        high: Its upper end.
+        role: Role of its colour.
+        across: "x" for a strip along the horizontal axis, "y" for one along the vertical axis.
+    """
+    ends = {"xref": "x domain", "x0": 0, "x1": 1, "y0": low, "y1": high}
+    if across == "y":
+        ends = {"yref": "y domain", "y0": 0, "y1": 1, "x0": low, "x1": high}
+    return {
+        "type": "rect",
+        **ends,
+        "fillcolor": f"role:{role}",
+        "line": {"width": 0},
+        "layer": "below",
+    }
+
+
+# ---- plots that several reports have
+
+
+def correlation_panel(correlation: Array, names: Sequence[str], title: str) -> Panel:
+    """Return a heat map of a correlation matrix; the diagonal and unknown cells are empty.
+
+    Args:
+        correlation: (n, n) correlations, -1 to 1; NaN where there is none.
+        names: n names.
+        title: Title of the plot.
+    """
+    shown = correlation.copy()
+    np.fill_diagonal(shown, np.nan)
+    count = len(names)
+    texts = [
+        [
+            f"{escape(names[i])} and {escape(names[j])}: {shown[i, j]:+.3f}"
+            if np.isfinite(shown[i, j])
+            else ""
+            for j in range(count)
+        ]
+        for i in range(count)
+    ]
+    trace: Plotly = {
+        "type": "heatmap",
+        "z": [[None if np.isnan(v) else round(float(v), 4) for v in row] for row in shown],
+        "hovertext": texts,
+        "hoverinfo": "text",
+        "hoverongaps": False,
+        "colorscale": "role:diverging",
+        "zmin": -1,
+        "zmax": 1,
+        "xgap": 1,
+        "ygap": 1,
+        "colorbar": {"thickness": 10, "outlinewidth": 0, "tickvals": [-1, -0.5, 0, 0.5, 1]},
+    }
+    if count <= MAX_WRITTEN_CELLS:
+        trace["texttemplate"] = "%{z:+.2f}"
+    columns = row_axis(names, 14)
+    columns.update(range=[-0.5, count - 0.5], side="bottom")
+    if count > 3:
+        columns["tickangle"] = -45
+    rows = row_axis(names, 16)
+    rows["range"] = [count - 0.5, -0.5]
+    return Panel(
+        title=title,
+        traces=[trace],
+        layout={"xaxis": columns, "yaxis": rows, "hovermode": "closest"},
+        height=rows_height(max(count, 4), CELL_ROW),
+    )

@@ -1,0 +1,319 @@
+"""The report of a design."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.output.labels import complete_labels
+from mjfim.output.report.correlations import correlation_of
+from mjfim.output.report.curves import (
+    axis,
+    band,
+    correlation_panel,
+    curve,
+    level,
+    log_axis,
+    points_per_curve,
+    row_axis,
+    rows_height,
+    rows_of_bars,
+)
+from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
+from mjfim.output.summaries.accuracy import NOT_ALONE, improvement, relative
+from mjfim.output.summaries.design import describe_design
+from mjfim.output.summaries.verdicts import next_steps, verdict_of
+from mjfim.output.summary_parts import Quantity
+from mjfim.output.vocabulary import DESIGNED, INITIAL
+from mjfim.records.design import Design, Evaluation, LimitUsage
+from mjfim.records.labels import Labels
+
+# Entries of the legend of the two trajectories.
+TRAJECTORY_KEYS = (
+    Key(name=INITIAL.word, role=INITIAL.word),
+    Key(name=DESIGNED.word, role=DESIGNED.word),
+)
+
+# Largest number of plots in one group; of more columns, the first ones are shown.
+MAX_PANELS = 36
+
+# Largest number of curves of one kind of limit; of more, those that come closest to a bound.
+MAX_LIMIT_CURVES = 8
+
+# Colours of the curves of limits, in the order of their closeness to a bound.
+LIMIT_ROLES = tuple(f"series{i}" for i in range(MAX_LIMIT_CURVES))
+
+
+def design_page(design: Design) -> Page:
+    """Return the report of a design.
+
+    Args:
+        design: The design.
+    """
+    labels = complete_labels(design)
+    summary = describe_design(design, labels.parameter_units)
+    seconds = float(design.trajectory.t[-1] - design.trajectory.t[0])
+
+    # Tables of limits and of the search stand with their plots.
+    elsewhere = {"limits", "eigenvalues", "starts"}
+    table, *others = [part for part in summary.parts if getattr(part, "key", "") not in elsewhere]
+    accuracy = [table, *_accuracy_plots(design, labels), *others]
+    sections = [
+        Section(title="Accuracy", parts=accuracy),
+        Section(title="Motion", parts=list(_motion_plots(design, labels))),
+    ]
+    limits = [table for table in summary.tables if table.key == "limits"]
+    if design.usage:
+        sections.append(Section(title="Limits", parts=[_limit_plots(design), *limits]))
+    search = [table for table in summary.tables if table.key in ("eigenvalues", "starts")]
+    sections.append(Section(title="Optimisation", parts=[_history_plots(design), *search]))
+
+    before, after = design.initial.eigenvalues[0], design.final.eigenvalues[0]
+    facts = {
+        "duration": f"{seconds:.4g} s",
+        "λ_min": f"{Quantity(value=float(before))} → {Quantity(value=float(after))}",
+        "iterations": str(design.iterations),
+        "time of the search": f"{design.seconds:.3g} s",
+    }
+    return Page(
+        kind="Design of an experiment",
+        verdict=verdict_of(design),
+        next_steps=next_steps(design),
+        warnings=design.warnings,
+        facts=facts,
+        sections=sections,
+    )
+
+
+# ---- accuracy
+
+
+def _accuracy_plots(design: Design, labels: Labels) -> Iterator[PlotGroup]:
+    """Yield bars of the standard deviations, and the correlations of the estimates."""
+    wanted = list(design.wanted)
+    names = [design.parameters[j] for j in wanted]
+    sizes = np.where(design.sizes > 0.0, design.sizes, np.nan)[wanted]
+    initial = 100.0 * design.initial.std[wanted] / sizes
+    designed = 100.0 * design.final.std[wanted] / sizes
+    bars = Panel(
+        title="predicted σ [% of the parameter's size]",
+        traces=[
+            _std_bars(design, wanted, initial, INITIAL.word, before=True),
+            _std_bars(design, wanted, designed, DESIGNED.word, before=False),
+        ],
+        layout={
+            "xaxis": log_axis("σ / size [%]", np.append(initial, designed), room=(0.5, 0.3)),
+            "yaxis": row_axis(names),
+            "bargap": 0.25,
+        },
+        height=rows_height(len(names), 44),
+    )
+
+    panels = [bars]
+    correlation = correlation_of(design.final.information, design.final.std)
+    if len(names) > 1 and np.isfinite(correlation[np.ix_(wanted, wanted)]).any():
+        title = "correlation of the estimates after the designed motion [–]"
+        panels.append(correlation_panel(correlation[np.ix_(wanted, wanted)], names, title))
+    keys = [
+        Key(name=INITIAL.word, role=INITIAL.word, shape="bar"),
+        Key(name=DESIGNED.word, role=DESIGNED.word, shape="bar"),
+    ]
+    note = "No bar: the parameter is not identifiable alone from this trajectory."
+    some_missing = not (np.isfinite(initial).all() and np.isfinite(designed).all())
+    yield PlotGroup(title="", panels=panels, keys=keys, note=note if some_missing else "")
+
+
+def _std_bars(
+    design: Design, wanted: Sequence[int], shares: Array, name: str, *, before: bool
+) -> Plotly:
+    """Return the bars of one trajectory; shares: (t,) [% of the size]."""
+    texts = []
+    for j, share in zip(wanted, shares, strict=True):
+        evaluation = design.initial if before else design.final
+        std, size = float(evaluation.std[j]), float(design.sizes[j])
+        text = str(relative(std, size)) if np.isfinite(share) else NOT_ALONE
+        if not before:
+            text += f"  ({improvement(float(design.initial.std[j]), std)})"
+        texts.append(text)
+    return rows_of_bars(np.where(np.isfinite(shares), shares, np.nan), name, name, texts=texts)
+
+
+# ---- motion
+
+
+def _motion_plots(design: Design, labels: Labels) -> Iterator[PlotGroup]:
+    """Yield plots of positions, velocities, controls and of the information over time."""
+    groups = (
+        ("Positions", "qpos", labels.qpos),
+        ("Velocities", "qvel", labels.velocities),
+        ("Controls", "ctrl", labels.controls),
+    )
+    curves = 2 * (1 + sum(len(names) for _, _, names in groups))
+    limit = points_per_curve(curves + len(design.usage))
+    thinned = len(design.trajectory.t) > limit
+
+    yield _information_plot(design, limit, thinned=thinned)
+    for title, quantity, names in groups:
+        if not names:
+            continue
+        panels = [
+            _signal_panel(design, quantity, i, name, limit)
+            for i, name in enumerate(names[:MAX_PANELS])
+        ]
+        note = ""
+        if len(names) > MAX_PANELS:
+            note = (
+                f"The first {MAX_PANELS} of {len(names)} columns are shown; all of them are in "
+                "design.npz."
+            )
+        yield PlotGroup(title=title, panels=panels, keys=TRAJECTORY_KEYS, note=note)
+
+
+def _signal_panel(design: Design, quantity: str, column: int, label: str, limit: int) -> Panel:
+    """Return the plot of one column of both trajectories."""
+    traces = []
+    for evaluation, term in ((design.initial, INITIAL), (design.final, DESIGNED)):
+        t = evaluation.trajectory.t
+        values = getattr(evaluation.trajectory, quantity)[:, column]
+        held = quantity == "ctrl"
+        if held:
+            # The last control is held until the end.
+            values = np.append(values, values[-1])
+        traces.append(curve(t, values, term.word, term.word, limit=limit, held=held))
+    return Panel(title=label, traces=traces, layout={"xaxis": axis("time [s]")}, linked="time")
+
+
+def _information_plot(design: Design, limit: int, *, thinned: bool) -> PlotGroup:
+    """Return the plot of the information that is gathered up to each time."""
+    traces = [
+        _root_information(evaluation, term.word, limit)
+        for evaluation, term in ((design.initial, INITIAL), (design.final, DESIGNED))
+    ]
+    panel = Panel(
+        title="√λ_min of the information up to each time [√s / unit of θ]",
+        traces=traces,
+        layout={"xaxis": axis("time [s]")},
+        linked="time",
+        wide=True,
+    )
+    note = (
+        "λ_min: smallest eigenvalue of the Fisher information up to time t, divided by the rate of "
+        "the measurements. It rises where the motion tells most."
+    )
+    if thinned:
+        note += (
+            " Long curves are thinned for display: the smallest and the largest value of each "
+            "interval are drawn, so that peaks stay; design.npz has all samples."
+        )
+    return PlotGroup(title="Information", panels=[panel], keys=TRAJECTORY_KEYS, note=note)
+
+
+def _root_information(evaluation: Evaluation, name: str, limit: int) -> Plotly:
+    """Return the curve of the root of the smallest eigenvalue of one trajectory."""
+    root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
+    return curve(evaluation.trajectory.t, root, name, name, limit=limit)
+
+
+# ---- limits
+
+
+def _limit_plots(design: Design) -> PlotGroup:
+    """Return a plot of the used share of each limit, one for each kind."""
+    kinds = list(dict.fromkeys(usage.kind for usage in design.usage))
+    limit = points_per_curve(len(design.usage) + 2 * len(kinds))
+    panels = []
+    for kind in kinds:
+        usages = [usage for usage in design.usage if usage.kind == kind]
+        panels.append(_limit_panel(design, kind, usages, limit))
+    note = (
+        "Every engine step of the designed motion on the stated model, in percent of the way from "
+        "the middle of the range to its bound; the dashed lines are the bounds."
+    )
+    return PlotGroup(title="How much of each limit is used", panels=panels, note=note)
+
+
+def _limit_panel(design: Design, kind: str, usages: list[LimitUsage], limit: int) -> Panel:
+    """Return the plot of one kind of limit; the curves closest to a bound are drawn."""
+    closest_first = sorted(usages, key=lambda usage: -float(np.abs(usage.share).max()))
+    shown = closest_first[:MAX_LIMIT_CURVES]
+    traces, keys = [], []
+    for usage, role in zip(shown, LIMIT_ROLES, strict=False):
+        percent = 100.0 * usage.share
+        largest = float(np.abs(percent).max())
+        name = f"{usage.name} {largest:.0f} %"
+        traces.append(curve(usage.t, percent, name, role, limit=limit, width=1.3))
+        keys.append(Key(name=name, role=role))
+
+    largest = 100.0 * float(np.abs(closest_first[0].share).max())
+    is_clearance = kind == "clearance"
+    reach = max(112.0, 1.08 * largest)
+    bounds = [level(100.0, "bound")] + ([] if is_clearance else [level(-100.0, "bound")])
+    beyond = [band(100.0, reach, "forbidden")]
+    if not is_clearance:
+        beyond.append(band(-reach, -100.0, "forbidden"))
+
+    margin = design.limits.get(kind, float("nan"))
+    remark = f"violated by {-margin:.3g}" if margin < 0.0 else f"smallest margin {margin:.3g}"
+    more = len(usages) - len(shown)
+    unit = "required / actual distance [%]" if is_clearance else "place in the range [%]"
+    title = f"{kind.replace('_', ' ')}: {unit}"
+    return Panel(
+        title=title,
+        traces=traces,
+        layout={
+            "xaxis": axis("time [s]"),
+            "yaxis": axis(range=[0.0 if is_clearance else -reach, reach]),
+            "shapes": [*bounds, *beyond],
+        },
+        remark=remark + (f"; {more} curves with smaller shares are not drawn" if more else ""),
+        linked="limits",
+        keys=keys,
+    )
+
+
+# ---- optimisation
+
+
+def _history_plots(design: Design) -> PlotGroup:
+    """Return plots of cost, smallest eigenvalue, slope and margin over the iterations."""
+    history = design.history
+    iterations = np.array([row.iteration for row in history], dtype=np.float64)
+    quantities = {
+        "cost J [–]": np.array([row.cost for row in history]),
+        "λ_min [s / (unit of θ)²]": np.array([row.min_eigenvalue for row in history]),
+        "slope |DJ·ζ| [–]": np.abs([row.slope for row in history]),
+    }
+    panels = []
+    for title, values in quantities.items():
+        positive = np.where(values > 0.0, values, np.nan)
+        if np.isfinite(positive).any():
+            panels.append(_history_panel(title, iterations, positive, logarithmic=True))
+
+    margins = 100.0 * np.array([row.margin for row in history])
+    if np.isfinite(margins).any():
+        title = "worst margin [% of half of the range]"
+        panels.append(_history_panel(title, iterations, margins, logarithmic=False))
+
+    note = f"{design.status.value[:1].upper()}{design.status.value[1:]}."
+    if any(row.mu for row in history):
+        note += " With limits, the slope is that of log J plus the barrier."
+    return PlotGroup(title="Trace of the search", panels=panels, note=note)
+
+
+def _history_panel(title: str, iterations: Array, values: Array, *, logarithmic: bool) -> Panel:
+    """Return the plot of one quantity over the iterations."""
+    trace = curve(iterations, values, title.split(" [")[0], "text", width=1.4)
+    trace["mode"] = "lines+markers"
+    trace["marker"] = {"size": 4, "color": "role:text"}
+    vertical = log_axis("", values) if logarithmic else axis()
+    usable = np.flatnonzero(np.isfinite(values))
+    first, last = float(values[usable[0]]), float(values[usable[-1]])
+    return Panel(
+        title=title,
+        traces=[trace],
+        layout={"xaxis": axis("iteration [–]"), "yaxis": vertical},
+        remark=f"{Quantity(value=first)} → {Quantity(value=last)}",
+        linked="iteration",
+    )

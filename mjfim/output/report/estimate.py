@@ -1,0 +1,374 @@
+"""The report of an estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import PurePath
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.model.coordinates import split_unit
+from mjfim.output.labels import complete_labels
+from mjfim.output.report.correlations import correlation_of_covariance
+from mjfim.output.report.curves import (
+    axis,
+    band,
+    correlation_panel,
+    curve,
+    dots,
+    level,
+    log_axis,
+    points_per_curve,
+    row_axis,
+    rows_height,
+    rows_of_bars,
+)
+from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
+from mjfim.output.report.residual_curves import Residuals
+from mjfim.output.summaries.estimate import describe_estimate
+from mjfim.output.summaries.verdicts import next_steps, verdict_of
+from mjfim.output.summary_parts import Listing, Part, Quantity, Summary
+from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
+from mjfim.records.estimate import Estimate, Prediction
+from mjfim.records.labels import Labels
+
+# Largest number of outputs that are drawn; of more, those whose residuals over sigma are largest.
+MAX_OUTPUTS = 12
+
+# Largest number of recordings whose signals are drawn.
+MAX_RECORDINGS = 8
+
+# Entries of the legend of signals.
+SIGNAL_KEYS = (
+    Key(name=MEASURED.word, role=MEASURED.word, shape="dot"),
+    Key(name=IDENTIFIED.word, role=IDENTIFIED.word),
+)
+RESIDUAL_KEYS = (Key(name="residual", role=MEASURED.word), Key(name="95 %", role="band"))
+
+
+def estimate_page(estimate: Estimate) -> Page:
+    """Return the report of an estimate.
+
+    Args:
+        estimate: The estimate.
+    """
+    labels = complete_labels(estimate)
+    summary = describe_estimate(estimate)
+    columns = _shown_outputs(estimate)
+
+    sections = [Section(title="Parameters", parts=list(_parameter_parts(estimate, summary)))]
+    if estimate.predictions:
+        found = (summary.table("predictions"), _prediction_plots(estimate, labels))
+        sections.append(Section(title="Predictions", parts=found))
+    if len(columns):
+        fit = list(_fit_plots(estimate, labels, columns))
+        sections.append(Section(title="Signals", parts=fit))
+        tests = list(_residual_plots(estimate, labels, columns))
+        sections.append(Section(title="Residuals", parts=[summary.table("residuals"), *tests]))
+    if estimate.missing_terms:
+        sections.append(Section(title="Missing terms", parts=[_missing_terms(estimate)]))
+
+    names = [PurePath(recording.name).name for recording in estimate.recordings]
+    facts = {
+        "recordings": str(len(names)),
+        "χ²/dof": f"{estimate.chi2 / max(estimate.dof, 1):.3f}",
+        "degrees of freedom": f"{estimate.dof:,}",
+        "iterations": str(estimate.iterations),
+        "time of the fit": f"{estimate.seconds:.3g} s",
+    }
+    return Page(
+        kind="Identification from recordings",
+        verdict=verdict_of(estimate),
+        next_steps=next_steps(estimate),
+        warnings=estimate.warnings,
+        facts=facts,
+        sections=sections,
+    )
+
+
+# ---- parameters
+
+
+def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | PlotGroup]:
+    """Yield the table of the estimates, their plots, and the sentences of the summary."""
+    elsewhere = {"predictions", "residuals"}
+    tables = [part for part in summary.parts if getattr(part, "key", "") not in elsewhere]
+    yield tables[0]
+
+    names = list(estimate.parameters)
+    panels = [_interval_panel(estimate, names)]
+    correlation = correlation_of_covariance(estimate.covariance)
+    if len(names) > 1 and np.isfinite(correlation).any():
+        panels.append(correlation_panel(correlation, names, "correlation of the estimates [–]"))
+    keys = [
+        Key(name="guess", role=NOMINAL.word),
+        Key(name="estimate, 95 % interval", role=IDENTIFIED.word),
+    ]
+    note = (
+        "The interval allows for residuals that are not white noise and for recordings that "
+        "disagree. A guess of 0 has no relative difference; see the table."
+    )
+    yield PlotGroup(title="", panels=panels, keys=keys, note=note)
+    yield from tables[1:]
+
+
+def _interval_panel(estimate: Estimate, names: Sequence[str]) -> Panel:
+    """Return the plot of the estimates with their intervals, relative to the guess."""
+    guess = estimate.initial_theta
+    percent = np.where(guess == 0.0, np.nan, np.abs(guess)) / 100.0
+    centre = (estimate.theta - guess) / percent
+    low, high = (estimate.interval.T - guess) / percent
+    rows = np.arange(len(names), dtype=np.float64)
+    known = np.isfinite(estimate.std)
+
+    texts = []
+    for j, name in enumerate(names):
+        unit = estimate.units[j]
+        left, right = estimate.interval[j]
+        text = f"{name}: {Quantity(value=float(estimate.theta[j]), digits=5)} {unit}"
+        texts.append(f"{text} (95 %: {left:.4g} to {right:.4g})" if known[j] else text)
+
+    estimates = dots(centre, rows, "estimate, 95 % interval", IDENTIFIED.word, size=9, texts=texts)
+    estimates["error_x"] = {
+        "type": "data",
+        "symmetric": False,
+        "array": _list(np.where(known, high - centre, np.nan)),
+        "arrayminus": _list(np.where(known, centre - low, np.nan)),
+        "color": f"role:{IDENTIFIED.word}",
+        "thickness": 2,
+        "width": 6,
+    }
+    zero = dots(np.zeros(len(rows)), rows, "guess", NOMINAL.word, size=12, symbol="line-ns-open")
+    zero["hoverinfo"] = "skip"
+    return Panel(
+        title="difference from the guess, with 95 % interval [% of the guess]",
+        traces=[zero, estimates],
+        layout={
+            "xaxis": axis("difference from the guess [%]"),
+            "yaxis": row_axis(names),
+            "shapes": [level(0.0, NOMINAL.word, across="y", dash="solid")],
+            "hovermode": "closest",
+        },
+        height=rows_height(len(names), 44),
+    )
+
+
+def _list(values: Array) -> list[float | None]:
+    """Return numbers for JSON, which has no NaN."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+# ---- predictions
+
+
+def _prediction_plots(estimate: Estimate, labels: Labels) -> PlotGroup:
+    """Return a plot of the prediction errors for every output."""
+    found = estimate.predictions
+    outputs = found[0].identified.outputs
+    panels = [
+        _prediction_panel(found, j, labels.output(name))
+        for j, name in enumerate(outputs)
+        if any(np.isfinite(prediction.identified.rms[j]) for prediction in found)
+    ]
+    keys = [
+        Key(name=NOMINAL.word, role=NOMINAL.word, shape="bar"),
+        Key(name=IDENTIFIED.word, role=IDENTIFIED.word, shape="bar"),
+    ]
+    note = "Of a predicted recording, only the initial state is estimated."
+    return PlotGroup(
+        title="Errors on recordings that were not fitted",
+        panels=panels[:MAX_OUTPUTS],
+        keys=keys,
+        note=note,
+    )
+
+
+def _prediction_panel(found: Sequence[Prediction], j: int, label: str) -> Panel:
+    """Return the plot of the errors of output j in every recording."""
+    name, unit = split_unit(label)
+    traces = []
+    for term in (NOMINAL, IDENTIFIED):
+        of_term = [p.identified if term is IDENTIFIED else p.nominal for p in found]
+        errors = np.array([errors.rms[j] for errors in of_term])
+        texts = [str(Quantity(value=float(error))) for error in errors]
+        traces.append(rows_of_bars(errors, term.word, term.word, texts=texts))
+    names = [PurePath(p.name).name + ("" if p.held_out else " *") for p in found]
+    return Panel(
+        title=f"{name}: rms error of the prediction [{unit or '–'}]",
+        traces=traces,
+        layout={
+            "xaxis": axis(f"rms error [{unit or '–'}]"),
+            "yaxis": row_axis(names),
+            "margin": {"r": 50},
+        },
+        height=rows_height(len(names), 44),
+    )
+
+
+# ---- signals
+
+
+def _shown_outputs(estimate: Estimate) -> list[int]:
+    """Return the numbers of the outputs to draw: of many, those with the largest residuals."""
+    rms = list(estimate.residual_rms.items())
+    measured = [j for j, (_, value) in enumerate(rms) if np.isfinite(value)]
+    sizes = {j: rms[j][1] / max(estimate.sigma.get(rms[j][0], 1.0), 1e-300) for j in measured}
+    largest = sorted(measured, key=lambda j: -sizes[j])
+    return sorted(largest[:MAX_OUTPUTS])
+
+
+def _fit_plots(estimate: Estimate, labels: Labels, columns: Sequence[int]) -> Iterator[PlotGroup]:
+    """Yield the measured and the identified signals of every recording, and their residuals."""
+    shown = estimate.recordings[:MAX_RECORDINGS]
+    limit = points_per_curve(3 * len(columns) * len(shown))
+    outputs = estimate.recordings[0].outputs
+    for i, recording in enumerate(shown):
+        predicted = estimate.predicted[i]
+        panels, residuals = [], []
+        for j in columns:
+            label = labels.output(outputs[j])
+            traces = [
+                _measured_dots(recording.t, recording.y[:, j], limit),
+                curve(recording.t, predicted[:, j], IDENTIFIED.word, IDENTIFIED.word, limit=limit),
+            ]
+            layout = {"xaxis": axis("time [s]")}
+            panels.append(Panel(title=label, traces=traces, layout=layout, linked=f"time {i}"))
+            residual = recording.y[:, j] - predicted[:, j]
+            sigma = estimate.sigma.get(outputs[j], float("nan"))
+            residuals.append(_residual_panel(recording.t, residual, sigma, label, limit, i))
+
+        name = PurePath(recording.name).name
+        note = _signal_note(estimate, len(columns), len(recording.t) > limit)
+        yield PlotGroup(
+            title=f"Fit to {name}", panels=panels, keys=SIGNAL_KEYS, note=note, folded=i > 0
+        )
+        yield PlotGroup(
+            title=f"Residuals of {name} over time",
+            panels=residuals,
+            note="Residual: measured − identified; the band is ± 2 σ of the noise.",
+            folded=True,
+        )
+
+
+def _measured_dots(t: Array, values: Array, limit: int) -> Plotly:
+    """Return the measured values of one output as small dots."""
+    return dots(t, values, MEASURED.word, MEASURED.word, limit=limit, size=3.0)
+
+
+def _signal_note(estimate: Estimate, drawn: int, thinned: bool) -> str:
+    """Say what the plots leave out."""
+    parts = []
+    outputs = len(estimate.recordings[0].outputs)
+    if drawn < outputs:
+        parts.append(
+            f"{drawn} of {outputs} outputs are drawn, those with the largest residuals over σ."
+        )
+    if len(estimate.recordings) > MAX_RECORDINGS:
+        parts.append(
+            f"The first {MAX_RECORDINGS} of {len(estimate.recordings)} recordings are drawn."
+        )
+    if thinned:
+        parts.append(
+            "Long curves are thinned for display: the smallest and the largest value of each "
+            "interval are drawn, so that peaks stay; estimate.npz has all samples."
+        )
+    return " ".join(parts)
+
+
+def _residual_panel(
+    t: Array, residual: Array, sigma: float, label: str, limit: int, i: int
+) -> Panel:
+    """Return the plot of the residuals of one output in one recording over time."""
+    name, unit = split_unit(label)
+    known = residual[np.isfinite(residual)]
+    outside = 100.0 * float(np.mean(np.abs(known) > 2.0 * sigma)) if known.size else float("nan")
+    return Panel(
+        title=f"{name}: residual [{unit or '–'}]",
+        traces=[dots(t, residual, "residual", MEASURED.word, limit=limit)],
+        layout={"xaxis": axis("time [s]"), "shapes": [band(-2.0 * sigma, 2.0 * sigma)]},
+        remark=f"{outside:.1f} % outside ± 2 σ (noise: 4.6 %)",
+        linked=f"time {i}",
+    )
+
+
+# ---- tests of the residuals
+
+
+def _residual_plots(
+    estimate: Estimate, labels: Labels, columns: Sequence[int]
+) -> Iterator[PlotGroup]:
+    """Yield autocorrelations and spectra of the residuals."""
+    autocorrelations, spectra = [], []
+    for j in columns:
+        residuals = Residuals.of(estimate, j)
+        if not residuals.parts:
+            continue
+        name, _ = split_unit(labels.output(estimate.recordings[0].outputs[j]))
+        autocorrelations.append(_autocorrelation_panel(estimate, residuals, j, name))
+        spectra.append(_spectrum_panel(residuals, name))
+
+    if autocorrelations:
+        yield PlotGroup(
+            title="Autocorrelation of the residuals",
+            panels=autocorrelations,
+            keys=RESIDUAL_KEYS,
+            note=(
+                "White noise stays in the band for 95 % of the lags. Slowly falling values mean "
+                "that the model lacks an effect."
+            ),
+        )
+        yield PlotGroup(
+            title="Spectrum of the residuals",
+            panels=spectra,
+            keys=RESIDUAL_KEYS,
+            note=(
+                "Power relative to white noise of the assumed σ, which is 1 at all frequencies. "
+                "Power above the band at low frequencies: the model lacks a slow effect. Rows "
+                "count as evenly spaced."
+            ),
+        )
+
+
+def _autocorrelation_panel(estimate: Estimate, residuals: Residuals, j: int, name: str) -> Panel:
+    """Return the plot of the autocorrelation of one output."""
+    lags, values, bound = residuals.autocorrelation()
+    trace: Plotly = curve(lags, values, "residual", MEASURED.word)
+    remark = ""
+    if j < len(estimate.whiteness):
+        p = estimate.whiteness[j].p
+        remark = f"p(white) {'below 10⁻⁶' if p < 1e-6 else format(p, '.2g')}"
+    reach = 1.1 * max(float(np.abs(values).max(initial=0.0)), 2.0 * bound)
+    return Panel(
+        title=f"{name}: autocorrelation [–]",
+        traces=[trace],
+        layout={
+            "xaxis": axis("lag [rows]"),
+            "yaxis": axis(range=[-reach, reach]),
+            "shapes": [band(-bound, bound), level(0.0, "muted", dash="solid")],
+        },
+        remark=remark,
+        linked="lag",
+    )
+
+
+def _spectrum_panel(residuals: Residuals, name: str) -> Panel:
+    """Return the plot of the spectrum of one output."""
+    frequencies, power, (low, high) = residuals.spectrum()
+    trace = curve(frequencies, np.where(power > 0.0, power, np.nan), "residual", MEASURED.word)
+    return Panel(
+        title=f"{name}: power / white noise [–]",
+        traces=[trace],
+        layout={
+            "xaxis": log_axis("frequency [Hz]", frequencies),
+            "yaxis": log_axis("", np.append(power, [low, high]), room=(0.1, 0.1)),
+            "shapes": [band(low, high), level(1.0, "muted", dash="solid")],
+        },
+        linked="frequency",
+    )
+
+
+def _missing_terms(estimate: Estimate) -> Listing:
+    """Return the terms that the model may lack."""
+    items = tuple(str(term) for term in estimate.missing_terms)
+    return Listing(title="Terms that would explain a part of the residuals", items=items)

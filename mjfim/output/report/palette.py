@@ -1,0 +1,75 @@
+"""Colours of a report for each role, in the light and in the dark theme."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mjfim.output.vocabulary import OTHER, TERMS
+
+# Colours of page and plots that belong to no term of the vocabulary, by their role.
+LIGHT = {
+    "page": "#ffffff",
+    "card": "#f6f7f8",
+    "text": "#222222",
+    "muted": "#5c6268",
+    "grid": "#e2e5e8",
+    "band": "#d9dcdf",
+    "bound": "#6b7076",
+    "forbidden": "#f4dcd7",
+    "good": "#1a7f4b",
+    "doubtful": "#9a6700",
+    "bad": "#c0281a",
+    "link": "#0a5fa5",
+}
+DARK = {
+    "page": "#16191d",
+    "card": "#20252b",
+    "text": "#e6e8ea",
+    "muted": "#a3abb3",
+    "grid": "#333a42",
+    "band": "#3a424b",
+    "bound": "#98a1aa",
+    "forbidden": "#452a28",
+    "good": "#4fc78a",
+    "doubtful": "#e0b04c",
+    "bad": "#ff8072",
+    "link": "#7dbdf5",
+}
+
+# Colours of curves without a meaning of their own, which differ also for colour-blind readers.
+SERIES_LIGHT = (
+    "#0077bb",
+    "#ee7733",
+    "#009988",
+    "#aa3377",
+    "#8a6d3b",
+    "#cc3311",
+    "#33669a",
+    "#6b7076",
+)
+SERIES_DARK = (
+    "#4fb0f0",
+    "#f7a55c",
+    "#2fc9b5",
+    "#e884bd",
+    "#cdb07a",
+    "#ff7f66",
+    "#8fb4dd",
+    "#a3abb3",
+)
+
+# Colours from -1 over 0 to 1.
+DIVERGING_LIGHT = ((0.0, "#2166ac"), (0.5, "#f7f7f7"), (1.0, "#b2182b"))
+DIVERGING_DARK = ((0.0, "#4a9be0"), (0.5, "#262b31"), (1.0, "#e8604c"))
+
+
+def palettes() -> dict[str, dict[str, Any]]:
+    """Return the colours by theme, `light` and `dark`, and role."""
+    light: dict[str, Any] = {**LIGHT, "diverging": DIVERGING_LIGHT}
+    dark: dict[str, Any] = {**DARK, "diverging": DIVERGING_DARK}
+    for term in (*TERMS, OTHER):
+        light[term.word] = term.colour
+        dark[term.word] = term.colour_on_dark
+    for i, (bright, pale) in enumerate(zip(SERIES_LIGHT, SERIES_DARK, strict=True)):
+        light[f"series{i}"], dark[f"series{i}"] = bright, pale
+    return {"light": light, "dark": dark}

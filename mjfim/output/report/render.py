@@ -1,0 +1,170 @@
+"""Reports as HTML: one file that holds its style, its plots and the plotting library.
+
+The file makes no request to any network. All names and sentences are escaped, because they may come
+from files of others.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from html import unescape
+from typing import Any
+
+from mjfim.output.html import escape
+from mjfim.output.report.page import Page, Panel, PlotGroup, Video
+from mjfim.output.report.palette import palettes
+from mjfim.output.summary_parts import Emphasis, SummaryTable
+from mjfim.output.vocabulary import shown_word
+
+# Folder of the templates, beside this module.
+PACKAGE, TEMPLATES = "mjfim.output.report", "templates"
+
+# Class of every emphasis.
+CLASSES = {
+    Emphasis.NORMAL: "",
+    Emphasis.STRONG: "strong",
+    Emphasis.WEAK: "weak",
+    Emphasis.WARNING: "warning-row warning",
+    Emphasis.STRONG_WARNING: "warning-row warning strong",
+    Emphasis.DERIVED: "derived",
+}
+
+# The video of a report, and the sentence that stands there instead; the template writes both.
+VIDEO = re.compile(
+    r'<(?:video|img) class="robot" [^>]*src="data:([\w/.+-]+);base64,([\w+/=]+)"'
+    r'.*?<p class="note">(.*?)</p>',
+    re.DOTALL,
+)
+NO_VIDEO = re.compile(r'<p class="note no-video">(.*?)</p>', re.DOTALL)
+
+
+def rendered(page: Page, name: str = "", video: Video | None = None, no_video: str = "") -> str:
+    """Return a report as one HTML file.
+
+    Args:
+        page: The report.
+        name: Name of what was designed, identified or studied; may be empty.
+        video: A video of the robot, or None.
+        no_video: Sentence that says why there is no video; may be empty.
+    """
+    # These libraries are slow to import, and only reports need them.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2.utils import htmlsafe_json_dumps
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+
+    loader = PackageLoader(PACKAGE, TEMPLATES)
+    environment = Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    panels = list(_panels(page))
+    number_of = {id(panel): i for i, panel in enumerate(panels)}
+    environment.filters.update(
+        base64=lambda content: base64.b64encode(content).decode("ascii"),
+        colours=_plain_colours,
+        emphasis_class=CLASSES.__getitem__,
+        group_heads=lambda table: list(_group_heads(table)),
+        kind_of=lambda part: type(part).__name__,
+        panel_number=lambda panel: number_of[id(panel)],
+        prose=lambda text: Markup(escape(text)),
+        without_bullet=lambda text: text.removeprefix("• "),
+    )
+
+    def own_file(file: str) -> Markup:
+        """Return a file of this package, which needs no escaping."""
+        return Markup(loader.get_source(environment, file)[0])
+
+    colours = palettes()
+    data = {"palettes": colours, "panels": [_as_json(panel) for panel in panels]}
+    return environment.get_template("report.html.j2").render(
+        page=page,
+        name=name,
+        video=video,
+        no_video=no_video,
+        palettes=colours,
+        data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
+        css=own_file("report.css"),
+        js=own_file("report.js"),
+        plotly=Markup(get_plotlyjs()),
+    )
+
+
+def video_in(html: str) -> Video | None:
+    """Return the video that a report embeds; None without one.
+
+    Args:
+        html: The report.
+    """
+    found = VIDEO.search(html)
+    if found is None:
+        return None
+    mime_type, content, caption = found.groups()
+    return Video(content=base64.b64decode(content), mime_type=mime_type, caption=unescape(caption))
+
+
+def no_video_in(html: str) -> str:
+    """Return the sentence with which a report says why it has no video; may be empty.
+
+    Args:
+        html: The report.
+    """
+    found = NO_VIDEO.search(html)
+    return "" if found is None else unescape(found.group(1))
+
+
+def _panels(page: Page) -> Iterator[Panel]:
+    """Yield all plots of a report in their order."""
+    for section in page.sections:
+        for part in section.parts:
+            if isinstance(part, PlotGroup):
+                yield from part.panels
+
+
+def _as_json(panel: Panel) -> dict[str, Any]:
+    """Return what the script of the page reads of a plot."""
+    return {
+        "traces": list(panel.traces),
+        "layout": panel.layout,
+        "height": panel.height,
+        "linked": panel.linked,
+    }
+
+
+def _plain_colours(palette: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the roles that have a single colour."""
+    return [(role, colour) for role, colour in palette.items() if isinstance(colour, str)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _GroupHead:
+    """A heading above several columns.
+
+    Attributes:
+        span: Number of columns.
+        trajectory: Name of the trajectory in the records; empty above other columns.
+        word: The heading.
+    """
+
+    span: int
+    trajectory: str
+    word: str
+
+
+def _group_heads(table: SummaryTable) -> Iterator[_GroupHead]:
+    """Yield the headings above the columns of a table, also empty ones."""
+    column = 0
+    for group in table.groups:
+        if group.first > column:
+            yield _GroupHead(span=group.first - column, trajectory="", word="")
+        span = group.last + 1 - group.first
+        yield _GroupHead(span=span, trajectory=group.trajectory, word=shown_word(group.trajectory))
+        column = group.last + 1
+    if column < len(table.columns):
+        yield _GroupHead(span=len(table.columns) - column, trajectory="", word="")

@@ -1,0 +1,285 @@
+"""Reports: one HTML file that needs nothing else, with everything escaped."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.errors import MjfimError, RecordingError
+from mjfim.output.report import REPORT
+from mjfim.output.report.build import page_of, rewrite_report, write_report
+from mjfim.output.report.correlations import correlation_of
+from mjfim.output.report.curves import packed, points_per_curve, thinned
+from mjfim.output.report.page import Video
+from mjfim.output.report.render import no_video_in, rendered, video_in
+from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
+from mjfim.records.design import Design, LimitUsage, Status
+from mjfim.records.shown import ShownRecord
+from tests.support import results
+
+# A name that would change the page, or run, if it were not escaped.
+HOSTILE = "<script>alert(1)</script>"
+
+# Largest size of a report [bytes].
+MAX_SIZE = 8_000_000
+
+# Result of every verb that has a report, by the name of the verb.
+MAKERS = {"design": results.design, "identify": results.estimate}
+
+
+@cache
+def record_of(verb: str) -> ShownRecord:
+    """The made-up result of a verb."""
+    return MAKERS[verb]()
+
+
+@cache
+def html_of(verb: str) -> str:
+    """The report of the made-up result of a verb."""
+    return rendered(page_of(record_of(verb)), verb)
+
+
+def own_part(html: str) -> str:
+    """A report without the plotting library."""
+    start = html.index("</script>", html.index('id="report-data"'))
+    library = html[start:].split("<script>", 2)
+    return html[:start] + library[2]
+
+
+def data_of(html: str) -> dict[str, Any]:
+    """The data of the plots of a report."""
+    text = html.split('id="report-data">', 1)[1].split("</script>", 1)[0]
+    data: dict[str, Any] = json.loads(text)
+    return data
+
+
+def numbers(array: dict[str, str]) -> np.ndarray:
+    """The numbers of an array of a plot."""
+    return np.frombuffer(base64.b64decode(array["bdata"]), dtype=f"<{array['dtype']}")
+
+
+# ---- the file
+
+
+@pytest.mark.parametrize("verb", MAKERS)
+def test_a_report_needs_no_other_file(verb: str) -> None:
+    """The part around the plotting library names no address, and scripts and styles are inline."""
+    html = html_of(verb)
+    assert len(html.encode()) < MAX_SIZE
+    assert html.lstrip().startswith("<!DOCTYPE html>")
+    assert re.findall(r"https?://", own_part(html)) == []
+    assert re.findall(r"<(?:script|img|video|iframe)[^>]* src=", html) == []
+    assert re.findall(r'<link[^>]*href="(?!data:)', html) == []
+    assert "default-src 'none'" in html
+
+
+@pytest.mark.parametrize("verb", MAKERS)
+def test_the_verdict_stands_above_the_sections(verb: str) -> None:
+    """The first thing is the verdict; every section has an entry in the navigation."""
+    html, page = html_of(verb), page_of(record_of(verb))
+    places = [html.index(f'<div class="verdict {page.verdict.level.value}'), html.index("<nav")]
+    for i, section in enumerate(page.sections):
+        assert f'<a href="#section-{i + 1}">{section.title}</a>' in html
+        places.append(html.index(f"<h2>{section.title}</h2>"))
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("verb", MAKERS)
+def test_every_plot_has_a_place_and_a_unit(verb: str) -> None:
+    """The numbers of the places are those of the plots; titles name a unit in brackets."""
+    html = html_of(verb)
+    panels = data_of(html)["panels"]
+    places = [int(number) for number in re.findall(r'data-panel="(\d+)"', html)]
+    assert places == list(range(len(panels)))
+    titles = re.findall(r"<figcaption><b>(.*?)</b>", html)
+    assert all(re.search(r"\[.+\]", title) for title in titles), titles
+
+
+@pytest.mark.parametrize("verb", MAKERS)
+def test_every_colour_has_a_value_in_both_themes(verb: str) -> None:
+    """A role without a colour would be drawn in black on a dark page."""
+    html = html_of(verb)
+    data = data_of(html)
+    roles = set(re.findall(r'"role:([^"]+)"', json.dumps(data["panels"])))
+    roles |= set(re.findall(r"color: var\(--([\w-]+)\)", html)) - {"level"}
+    assert roles <= set(data["palettes"]["light"])
+    assert set(data["palettes"]["light"]) == set(data["palettes"]["dark"])
+
+
+@pytest.mark.parametrize("verb", MAKERS)
+def test_names_of_others_are_escaped(verb: str) -> None:
+    """A name with a script stays a text, in the page and in the data of the plots."""
+    record = MAKERS[verb](name=HOSTILE, parameters=(HOSTILE, "<img src=x>", "a & b"))
+    html = rendered(page_of(record), HOSTILE)
+    assert HOSTILE not in html
+    assert "<img src=x" not in html
+    assert html.count("</script>") == html_of(verb).count("</script>")
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in own_part(html)
+    assert "<" not in html.split('id="report-data">', 1)[1].split("</script>", 1)[0]
+
+
+def test_a_record_without_report_is_refused() -> None:
+    class Other(ShownRecord):
+        """A record that nobody knows."""
+
+    with pytest.raises(MjfimError, match="a Other has no report"):
+        page_of(Other())
+
+
+# ---- contents
+
+
+def test_a_design_shows_its_tables_and_curves() -> None:
+    """The values of a curve are those of the trajectory; the heat map holds the correlation."""
+    html = html_of("design")
+    data = data_of(html)
+    for heading in ("Accuracy", "Motion", "Limits", "Optimisation"):
+        assert f"<h2>{heading}</h2>" in html
+    assert "Ready to play" in html
+    assert "<td>÷ 10.0</td>" in html
+
+    maps = [t for p in data["panels"] for t in p["traces"] if t["type"] == "heatmap"]
+    assert maps[0]["z"][0][1] == pytest.approx(results.CORRELATION)
+    assert maps[0]["z"][0][0] is None
+
+    design = results.design()
+    curves = [t for p in data["panels"] for t in p["traces"] if t["type"] == "scatter"]
+    position = next(t for t in curves if len(numbers(t["y"])) == 51 and t["name"] == "designed")
+    assert numbers(position["x"])[-1] == pytest.approx(design.trajectory.t[-1])
+
+
+def test_an_estimate_shows_predictions_and_residuals() -> None:
+    html = html_of("identify")
+    for heading in ("Parameters", "Predictions", "Signals", "Residuals"):
+        assert f"<h2>{heading}</h2>" in html
+    assert "Autocorrelation of the residuals" in html
+    assert "Spectrum of the residuals" in html
+    assert "0.05 / 0.2" in html
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "words"),
+    [
+        ({}, Level.GOOD, "σ of 1 % or less"),
+        ({"limits": {"position": -0.1}}, Level.BAD, "violates limits (position)"),
+        ({"status": Status.INFEASIBLE}, Level.BAD, "not ready"),
+    ],
+)
+def test_the_verdict_on_a_design(changes: dict[str, Any], level: Level, words: str) -> None:
+    design = results.design(**changes)
+    assert verdict_of(design).level is level
+    assert words in verdict_of(design).text
+    assert next_steps(design)
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "words"),
+    [
+        ({}, Level.GOOD, "explains the recordings"),
+        ({"misfit": True, "chi2": 800.0}, Level.DOUBTFUL, "2.01 times the noise"),
+        ({"success": False, "at_bound": ("mass",)}, Level.BAD, "mass ended at a bound"),
+    ],
+)
+def test_the_verdict_on_an_estimate(changes: dict[str, Any], level: Level, words: str) -> None:
+    estimate = results.estimate(**changes)
+    assert verdict_of(estimate).level is level
+    assert words in verdict_of(estimate).text
+
+
+def test_a_missing_term_is_the_first_next_step() -> None:
+    estimate = results.estimate(misfit=True, missing_terms=(results.missing_term(),))
+    assert "joint/hinge:frictionloss" in next_steps(estimate)[0]
+    assert "<h2>Missing terms</h2>" in rendered(page_of(estimate))
+
+
+def test_the_correlation_of_parameters_that_are_identifiable_alone() -> None:
+    """The third parameter is known in no direction; the others keep their correlation."""
+    information = np.zeros((3, 3))
+    information[:2, :2] = np.linalg.inv(results.covariance(np.array([2.0, 0.5])))
+    found = correlation_of(information, np.array([2.0, 0.5, np.inf]))
+    assert found[0, 1] == pytest.approx(results.CORRELATION)
+    assert np.isnan(found[2]).all()
+
+
+# ---- long logs
+
+
+def test_thinning_keeps_the_peaks() -> None:
+    """One high and one low sample out of a million remain, and the ends, in order."""
+    values = np.zeros(1_000_000)
+    values[123_456], values[654_321] = 7.0, -5.0
+    values[10:20] = np.nan
+    kept = thinned(values, 1000)
+    assert len(kept) <= 1000
+    assert {0, 123_456, 654_321, 999_999} <= set(kept.tolist())
+    assert (np.diff(kept) > 0).all()
+    assert np.array_equal(thinned(values[:5], 1000), np.arange(5))
+
+
+def test_numbers_are_packed_as_exactly_as_a_plot_shows_them() -> None:
+    """Single precision where it is enough, and gaps stay."""
+    assert packed(np.array([0.0, 0.25, np.nan]))["dtype"] == "f4"
+    assert np.isnan(numbers(packed(np.array([0.0, 0.25, np.nan])))[2])
+    tiny_changes = 1e9 + np.arange(3.0)
+    assert np.array_equal(numbers(packed(tiny_changes)), tiny_changes)
+
+
+def test_an_hour_of_signals_stays_small() -> None:
+    """An hour at 50 Hz with thirty curves of limits."""
+    samples = 180_000
+    usage = results.design(samples=samples).usage[0]
+    many = tuple(
+        LimitUsage(kind="position", name=f"joint {i}", t=usage.t, share=usage.share)
+        for i in range(30)
+    )
+    design = results.design(samples=samples, usage=many)
+    html = rendered(page_of(design))
+    assert len(html) < MAX_SIZE
+    assert "thinned for display" in html
+    assert points_per_curve(3600) >= 200
+
+
+# ---- video
+
+
+@pytest.mark.parametrize("mime_type", ["video/mp4", "image/gif"])
+def test_a_video_is_embedded_and_found_again(mime_type: str) -> None:
+    video = Video(content=bytes(range(256)), mime_type=mime_type, caption='A "robot" <swings>.')
+    html = rendered(page_of(record_of("design")), video=video)
+    assert video_in(html) == video
+    assert '<a href="#video">' in html
+    assert video_in(html_of("design")) is None
+
+
+def test_without_video_a_sentence_says_why() -> None:
+    html = rendered(page_of(record_of("design")), no_video="No renderer & no display.")
+    assert no_video_in(html) == "No renderer & no display."
+
+
+# ---- folders
+
+
+def test_a_report_is_made_again_byte_for_byte(tmp_path: Path) -> None:
+    """Also with a video, which is not rendered again."""
+    design = results.design()
+    design.save(tmp_path)
+    video = Video(content=b"film", mime_type="video/webm", caption="It swings.")
+    first = write_report(tmp_path, Design, video).read_bytes()
+    (tmp_path / "design.json").touch()
+    assert rewrite_report(tmp_path).read_bytes() == first
+    assert b"\r\n" not in first[:10_000]
+
+
+def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"holds no result; .*design\.npz"):
+        rewrite_report(tmp_path)
+    with pytest.raises(RecordingError, match="no such folder"):
+        rewrite_report(tmp_path / "nowhere")
+    assert not (tmp_path / REPORT).exists()

@@ -1,0 +1,170 @@
+"""Reports in a real browser: nothing is fetched, nothing fails, and every plot is visible.
+
+The browser is a Chromium or Chrome of the machine; without one the tests are skipped.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mjfim.output.report.build import page_of
+from mjfim.output.report.render import rendered
+from mjfim.output.vocabulary import DESIGNED
+from mjfim.records.shown import ShownRecord
+from tests.support import results
+
+pytestmark = pytest.mark.slow
+
+# Names of the program on the systems where it may be installed.
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+
+# Width and height of the window [CSS pixels]: a laptop and a phone.
+WINDOWS = ((1280, 800), (390, 844))
+
+# Result of every verb that has a report, by the name of the verb.
+MAKERS = {"design": results.design, "identify": results.estimate}
+
+# Time after which the plots must stand [ms].
+PATIENCE = 120_000
+
+# Height and width of each plot, and the number of its drawn shapes.
+MEASURE_PLOTS = """nodes => nodes.map(node => {
+  const box = node.getBoundingClientRect();
+  const shapes = node.querySelectorAll('.trace path, .trace text, .heatmaplayer image');
+  return [box.width, box.height, shapes.length];
+})"""
+
+# Width of the part of the page that is outside the window [CSS pixels].
+FIND_WIDE = "document.documentElement.scrollWidth - window.innerWidth"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser without a window."""
+    program = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if program is None:
+        pytest.skip("there is no Chromium or Chrome on this machine")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+    with playwright.sync_playwright() as driver:
+        try:
+            opened = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        except playwright.Error as error:
+            pytest.skip(f"{program} does not start: {error}")
+        yield opened
+        opened.close()
+
+
+class Viewed:
+    """A report in a browser.
+
+    Attributes:
+        page: The page.
+        faults: Messages of the console, errors, and requests.
+    """
+
+    def __init__(self, browser: Any, path: Path, size: tuple[int, int], theme: str) -> None:
+        """Open a report and wait for its plots."""
+        width, height = size
+        self.page = browser.new_page(
+            viewport={"width": width, "height": height}, color_scheme=theme
+        )
+        self.faults: list[str] = []
+        self.page.on("console", lambda message: self.faults.append(message.text))
+        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.page.on("request", lambda request: self._note(request.url))
+        self.page.goto(path.as_uri())
+        self.page.wait_for_selector("body[data-ready=yes]", timeout=PATIENCE)
+
+    def _note(self, address: str) -> None:
+        """Note a request that leaves the file."""
+        if not address.startswith(("file:", "data:", "blob:")):
+            self.faults.append(address)
+
+
+def rgb_text(colour: str) -> str:
+    """A colour as the browser writes it."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return f"rgb({red}, {green}, {blue})"
+
+
+def report_file(folder: Path, record: ShownRecord) -> Path:
+    """Write a report."""
+    path = folder / "report.html"
+    path.write_text(rendered(page_of(record), "made up"), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("verb", MAKERS)
+def test_every_plot_is_visible_in_every_window_and_theme(
+    verb: str, browser: Any, tmp_path: Path
+) -> None:
+    """No message, no request, no horizontal scrolling of the page, and no empty plot."""
+    view = Viewed(browser, report_file(tmp_path, MAKERS[verb]()), WINDOWS[0], "light")
+    view.page.eval_on_selector_all("details", "folds => folds.forEach(f => { f.open = true; })")
+    view.page.wait_for_selector(".plot:not([data-drawn])", state="detached", timeout=PATIENCE)
+
+    for width, height in WINDOWS:
+        view.page.set_viewport_size({"width": width, "height": height})
+        for theme in ("light", "dark"):
+            view.page.emulate_media(color_scheme=theme)
+            background = view.page.evaluate("getComputedStyle(document.body).backgroundColor")
+            assert (background == "rgb(255, 255, 255)") == (theme == "light")
+
+            plots = view.page.eval_on_selector_all(".plot", MEASURE_PLOTS)
+            assert plots
+            for plot_width, plot_height, shapes in plots:
+                assert 200 < plot_width < width
+                assert plot_height > 100
+                assert shapes > 0
+            assert view.page.evaluate(FIND_WIDE) <= 0
+    assert view.faults == []
+
+
+def test_a_name_in_the_legend_hides_its_curves(browser: Any, tmp_path: Path) -> None:
+    """A second click shows them again; a change of the theme keeps them hidden."""
+    from playwright.sync_api import expect
+
+    view = Viewed(browser, report_file(tmp_path, results.design()), WINDOWS[0], "light")
+    group = view.page.locator(".group", has_text="hinge [rad]").first
+    key = group.locator("button", has_text="initial")
+    curves = group.locator(".scatterlayer .trace")
+    expect(curves).to_have_count(2)
+
+    key.click()
+    expect(curves).to_have_count(1)
+    assert key.get_attribute("aria-pressed") == "false"
+    view.page.emulate_media(color_scheme="dark")
+    expect(curves.locator("path.js-line")).to_have_css("stroke", rgb_text(DESIGNED.colour_on_dark))
+    expect(curves).to_have_count(1)
+    key.click()
+    expect(curves).to_have_count(2)
+    assert view.faults == []
+
+
+def test_a_hostile_name_does_not_run(browser: Any, tmp_path: Path) -> None:
+    """It stands on the page as a text."""
+    name = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+    record = results.design(name=name, parameters=(name, "b", "c"))
+    dialogs: list[str] = []
+    page = browser.new_page()
+    page.on("dialog", lambda dialog: (dialogs.append(dialog.message), dialog.dismiss()))
+    page.goto(report_file(tmp_path, record).as_uri())
+    page.wait_for_selector("body[data-ready=yes]", timeout=PATIENCE)
+    assert dialogs == []
+    assert page.locator("body").inner_text().count("<script>alert(1)") >= 2
+    assert page.locator("img").count() == 0
+
+
+def test_a_printed_report_is_light_and_complete(browser: Any, tmp_path: Path) -> None:
+    """The PDF of a report in the dark theme has several pages."""
+    view = Viewed(browser, report_file(tmp_path, results.design()), WINDOWS[0], "dark")
+    content = view.page.pdf()
+    assert content.startswith(b"%PDF")
+    assert len(content) > 50_000
+    assert view.faults == []
