@@ -43,6 +43,10 @@ class ModelError(MjfimError):
     """MuJoCo cannot load or compile the model, or mjfim cannot use it."""
 
 
+class ModelWarning(UserWarning):
+    """MuJoCo loads the model, but leaves out or changes something that the file states."""
+
+
 class RecordingError(MjfimError):
     """A recording, a control table or a design archive cannot be used."""
 

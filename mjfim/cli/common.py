@@ -7,6 +7,7 @@ import io
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -20,7 +21,13 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 import mjfim
 from mjfim.atomic_io import remove_temporary_files
-from mjfim.errors import MjfimError, NoResultError, RecordingError, UnfinishedError
+from mjfim.errors import (
+    MjfimError,
+    ModelWarning,
+    NoResultError,
+    RecordingError,
+    UnfinishedError,
+)
 from mjfim.interruption import (
     INTERRUPTED_CODE,
     NOTHING_SENTENCE,
@@ -344,7 +351,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         """Call the verb; print one message and exit for each error."""
         interruption = Interruption(_announce)
         try:
-            with interruption, _claims:
+            with interruption, _claims, _worded_warnings():
                 _require_utf8_paths([*args, *kwargs.values()])
                 function(*args, **kwargs)
         except (NoResultError, UnfinishedError):
@@ -374,6 +381,23 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
 
     app.command(function.__name__.rstrip("_").replace("_", "-"))(wrapped)
     return wrapped
+
+
+@contextmanager
+def _worded_warnings() -> Iterator[None]:
+    """Print warnings about models as sentences, without the place in the code that warns."""
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **to: Any) -> None:
+            """Print a warning."""
+            if issubclass(category, ModelWarning):
+                errors.print(f"warning: {message}", markup=False)
+            else:
+                usual(message, category, *place, **to)
+
+        warnings.showwarning = show
+        yield
 
 
 def _announce(sentence: str) -> None:

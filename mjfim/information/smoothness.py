@@ -117,7 +117,7 @@ def roughness(
     between = derivatives.sensitivity(theta, trajectory, medium * SENSITIVITY_STEP)
     if between is not None:
         smaller = disagreement(G, noise.whiten(between.G))[:, visible]
-        if (smaller.max(axis=0) * SMOOTH_DECREASE <= error.max(axis=0)).all():
+        if only_curved(smaller.max(axis=0), error.max(axis=0)):
             return None
 
     first = int(np.argmax(error[:, worst] > DISAGREEMENT_TOLERANCE))
@@ -129,6 +129,19 @@ def roughness(
         time=float(trajectory.t[first]),
         causes=active_constraints(model, trajectory, nearby),
     )
+
+
+def only_curved(medium: Array, longer: Array) -> bool:
+    """Whether disagreements decrease with the step as those of derivatives that exist.
+
+    Those below `DISAGREEMENT_TOLERANCE` count as agreement; they may be round-off.
+
+    Args:
+        medium: (p,) disagreement of the shorter and the medium step.
+        longer: (p,) disagreement of the shorter and the longer step.
+    """
+    allowed = np.maximum(longer / SMOOTH_DECREASE, DISAGREEMENT_TOLERANCE)
+    return bool((medium <= allowed).all())
 
 
 def _longer_step_factors(plant: Plant) -> Array:

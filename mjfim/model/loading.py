@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,11 +14,11 @@ from mjfim.errors import ModelError
 from mjfim.model.coordinates import ModelCoordinates
 from mjfim.model.expanded_size import check_expanded_size
 from mjfim.model.finite_numbers import check_compiled_numbers, check_file_numbers
-from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.model.mujoco_log import collected_warnings, tell_once
 
 
 def load_spec(path: Path) -> Any:
-    """MjSpec of an MJCF or URDF file.
+    """MjSpec of an MJCF or URDF file. What MuJoCo warns of is told once.
 
     Args:
         path: The file.
@@ -34,21 +32,13 @@ def load_spec(path: Path) -> Any:
     check_file_numbers(path)
     check_expanded_size(path)
     try:
-        with _only_python_warnings():
-            return mujoco.MjSpec.from_file(_engine_path(path))
+        with collected_warnings(of_reader=True) as found:
+            spec = mujoco.MjSpec.from_file(_engine_path(path))
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot read the model: {str(error).strip()}") from None
 
-
-@contextmanager
-def _only_python_warnings() -> Iterator[None]:
-    """Let MuJoCo report warnings of the reader and the compiler through Python alone.
-
-    A warning about attached models without a prefix is left out: their names stay as they are.
-    """
-    with silence_mujoco_log(), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Attaching a spec with an empty prefix")
-        yield
+    tell_once(path, found)
+    return spec
 
 
 def _engine_path(path: Path) -> str:
@@ -69,21 +59,38 @@ def _engine_path(path: Path) -> str:
         ) from None
 
 
-def compile_spec(spec: Any, path: Path) -> Any:
+def compile_spec(spec: Any, path: Path, *, tells: bool = False) -> Any:
     """MjModel of a spec.
 
     Args:
         spec: The spec (`mujoco.MjSpec`).
         path: The file that it was read from, for the message.
+        tells: Whether MuJoCo's warnings are told; those about an edited copy are not.
 
     Raises:
         ModelError: MuJoCo cannot compile the spec; the message is MuJoCo's.
     """
     try:
-        with _only_python_warnings():
-            return spec.compile()
+        with collected_warnings() as found:
+            model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
+
+    if tells:
+        tell_once(path, found)
+    return model
+
+
+def load_written_model(path: Path) -> Any:
+    """MjModel of a file that mjfim wrote, without MuJoCo's warnings.
+
+    The user knows them from the original file.
+
+    Args:
+        path: The file.
+    """
+    with collected_warnings():
+        return mujoco.MjModel.from_xml_path(str(path))
 
 
 # Largest number of compiled models of edited specs that a source keeps; a search revisits few
@@ -116,7 +123,7 @@ class ModelSource:
         """
         self.path = path
         self.spec = load_spec(path) if spec is None else spec
-        self.model = compile_spec(self.spec, path)
+        self.model = compile_spec(self.spec, path, tells=True)
         check_compiled_numbers(self.model, path)
         self._compiled: dict[frozenset[str] | None, Any] = {}
         self._edited: dict[tuple[frozenset[str] | None, bytes], Any] = {}

@@ -11,7 +11,12 @@ import pytest
 
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.information.smoothness import DISAGREEMENT_TOLERANCE, disagreement, roughness
+from mjfim.information.smoothness import (
+    DISAGREEMENT_TOLERANCE,
+    disagreement,
+    only_curved,
+    roughness,
+)
 from mjfim.plant.rollout_derivatives import RolloutDerivatives
 from mjfim.records.check import Roughness
 from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
@@ -234,3 +239,11 @@ def test_a_model_that_diverges_under_the_longer_step_is_infinitely_rough(
     assert found.error == np.inf
     assert found.parameter == "mass, drag"
     assert "dry friction of rail" in found.causes
+
+
+def test_disagreements_below_the_tolerance_need_not_decrease() -> None:
+    # The first derivative exists, although the longer step reaches the end of a joint's range.
+    assert only_curved(np.array([6e-5, 5e-9]), np.array([0.87, 2.6e-8]))
+    assert only_curved(np.array([0.12, 8e-3]), np.array([0.79, 0.037]))
+    assert not only_curved(np.array([0.5, 5e-9]), np.array([0.87, 2.6e-8]))
+    assert not only_curved(np.array([6e-5, 0.02]), np.array([0.87, 2.6e-8]))

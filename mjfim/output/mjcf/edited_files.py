@@ -10,6 +10,7 @@ import mujoco
 
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError
+from mjfim.model.loading import load_written_model
 from mjfim.output.mjcf.asset_paths import point_to_copies
 from mjfim.output.mjcf.document import MAIN, MjcfDocument
 
@@ -73,7 +74,7 @@ class EditedFiles:
         self._point_to(names)
         self._write()
         try:
-            return mujoco.MjModel.from_xml_path(str(self._temporary[MAIN]))
+            return load_written_model(self._temporary[MAIN])
         except (ValueError, mujoco.FatalError) as error:
             reason = " ".join(str(error).split())
             raise ModelError(

@@ -18,7 +18,7 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, first_ones, listed
 from mjfim.experiment.system import System
-from mjfim.model.loading import compile_spec
+from mjfim.model.loading import compile_spec, load_written_model
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS
 from mjfim.model.spec_writer import state_derived_values, write_element
@@ -104,7 +104,7 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
                 f"values: {first_ones(stated, longest=REMARK_TEXT)}"
             )
 
-    found = mujoco.MjModel.from_xml_path(str(path))
+    found = load_written_model(path)
     reweighted = _reweighted_bodies(found, wanted, same_class=False)
     if reweighted and not unconstrained(found):
         names = first_ones([*map(repr, reweighted)], longest=REMARK_TEXT)
@@ -182,7 +182,7 @@ def _save(path: Path, spec: Any, model_path: Path) -> None:
 
     with replacing(path) as temporary:
         temporary.write_text(spec.to_xml(), encoding="utf-8")
-        mujoco.MjModel.from_xml_path(str(temporary))
+        load_written_model(temporary)
 
 
 def same_dynamics(a: Any, b: Any) -> bool:
