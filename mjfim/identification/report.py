@@ -17,7 +17,7 @@ from mjfim.experiment.stated_units import probable_degrees
 from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
-from mjfim.identification.fit_quality import FitQuality, fit_quality
+from mjfim.identification.fit_quality import FitQuality
 from mjfim.identification.flipped_signs import (
     POOR_FIT,
     flipped_signs,
@@ -33,7 +33,7 @@ from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.recordings.plausibility import plausibility_remarks
-from mjfim.records.estimate import Estimate, MissingTerm, Prediction
+from mjfim.records.estimate import Estimate, MissingTerm, Prediction, Restart
 from mjfim.records.recording import Recording
 
 # Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
@@ -60,18 +60,22 @@ class FitResult:
         task: System, recordings and settings.
         problem: The least-squares problem, with the noise of the last search.
         solution: Its solution.
+        quality: Size and whiteness of its residuals.
         null_space: Directions of theta about which neither recordings nor priors contain
             information.
         held_out: Problem of the held-out recordings; None without any.
         subset: Indices of segments that are quick to simulate, evenly spread over the data.
+        restart: How the fit was repeated from fits over segments; None where it was not.
     """
 
     task: FitTask
     problem: FitProblem
     solution: Solution
+    quality: FitQuality
     null_space: NullSpace
     held_out: FitProblem | None
     subset: np.ndarray
+    restart: Restart | None
 
     @property
     def theta(self) -> Array:
@@ -124,8 +128,7 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
     Raises:
         SimulationDivergedError: The simulation diverges at the estimate.
     """
-    task, problem = result.task, result.problem
-    quality = fit_quality(problem, result.solution)
+    task, problem, quality = result.task, result.problem, result.quality
 
     # Optional parts, each of which takes about as long as a search.
     missing = _missing_terms(result, quality, budget)
@@ -290,6 +293,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         motion=problem.motion(solution.unknowns, 0),
         interrupted=findings.interrupted,
         labels=labels_of_system(system),
+        restart=result.restart,
     )
 
 

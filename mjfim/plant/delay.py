@@ -63,8 +63,10 @@ class OutputDelay:
         place = np.clip(wanted, 0.0, samples - 1.0)
         count = min(NODES, samples)
 
-        # The nodes lie around the place; at both ends they are shifted to existing samples.
-        first = np.clip(np.floor(place).astype(int) - 1, 0, samples - count)
+        # No node lies after the sample at or behind the place: a controller feeds the noise of a
+        # measurement back into the later samples, and a slope from these would be correlated with
+        # that noise. At both ends, the nodes are shifted to existing samples.
+        first = np.clip(np.ceil(place).astype(int) - (count - 1), 0, samples - count)
         nodes = first[:, None] + np.arange(count)
         value, slope = _lagrange(place[:, None] - first[:, None], count)
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.records.combinations import join_names
 from mjfim.records.labels import Labels
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import SavedRecord
@@ -68,6 +69,7 @@ class Estimate(ShownRecord):
         units: Unit of each parameter.
         prior: (p, p) information of the parameters' priors.
         labels: Names and units for figures and tables; None in records of earlier versions.
+        restart: How the fit was repeated from fits over segments; None where it was not.
     """
 
     parameters: tuple[str, ...]
@@ -107,6 +109,7 @@ class Estimate(ShownRecord):
     units: tuple[str, ...] = ()
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     labels: Labels | None = None
+    restart: Restart | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -177,6 +180,44 @@ class Estimate(ShownRecord):
             "prior": self.prior,
             "data": self.data,
             "combinations": list(self.combinations),
+            "restart": None if self.restart is None else self.restart.summary(),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Restart:
+    """Repetition of a fit that did not explain the recordings, from fits over short segments.
+
+    Attributes:
+        lengths: Lengths of the segments, in the order of the fits [s].
+        cost_before: Half of the sum of squares of the first fit.
+        cost: That of the fit that was kept, with the noise of the first fit.
+    """
+
+    lengths: tuple[float, ...]
+    cost_before: float
+    cost: float
+
+    def __str__(self) -> str:
+        lengths = join_names([f"{length:.2g}" for length in self.lengths])
+        begin = (
+            "The first fit did not explain the recordings or did not converge, so it was restarted "
+            f"from fits over segments of {lengths} s"
+        )
+        if not self.cost < self.cost_before:
+            return f"{begin}. This found nothing better, and the first result stands."
+        return (
+            f"{begin}. Half of the sum of squares fell from {self.cost_before:.6g} to "
+            f"{self.cost:.6g}."
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of `restart` in estimate.json."""
+        return {
+            "lengths": list(self.lengths),
+            "cost_before": self.cost_before,
+            "cost": self.cost,
+            "words": str(self),
         }
 
 

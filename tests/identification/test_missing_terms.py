@@ -75,6 +75,38 @@ def test_a_bias_and_a_delay_are_found(tmp_path: Path) -> None:
     assert "output:delay" in [s.path for s in lagging.missing_terms]
 
 
+def played_with_feedback(task: DesignTask, gain: float, seed: int) -> Recording:
+    """A log of a controller whose gain acts on noisy measurements of the slide."""
+    system, plan = task.system, task.initial
+    rng = np.random.default_rng(seed)
+    model = system.plant.model(system.parameters.true)
+    state = np.array(plan.state[0])
+
+    measured, sent = [], []
+    for k, planned in enumerate(plan.ctrl):
+        measured.append(state[:4] + system.noise.sigma * rng.standard_normal(4))
+        deviation = plan.state[k][:4] - measured[-1]
+        sent.append(planned + gain * (deviation[0] + deviation[2]))
+        played = system.plant.simulator.rollout([model], state[None], sent[-1][None, None])
+        state = np.array(played.states[0][1])
+    measured.append(state[:4] + system.noise.sigma * rng.standard_normal(4))
+
+    times = system.dt * np.arange(len(measured))
+    names = system.outputs.names
+    return Recording(t=times, ctrl=np.array(sent), y=np.array(measured), outputs=names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 2])
+def test_feedback_on_noisy_measurements_is_no_delay(seed: int) -> None:
+    """The noise of a measurement moves the robot afterwards, which looked like a delay."""
+    task = DesignTask.resolve(stated())
+    found = identify_system(task.system, [played_with_feedback(task, gain=20.0, seed=seed)])
+    assert not found.missing_terms
+    assert not found.misfit
+    assert (np.abs(found.theta - task.system.parameters.true) < 3.0 * found.std).all()
+
+
 @pytest.mark.slow
 def test_a_complete_model_has_no_missing_terms() -> None:
     task = DesignTask.resolve(stated())

@@ -52,6 +52,16 @@ def test_whole_samples_are_exact() -> None:
     )
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 2.6])
+def test_nothing_depends_on_samples_after_the_delayed_time(delay: float) -> None:
+    """Later samples contain the feedback of a controller on the noise of this measurement."""
+    output_delay = OutputDelay.on_grid(12, delay, 1.0)
+    sample, row = np.arange(12)[None, :], np.arange(12)[:, None]
+    later = (sample > np.ceil(row - delay)) & (row - delay >= 3)
+    assert not output_delay.weights.toarray()[later].any()
+    assert not output_delay.weight_slopes.toarray()[later].any()
+
+
 def test_before_the_first_sample_the_first_value_is_held() -> None:
     """It does not change with the delay; a negative delay holds the last value after the last
     sample.

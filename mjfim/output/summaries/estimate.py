@@ -57,6 +57,8 @@ def describe_estimate(estimate: Estimate) -> Summary:
     )
     parts.append(_residual_table(estimate))
     parts.append(Paragraph(text=f"{estimate.iterations} iterations, {estimate.seconds:.1f} s"))
+    if estimate.restart is not None:
+        parts.append(Paragraph(text=str(estimate.restart)))
     if estimate.predictions:
         parts.append(_prediction_table(estimate.predictions))
     parts.append(

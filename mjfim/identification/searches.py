@@ -1,0 +1,350 @@
+"""Searches of one identification: over a subset, from several starts, and over all data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.budget import Budget
+from mjfim.errors import SimulationDivergedError
+from mjfim.identification.residuals import FitProblem
+from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
+from mjfim.identification.task import FitTask
+from mjfim.model.parameter_samples import sample_parameters
+from mjfim.optimize.levenberg_marquardt import (
+    IterationReport,
+    SearchSettings,
+    Solution,
+    UnknownValues,
+    minimise,
+)
+from mjfim.plant.noise import Noise
+from mjfim.records.events import FitEvent
+
+# Settings of the paper's Newton-Raphson iteration.
+NEWTON = SearchSettings(max_iterations=50, tolerance=1e-5, damped=False)
+
+# Length of a step [standard deviations] below which the search over all data has converged.
+FINAL_TOLERANCE = 1e-3
+
+# Length of a step [standard deviations] below which the search over a large amount of data has
+# converged. It is looser, because every linearisation takes long.
+FINAL_TOLERANCE_OF_MUCH_DATA = 1e-2
+
+# Number of samples that one linearisation simulates, with two-sided differences, above which the
+# amount of data is large.
+SAMPLES_OF_MUCH_DATA = 10 * SAMPLES_FOR_ONE_SIDED
+
+# Number of samples of the subset of segments on which the search begins, if there are more data.
+SUBSET_SAMPLES = 40_000
+
+# Iterations of a short search: from a random start, or for the initial states of a subset.
+SHORT_SEARCH_ITERATIONS = 8
+
+# Length of a step [standard deviations] at which a search from a random start ends.
+SHORT_SEARCH_TOLERANCE = 1e-2
+
+# Iterations of the initial states of all segments, after theta was found on a subset of them.
+INITIAL_STATE_ITERATIONS = 2
+
+# Length of a step [standard deviations] at which initial states count as found.
+INITIAL_STATE_TOLERANCE = 0.1
+
+# Largest number of times that the noise is estimated and the parameters are fitted again.
+MAX_NOISE_ROUNDS = 10
+
+# Relative change of an estimated standard deviation below which it has converged.
+NOISE_TOLERANCE = 0.01
+
+# Smallest estimated standard deviation, as a share of the stated one.
+MIN_NOISE_SHARE = 1e-3
+
+# Standard deviation of normal noise over its median absolute value.
+SIGMA_PER_MEDIAN = 1.4826
+
+Callback = Callable[[FitEvent], None]
+
+
+def quick_subset(problem: FitProblem) -> np.ndarray:
+    """Indices of segments that are quick to simulate, evenly spread over the data.
+
+    Args:
+        problem: Problem of all segments.
+
+    Returns:
+        The indices; with little data those of all segments.
+    """
+    count = len(problem.segments)
+    if problem.sample_count <= SUBSET_SAMPLES or count == 1:
+        return evenly_spread_indices(count, count)
+
+    wanted = max(int(SUBSET_SAMPLES * count / problem.sample_count), 1)
+    return evenly_spread_indices(count, wanted)
+
+
+def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
+    """Take the unknowns of some segments.
+
+    Args:
+        at: Unknowns of all segments.
+        subset: Indices of the segments.
+
+    Returns:
+        The unknowns of these segments.
+    """
+    return replace(at, private=at.private[subset])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitSearch:
+    """Searches of one identification, which share a budget and report their iterations.
+
+    Attributes:
+        task: System, recordings and settings.
+        budget: Budget whose token ends all searches.
+        callback: Called with every iterate, or None.
+    """
+
+    task: FitTask
+    budget: Budget
+    callback: Callback | None
+
+    def interrupted(self) -> bool:
+        """True after a request to stop."""
+        return self.budget.stop.requested
+
+    def best_start(
+        self, problem: FitProblem, subset: np.ndarray, begin: UnknownValues
+    ) -> UnknownValues:
+        """Find where the search over all data begins.
+
+        This is the best result of short searches on a subset of the segments.
+
+        Args:
+            problem: Problem of all segments.
+            subset: Indices of the segments of the subset.
+            begin: Unknowns at the stated start.
+
+        Returns:
+            Unknowns of all segments.
+        """
+        starts = self.task.settings.starts
+        part = problem.of_segments(subset)
+        is_whole = len(part.segments) == len(problem.segments)
+
+        # Initial states are estimated first; otherwise theta would compensate for their errors.
+        placed = self.with_initial_states(part, of_subset(begin, subset))
+        if is_whole and starts == 1:
+            return placed
+
+        settings = replace(self._final_settings(problem), relinearise_at_end=False)
+        found = [self._minimise(part, placed, settings, "part of the data")]
+        found += self._from_random_starts(part, starts)
+        best = min(found, key=lambda solution: solution.cost).unknowns
+        if is_whole:
+            return best
+
+        # The initial states of the other segments are the measured ones, improved for the theta
+        # that was found.
+        private = np.array(begin.private)
+        private[subset] = best.private
+        whole = replace(best, private=private)
+        return self.with_initial_states(problem, whole, INITIAL_STATE_ITERATIONS)
+
+    def solve(
+        self,
+        problem: FitProblem,
+        begin: UnknownValues,
+        phase: str = "all data",
+        max_iterations: int | None = None,
+    ) -> tuple[FitProblem, Solution]:
+        """Search over all data.
+
+        Where the noise is estimated, the search is repeated until the noise agrees with the
+        residuals.
+
+        Args:
+            problem: Problem of all segments.
+            begin: Unknowns at which the search begins.
+            phase: Name of the search for the user.
+            max_iterations: Largest number of iterations, if it is below that of the settings.
+
+        Returns:
+            The problem with the noise that was used, and its solution.
+
+        Raises:
+            SimulationDivergedError: The simulation diverges at the begin.
+        """
+        settings = self._final_settings(problem)
+        if max_iterations is not None:
+            fewest = min(max_iterations, settings.max_iterations)
+            settings = replace(settings, max_iterations=fewest)
+        solution = self._minimise(problem, begin, settings, phase)
+        if self.task.noise_is_stated:
+            return problem, solution
+
+        for _ in range(MAX_NOISE_ROUNDS):
+            if solution.interrupted:
+                break
+
+            # The noise that is estimated from the residuals weights them in the next search.
+            sigma = self._residual_sigma(problem, solution.unknowns)
+            change = float(np.abs(sigma / problem.noise.sigma - 1.0).max())
+            noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
+            problem = problem.with_noise(noise)
+            solution = self._minimise(
+                problem, solution.unknowns, settings, f"{phase}, noise estimated"
+            )
+            if change < NOISE_TOLERANCE:
+                break
+        return problem, solution
+
+    def _final_settings(self, problem: FitProblem) -> SearchSettings:
+        """Settings of the search over all data."""
+        if self.task.method == "newton":
+            return NEWTON
+
+        settings = SearchSettings(
+            max_iterations=self.task.settings.max_iterations, tolerance=FINAL_TOLERANCE
+        )
+        samples = problem.sample_count * 2 * len(self.task.system.parameters)
+        if samples < SAMPLES_OF_MUCH_DATA:
+            return settings
+        return replace(settings, tolerance=FINAL_TOLERANCE_OF_MUCH_DATA, relinearise_at_end=False)
+
+    def with_initial_states(
+        self,
+        problem: FitProblem,
+        begin: UnknownValues,
+        iterations: int = SHORT_SEARCH_ITERATIONS,
+    ) -> UnknownValues:
+        """Unknowns with measured initial states improved for the given theta.
+
+        They are unchanged where initial states are stated.
+
+        Args:
+            problem: The problem.
+            begin: The unknowns.
+            iterations: Largest number of iterations.
+
+        Returns:
+            The improved unknowns.
+        """
+        if not problem.layout.free_starts or self.interrupted():
+            return begin
+
+        settings = SearchSettings(
+            max_iterations=iterations,
+            tolerance=INITIAL_STATE_TOLERANCE,
+            relinearise_at_end=False,
+        )
+        held = problem.with_shared_held()
+        found = minimise(held, begin, settings, self.budget, self._reporter("initial states"))
+        return begin if found is None else found.unknowns
+
+    def _from_random_starts(self, problem: FitProblem, starts: int) -> list[Solution]:
+        """Results of short searches from random parameters; those that diverge are left out."""
+        if starts == 1 or self.interrupted():
+            return []
+
+        system = self.task.system
+        samples = sample_parameters(
+            system.parameters,
+            self.task.start,
+            starts,
+            self.task.settings.seed,
+            system.impossible,
+        )
+        settings = SearchSettings(
+            max_iterations=SHORT_SEARCH_ITERATIONS,
+            tolerance=SHORT_SEARCH_TOLERANCE,
+            relinearise_at_end=False,
+        )
+
+        # The first sample is the stated start, which was searched before.
+        found = []
+        for number, theta in enumerate(samples[1:], start=2):
+            phase = f"start {number} of {starts}"
+            begin = problem.begin(theta)
+            solution = minimise(problem, begin, settings, self.budget, self._reporter(phase))
+            if solution is not None:
+                found.append(solution)
+            if self.interrupted():
+                break
+        return found
+
+    def minimise(
+        self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
+    ) -> Solution | None:
+        """Search for a minimum within the budget, and report the iterations.
+
+        Args:
+            problem: The problem.
+            begin: Unknowns at which the search begins.
+            settings: Tolerance and number of iterations.
+            phase: Name of the search for the user.
+
+        Returns:
+            The solution; None where the simulation diverges at the begin.
+        """
+        return minimise(problem, begin, settings, self.budget, self._reporter(phase))
+
+    def _minimise(
+        self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
+    ) -> Solution:
+        """Solution of a search. Raises SimulationDivergedError where its start diverges."""
+        found = self.minimise(problem, begin, settings, phase)
+        if found is None:
+            raise SimulationDivergedError(
+                f"the simulation diverges next to the start of the fit ({phase})"
+            )
+        return found
+
+    def _reporter(self, phase: str) -> Callable[[IterationReport], None] | None:
+        """Callback of the optimiser that reports its iterations as events of a phase."""
+        callback = self.callback
+        if callback is None:
+            return None
+
+        def report(iteration: IterationReport) -> None:
+            """Report one iteration as an event."""
+            callback(
+                FitEvent(
+                    phase=phase,
+                    iteration=iteration.iteration,
+                    cost=iteration.cost,
+                    step=iteration.step_length,
+                )
+            )
+
+        return report
+
+    def _residual_sigma(self, problem: FitProblem, at: UnknownValues) -> Array:
+        """(ny,) standard deviations of the residuals [y-unit].
+
+        With a robust loss, outliers do not count.
+        """
+        sigma = np.array(problem.noise.sigma)
+        predicted = problem.predict(at)
+        if predicted is None:
+            return sigma
+
+        # Fitted parameters make residuals smaller than the noise.
+        is_robust = self.task.settings.loss != "linear"
+        count = problem.value_count
+        correction = count / max(count - problem.unknown_count, 1)
+        smallest = MIN_NOISE_SHARE * self.task.system.noise.sigma
+
+        for j, errors in enumerate(problem.errors(predicted)):
+            if not len(errors):
+                continue
+
+            # The median is used with a robust loss, because outliers hardly change it.
+            spread = float(np.sqrt(np.mean(errors**2) * correction))
+            if is_robust:
+                spread = SIGMA_PER_MEDIAN * float(np.median(np.abs(errors)))
+            sigma[j] = max(spread, smallest[j])
+        return sigma

@@ -1,0 +1,171 @@
+"""A fit over a whole recording that ends in a local minimum is restarted from short segments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.budget import StopToken
+from mjfim.experiment.system import System
+from mjfim.identification.continuation import MIN_ROWS, segment_lengths
+from mjfim.identification.identify import identify_system
+from mjfim.identification.residuals import FitProblem
+from mjfim.records.estimate import Estimate
+from mjfim.records.events import FitEvent
+from mjfim.records.recording import Recording
+
+# A pendulum that swings about once per second, measured with an error of 0.01 rad.
+PENDULUM = """<mujoco>
+  <option timestep="0.02" integrator="implicitfast"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="arm">
+      <inertial pos="0 0 -0.4" mass="0.5" diaginertia="0.004 0.004 0.0004"/>
+      <joint name="hinge" axis="0 1 0" damping="0.002"/>
+      <geom type="sphere" size="0.01" mass="0"/>
+    </body>
+  </worldbody>
+  <sensor><jointpos name="angle" joint="hinge" noise="0.01"/></sensor>
+</mujoco>
+"""
+COM = {"target": "body/arm:ipos[2]", "guess": -0.4, "true": -0.4}
+DAMPING = {"target": "joint/hinge:damping", "guess": 0.002, "true": 0.002, "bounds": [0.0, 1.0]}
+RATE = 50.0
+
+# Factors by which the start is wrong, of the centre of mass and of the damping.
+START = (0.5, 0.5)
+
+
+def pendulum(folder: Path, seconds: float, **tables: object) -> System:
+    """The pendulum, released at 1.5 rad."""
+    (folder / "pendulum.xml").write_text(PENDULUM, encoding="utf-8")
+    stated = {"fit": {"bootstrap": 0}, "parameters": {"com": COM, "damping": DAMPING}, **tables}
+    experiment = mjfim.Experiment(
+        model="pendulum.xml",
+        directory=folder,
+        rate=RATE,
+        horizon=seconds,
+        initial={"qpos": [1.5]},
+        **stated,
+    )
+    return System.resolve(experiment, threads=1)
+
+
+def swings(system: System, seconds: float) -> Recording:
+    """A log of many swings at the true parameters, with noise."""
+    samples = round(seconds * RATE)
+    ctrl = np.zeros((samples, 0))
+    y = system.plant.measure(system.parameters.true[None], ctrl)[0][0]
+    noise = system.noise.sigma * np.random.default_rng(0).standard_normal(y.shape)
+    times = np.arange(samples + 1) / RATE
+    return Recording(t=times, ctrl=ctrl, y=y + noise, outputs=system.outputs.names)
+
+
+def is_found(system: System, estimate: Estimate) -> bool:
+    """Whether the true parameters are found and nothing is doubted."""
+    near = np.abs(estimate.theta - system.parameters.true) < 4.0 * estimate.std
+    return bool(near.all() and estimate.success and not estimate.misfit)
+
+
+def test_a_wrong_start_finds_the_truth_over_many_swings(tmp_path: Path) -> None:
+    system = pendulum(tmp_path, 12.0, fit={"bootstrap": 0, "max_iterations": 15})
+    recording = swings(system, 12.0)
+    phases: list[str] = []
+
+    def note(event: FitEvent) -> None:
+        """Keep the phases in their order."""
+        if event.phase not in phases:
+            phases.append(event.phase)
+
+    start = system.parameters.true * START
+    found = identify_system(system, [recording], start=start, callback=note)
+    assert is_found(system, found)
+    assert not found.missing_terms
+    assert phases[0] == "all data" and phases[-1] == "again all data"
+    assert phases[1].startswith("segments of")
+
+    # The result says what happened.
+    restart = found.restart
+    assert restart is not None
+    assert restart.cost < 1e-2 * restart.cost_before
+    assert "fell from" in found.summary()["restart"]["words"]
+
+
+def test_a_right_first_fit_is_not_repeated(tmp_path: Path) -> None:
+    system = pendulum(tmp_path, 4.0)
+    phases = set()
+    found = identify_system(
+        system, [swings(system, 4.0)], callback=lambda event: phases.add(event.phase)
+    )
+    assert is_found(system, found)
+    assert found.restart is None and phases == {"all data"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [(1.2, 1.3), (1.5, 2.0), (2.0, 0.5), (0.5, 0.5), (0.4, 3.0)])
+def test_guesses_that_are_wrong_by_factors_find_the_truth(
+    tmp_path: Path, start: tuple[float, float]
+) -> None:
+    system = pendulum(tmp_path, 30.0)
+    recording = swings(system, 30.0)
+    found = identify_system(system, [recording], start=system.parameters.true * start)
+    assert is_found(system, found)
+
+
+@pytest.mark.slow
+def test_deviations_of_the_initial_state_and_biases_are_continued_too(tmp_path: Path) -> None:
+    """Parameters of the initial state are no unknowns of segments, the others are."""
+    nuisance = {"initial": {"qpos:hinge": 0.05}, "bias": 0.05, "per_recording": True}
+    system = pendulum(tmp_path, 30.0, nuisance=nuisance)
+    recording = swings(system, 30.0)
+    other = Recording(
+        t=recording.t, ctrl=recording.ctrl, y=recording.y + 0.03, outputs=recording.outputs
+    )
+    start = system.parameters.true.copy()
+    start[:2] *= START
+    found = identify_system(system, [recording, other], start=start)
+    assert found.restart is not None and is_found(system, found)
+    np.testing.assert_allclose(found.per_recording["bias angle"], [0.0, 0.03], atol=0.005)
+
+
+@pytest.mark.slow
+def test_a_wrong_model_keeps_the_lower_cost_of_all_fits(tmp_path: Path) -> None:
+    """Dry friction that the model lacks is no local minimum: the first result stands."""
+    system = pendulum(tmp_path, 12.0)
+    text = PENDULUM.replace('damping="0.002"', 'damping="0.002" frictionloss="0.02"')
+    (tmp_path / "robot").mkdir()
+    robot = pendulum(tmp_path / "robot", 12.0)
+    (tmp_path / "robot" / "pendulum.xml").write_text(text, encoding="utf-8")
+    robot = System.resolve(robot.experiment, threads=1)
+
+    found = identify_system(system, [swings(robot, 12.0)])
+    assert found.misfit and found.restart is not None
+    assert found.restart.cost <= found.restart.cost_before
+    assert found.missing_terms[0].path == "joint/hinge:frictionloss"
+
+
+@pytest.mark.slow
+def test_a_request_to_stop_during_the_restart_keeps_the_best_result(tmp_path: Path) -> None:
+    system = pendulum(tmp_path, 12.0)
+    stop = StopToken()
+
+    def press(event: FitEvent) -> None:
+        """Ask to stop in the first fit over segments."""
+        if event.phase.startswith("segments"):
+            stop.request()
+
+    start = system.parameters.true * START
+    found = identify_system(system, [swings(system, 12.0)], start=start, callback=press, stop=stop)
+    assert found.interrupted
+    assert found.restart is not None and found.restart.cost <= found.restart.cost_before
+
+
+def test_segments_are_shares_of_the_recording_with_enough_rows(tmp_path: Path) -> None:
+    system = pendulum(tmp_path, 12.0)
+    problem = FitProblem.of(system, [swings(system, 12.0)])
+    lengths = segment_lengths(problem.recordings)
+    assert lengths[0] * RATE >= MIN_ROWS
+    assert list(lengths) == sorted(set(lengths))
+    assert lengths[-1] <= 6.0
