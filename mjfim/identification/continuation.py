@@ -271,12 +271,14 @@ def _repeated(
 ) -> WholeFit | None:
     """A fit over whole recordings from a start; None where the simulation diverges.
 
-    It goes on only if its cost is lower than that of the first fit after some iterations.
+    It goes on beyond some iterations only if its cost is lower than that of the first fit by then.
     """
     try:
         placed = search.with_initial_states(problem, start)
         found = search.solve(problem, placed, "again all data", RESTART_ITERATIONS)
-        if not found[1].success and _cost(first, found[1]) < first.solution.cost:
+        solution = found[1]
+        ends_early = solution.success or solution.iterations < RESTART_ITERATIONS
+        if not ends_early and _cost(first, solution) < first.solution.cost:
             found = search.solve(problem, found[1].unknowns, "again all data")
         return WholeFit(problem=found[0], solution=found[1], quality=fit_quality(*found))
     except SimulationDivergedError:

@@ -122,14 +122,18 @@ def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> I
         problem = problem.of_segments(subset)
         at = replace(at, private=at.private[subset])
 
+    guess = problem.system.parameters.guess
     for part in _parts(problem):
         others = problem.masked([~mask for mask in part.masks])
         segments = others.segments_with_values
         if not len(segments):
             continue
 
-        begin = replace(at, private=at.private[segments])
-        found = minimise(others.of_segments(segments), begin, SEARCH, budget)
+        # The data that are left out may have led the estimate to a minimum that the others lack.
+        # The fit to the others then begins at the guess.
+        others = others.of_segments(segments)
+        begins = [replace(at, private=at.private[segments]), others.begin(guess)]
+        found = minimise(others, min(begins, key=others.cost), SEARCH, budget)
         if budget.exhausted is not None:
             return
         if found is not None:
