@@ -202,7 +202,7 @@ def test_a_diverging_start_lists_the_first_values(monkeypatch: pytest.MonkeyPatc
     )
     task = SimpleNamespace(system=system, start=np.ones(300), recordings=())
     begin = SimpleNamespace(private=np.zeros((1, 0)))
-    monkeypatch.setattr(identify, "_of_subset", lambda *_: None)
+    monkeypatch.setattr(identify, "of_subset", lambda *_: None)
     monkeypatch.setattr(identify, "_why_diverged", lambda *_: "the simulation is unstable")
     monkeypatch.setattr(identify, "describe_extreme_value", lambda *_: "")
     with pytest.raises(SimulationDivergedError, match="inertia_of_link_0 = 1, ") as raised:

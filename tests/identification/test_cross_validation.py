@@ -68,6 +68,7 @@ def test_without_held_out_recordings_each_is_predicted_by_the_others(
     assert (found.predictions[2].identified.rms > 0.15).all()
 
 
+@pytest.mark.slow
 def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
     task = DesignTask.resolve(base)
     recording = recorded(task, 0)
