@@ -6,7 +6,7 @@ import os
 import platform
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -49,6 +49,23 @@ class Guard(Protocol):
 
 # The rule that holds now. Without one, every file may be replaced and none removed.
 _guard: ContextVar[Guard | None] = ContextVar("guard", default=None)
+
+# What is called with every file that was written, or None.
+_observer: ContextVar[Callable[[Path], None] | None] = ContextVar("observer", default=None)
+
+
+@contextmanager
+def observed_by(observer: Callable[[Path], None]) -> Iterator[None]:
+    """Call a function with every file that is written in the context.
+
+    Args:
+        observer: The function; it gets the final name of the file.
+    """
+    token = _observer.set(observer)
+    try:
+        yield
+    finally:
+        _observer.reset(token)
 
 
 @contextmanager
@@ -113,6 +130,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
         if guard is not None:
             guard.before_replacing(temporary, path)
         os.replace(temporary, path)
+        observer = _observer.get()
+        if observer is not None:
+            observer(path)
     except OSError as error:
         # The error of a full disk names no file, other errors name the temporary one.
         if error.errno is not None and error.filename in (None, name):

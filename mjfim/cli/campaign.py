@@ -17,10 +17,12 @@ from mjfim.cli.common import (
     Force,
     Pictures,
     Threads,
+    Verbose,
     claim_folder,
     errors,
     keep_result,
     out,
+    say_written,
     verb,
 )
 from mjfim.errors import ExperimentError, RecordingError
@@ -80,6 +82,7 @@ def campaign(
         ),
     ] = False,
     pictures: Pictures = PictureFormat.PNG,
+    verbose: Verbose = False,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -109,7 +112,7 @@ def campaign(
     if warning:
         errors.print(f"warning: {warning}", markup=False)
     parameters = CampaignParameters.stated(run.task.parameters, simulated=simulated)
-    out.print(render(describe_campaign(found, parameters)))
+    out.print(render(describe_campaign(found, parameters), verbose=verbose))
     if found.status is CampaignStatus.WAITING:
         waiting = run.folder.round(run.folder.designed)
         out.print(
@@ -118,7 +121,7 @@ def campaign(
             markup=False,
             soft_wrap=True,
         )
-    errors.print(f"wrote {output}/")
+    say_written(output)
     raise typer.Exit(0 if found.reached else 1)
 
 

@@ -17,10 +17,12 @@ from mjfim.cli.common import (
     OtherDesign,
     Pictures,
     Threads,
+    Verbose,
     claim_folder,
     errors,
     print_result,
     progress,
+    say_written,
     verb,
     writing,
 )
@@ -32,7 +34,6 @@ from mjfim.output import archive
 from mjfim.output.folders import CHECK_FILES
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.check import describe_check
-from mjfim.output.text import render
 from mjfim.recordings.read import read_recording, recording_paths
 
 
@@ -52,6 +53,7 @@ def check(
     ] = None,
     as_json: AsJson = False,
     pictures: Pictures = PictureFormat.PNG,
+    verbose: Verbose = False,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -84,12 +86,11 @@ def check(
     with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
 
+    print_result(as_json, result.summary(), describe_check(result), verbose=verbose)
     if output is not None:
         with writing(output) as results:
             results.write_check_folder(output, result, pictures)
-    print_result(as_json, result.summary(), render(describe_check(result)))
-    if output is not None:
-        errors.print(f"wrote {output}/", markup=False)
+        say_written(output)
     if refused is not None:
         errors.print(f"mjfim: `mjfim design` refuses this experiment: {refused}", markup=False)
     raise typer.Exit(0 if result.ok and refused is None else 1)

@@ -16,11 +16,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console, RenderableType
+from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 import mjfim
-from mjfim.atomic_io import remove_temporary_files
+from mjfim.atomic_io import observed_by, remove_temporary_files
 from mjfim.errors import (
     MjfimError,
     ModelWarning,
@@ -37,6 +37,8 @@ from mjfim.interruption import (
 )
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.progress_text import design_text, fit_text, part_text
+from mjfim.output.summary_parts import Summary
+from mjfim.output.text import render
 from mjfim.output.video.record import NoVideoError, format_of, require_encoder
 from mjfim.parallel import LOST_SENTENCE, MAX_THREADS, Pool
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
@@ -54,8 +56,27 @@ app = typer.Typer(
 )
 
 
+class MessageConsole(Console):
+    """A console for sentences.
+
+    A terminal breaks them between words, and never inside a path, which the user may copy. In a
+    file each sentence is one line.
+    """
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print as a console does.
+
+        Args:
+            *objects: What is printed.
+            **options: Options of `rich.console.Console.print`.
+        """
+        if self.is_terminal:
+            options = {"soft_wrap": False, "overflow": "ignore", "crop": False, **options}
+        super().print(*objects, **options)
+
+
 # Console for messages and progress. Brackets and colons in file names are no markup and no emoji.
-errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
+errors = MessageConsole(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 # Width of the lines of results that do not go to a terminal [characters]; tables fit into it.
 FILE_WIDTH = 110
@@ -67,6 +88,13 @@ out = Console(
     markup=False,
     emoji=False,
 )
+
+# Page with all results of a folder.
+REPORT = "report.html"
+
+# Files that the running verb wrote, and how many it may write at most.
+_written: list[Path] = []
+_names: list[str] = []
 
 # Number of iterations from one line of progress to the next, for a design and for an estimation,
 # if stderr is not a terminal.
@@ -120,6 +148,10 @@ Folder = Annotated[
         "--output", "-o", metavar="DIR", help="Folder for the results; created if it is missing."
     ),
 ]
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", help="Print all tables and sentences, not only the essential."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON instead of tables.")]
 Pictures = Annotated[
     PictureFormat, typer.Option("--format", help="Format of the pictures.", case_sensitive=False)
@@ -169,9 +201,10 @@ def claim_folder(
     from mjfim.output.folders import check_folder
     from mjfim.output.manifest import OutputGuard, claimed
 
+    _names[:] = names
     check_folder(folder)
     guard = OutputGuard(inputs, force=force)
-    guard.check(folder / name for name in names)
+    guard.check(folder / name for name in _names)
     _claims.enter_context(claimed(folder, guard, exclusive=True))
 
 
@@ -280,8 +313,8 @@ def replace_unencodable_characters() -> None:
 def writing(folder: Path) -> Iterator[ModuleType]:
     """Create a folder for results, and import the module that writes them.
 
-    After Ctrl-C inside the context, the data are written completely, but figures are left out if
-    they take too long.
+    The display of progress counts the files that are written. After Ctrl-C inside the context, the
+    data are written completely, but figures are left out if they take too long.
 
     Args:
         folder: The folder.
@@ -290,11 +323,24 @@ def writing(folder: Path) -> Iterator[ModuleType]:
         The module `mjfim.output.folders`.
     """
     keep_result()
-    from mjfim.output import folders as results  # imports matplotlib and rerun, which takes a while
+    _written.clear()
+    with progress("writing files and drawing pictures") as show, observed_by(show.count_file):
+        from mjfim.output import folders as results  # imports matplotlib and rerun, which is slow
 
-    folder.mkdir(parents=True, exist_ok=True)
-    keep_result(folder)
-    yield results
+        folder.mkdir(parents=True, exist_ok=True)
+        keep_result(folder)
+        yield results
+
+
+def say_written(folder: Path, remark: str = "") -> None:
+    """Say where the results are, and which page shows all of them.
+
+    Args:
+        folder: Folder with the results.
+        remark: What can be done with them; may be empty.
+    """
+    report = f"; see {folder / REPORT}" if folder / REPORT in _written else ""
+    errors.print(f"wrote {folder}/{report}{remark}", markup=False)
 
 
 def _version(wanted: bool) -> None:
@@ -433,6 +479,13 @@ class ProgressDisplay:
         self._latest = description
         self._begun = self._told = time.monotonic()
 
+    def count_file(self, path: Path) -> None:
+        """Show how many of the files that may be written are written."""
+        _written.append(path)
+        self._latest = f"writing files and drawing pictures: {path.name}"
+        total = max(len(_names), len(_written))
+        self._bar.update(self._task, description=self._latest, total=total, completed=len(_written))
+
     def describe(self, description: str) -> None:
         """Show what is done until the next event."""
         self._latest = description
@@ -547,15 +600,29 @@ def _repeatedly(call: Callable[[], None], period: float) -> Iterator[None]:
         thread.join()
 
 
-def print_result(as_json: bool, summary: dict[str, Any], text: RenderableType) -> None:
+def is_elsewhere(as_json: bool) -> bool:
+    """Return whether the result is not readable on the terminal that shows the messages.
+
+    How the work ended is then a message, too.
+
+    Args:
+        as_json: Whether the result is printed as JSON.
+    """
+    return as_json or not out.is_terminal
+
+
+def print_result(
+    as_json: bool, values: dict[str, Any], summary: Summary, *, verbose: bool = False
+) -> None:
     """Print a result on stdout.
 
     Args:
         as_json: True for JSON, False for text.
-        summary: The result as values for JSON.
-        text: The result for people.
+        values: The result as values for JSON.
+        summary: The result in words and tables.
+        verbose: True for all tables and sentences, False for a screen of text at most.
     """
     if as_json:
-        typer.echo(records_as_json(summary), nl=False)
+        typer.echo(records_as_json(values), nl=False)
     else:
-        out.print(text)
+        out.print(render(summary, verbose=verbose))

@@ -15,10 +15,13 @@ from mjfim.cli.common import (
     Force,
     Pictures,
     Threads,
+    Verbose,
     claim_folder,
     errors,
+    is_elsewhere,
     print_result,
     progress,
+    say_written,
     verb,
     writing,
 )
@@ -28,7 +31,6 @@ from mjfim.experiment.input_files import input_files
 from mjfim.output.folders import comparison_files
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.comparison import describe_comparison
-from mjfim.output.text import render
 from mjfim.studies.baselines.methods import METHODS
 from mjfim.studies.compare import chosen_methods, compare_task
 
@@ -51,6 +53,7 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the baselines.")] = 0,
     as_json: AsJson = False,
     pictures: Pictures = PictureFormat.PNG,
+    verbose: Verbose = False,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -73,10 +76,10 @@ def compare(
 
     if not result.rows:
         raise NoResultError
+    print_result(as_json, result.summary(), describe_comparison(result), verbose=verbose)
     with writing(output) as results:
         results.write_comparison_folder(output, result, task.system, pictures)
-    print_result(as_json, result.summary(), render(describe_comparison(result)))
-    errors.print(f"wrote {output}/")
-    if not result.ok:
+    say_written(output)
+    if is_elsewhere(as_json) and not result.ok:
         errors.print(f"mjfim: {' '.join(result.verdict)}", markup=False)
     raise typer.Exit(0 if result.ok else 1)

@@ -20,12 +20,15 @@ from mjfim.cli.common import (
     Force,
     Pictures,
     Threads,
+    Verbose,
     VideoFile,
     claim_folder,
     claim_video,
     errors,
+    is_elsewhere,
     print_result,
     progress,
+    say_written,
     verb,
     worker_processes,
     write_wanted_video,
@@ -42,7 +45,6 @@ from mjfim.experiment.task_tables import MAX_STARTS
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.design import describe_design
-from mjfim.output.text import render
 from mjfim.records.design import Design
 from mjfim.records.events import Callback
 
@@ -71,6 +73,7 @@ def design(
     experiment: ExperimentFile,
     output: Folder,
     as_json: AsJson = False,
+    verbose: Verbose = False,
     starts: Annotated[
         int | None,
         typer.Option(
@@ -117,20 +120,17 @@ def design(
     # The files of the shortest experiment describe its horizon, not the stated one.
     if found is not None:
         task = DesignTask.resolve(found.experiment, threads=threads)
+    values = result.summary()
+    if found is not None:
+        values["shortest"] = found.summary()
+    summary = describe_design(result, task.system.units)
+    print_result(as_json, values, summary, verbose=verbose)
     with writing(output) as results:
         results.write_design_folder(output, result, task.system, pictures)
         if found is not None:
             found.save(output)
     write_wanted_video(video, task.system, result)
 
-    summary = result.summary()
-    if found is not None:
-        summary["shortest"] = found.summary()
-    print_result(
-        as_json,
-        summary,
-        render(describe_design(result, task.system.units)),
-    )
     if found is not None:
         errors.print(f"mjfim: {found}" if not found.reached else f"{found}", markup=False)
     if found is not None and found.reached:
@@ -138,8 +138,8 @@ def design(
             f"to use this horizon further, state horizon = {found.horizon:g} in {experiment}",
             markup=False,
         )
-    errors.print(f"wrote {output}/ (to see the motion: mjfim replay {output})", markup=False)
-    if not result.success:
+    say_written(output, f"\nto see the motion: mjfim replay {output}")
+    if is_elsewhere(as_json) and not result.success:
         errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
     if not result.separable:
         errors.print(f"mjfim: {_inseparable(result)}", markup=False)

@@ -12,6 +12,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
+    Verbose,
     claim_folder,
     errors,
     keep_result,
@@ -32,6 +33,7 @@ def export_sysid(
         list[Path], typer.Argument(metavar="RECORDING", help="Logs of any format that is read.")
     ],
     output: Folder,
+    verbose: Verbose = False,
     force: Force = False,
 ) -> None:
     """Pass recordings and parameters to mujoco.sysid, and compare its estimates with mjfim's."""
@@ -47,7 +49,8 @@ def export_sysid(
     loaded = [read_recording(path, system.channels) for path in logs]
 
     result = sysid_comparison.compare_with_sysid(system, loaded)
-    out.print(render(sysid_comparison.describe_sysid_comparison(result)))
+    summary = sysid_comparison.describe_sysid_comparison(result)
+    out.print(render(summary, verbose=verbose))
     for sentence in result.warnings:
         errors.print(f"warning: {sentence}", markup=False)
 

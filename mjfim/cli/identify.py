@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,13 +17,14 @@ from mjfim.cli.common import (
     Force,
     Pictures,
     Threads,
+    Verbose,
     VideoFile,
     claim_folder,
     claim_video,
     errors,
-    out,
     print_result,
     progress,
+    say_written,
     verb,
     write_wanted_video,
     writing,
@@ -35,7 +37,6 @@ from mjfim.output.folders import estimate_files, parts_of_identified
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summaries.logs import describe_logs
-from mjfim.output.text import render
 from mjfim.recordings.read import read_log, recording_paths
 
 
@@ -65,6 +66,7 @@ def identify(
     video: VideoFile = None,
     as_json: AsJson = False,
     pictures: Pictures = PictureFormat.PNG,
+    verbose: Verbose = False,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -82,10 +84,6 @@ def identify(
     with progress("reading") as show:
         fitted = [read_log(path, system.channels) for path in logs]
         predicted = [read_log(path, system.channels) for path in held_out_logs]
-        if not as_json:
-            summaries = [log.summary for log in (*fitted, *predicted)]
-            out.print(render(describe_logs(summaries)))
-
         announce_recordings(system, [log.recording for log in fitted], fit=True)
         show.describe("fitting")
         result = identify_system(
@@ -96,14 +94,15 @@ def identify(
             callback=show,
         )
 
+    summary = describe_estimate(result)
+    if verbose:
+        logs_read = describe_logs([log.summary for log in (*fitted, *predicted)])
+        summary = replace(summary, parts=(*summary.parts, *logs_read.parts))
+    print_result(as_json, result.summary(), summary, verbose=verbose)
     with writing(output) as results:
-        for sentence in results.write_estimate_folder(output, result, system, pictures):
-            errors.print(f"warning: {sentence}", markup=False)
+        remarks = results.write_estimate_folder(output, result, system, pictures)
+    for sentence in remarks:
+        errors.print(f"warning: {sentence}", markup=False)
     write_wanted_video(video, system, result)
-    print_result(
-        as_json,
-        result.summary(),
-        render(describe_estimate(result)),
-    )
-    errors.print(f"wrote {output}/")
+    say_written(output)
     raise typer.Exit(0 if result.success and not result.misfit and not result.interrupted else 1)

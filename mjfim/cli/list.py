@@ -10,7 +10,6 @@ import typer
 from mjfim.cli.common import AsJson, ModelFile, print_result, verb
 from mjfim.errors import ExperimentError
 from mjfim.output.summaries.inventory import describe_inventory
-from mjfim.output.text import render
 from mjfim.studies.inventory import list_model
 
 # Kinds of entries, as in `mjfim.records.inventory.KINDS`.
@@ -46,7 +45,8 @@ def list_(
                 f"{model}: no path or name contains {wanted!r}; `mjfim list {model}` lists all"
             )
 
-    print_result(as_json, inventory.summary(), render(describe_inventory(inventory)))
+    # Everything that was asked for is listed.
+    print_result(as_json, inventory.summary(), describe_inventory(inventory), verbose=True)
 
 
 def _matches(name: str, pattern: str) -> bool:

@@ -15,11 +15,13 @@ from mjfim.cli.common import (
     ExperimentFile,
     Force,
     Pictures,
+    Verbose,
     claim_folder,
     errors,
     keep_result,
     out,
     progress,
+    say_written,
     verb,
     worker_processes,
     writing,
@@ -35,7 +37,7 @@ from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.robustness import describe_robustness
 from mjfim.output.text import render
 from mjfim.parallel import cores
-from mjfim.records.robustness import MAX_NOISE, MAX_WRONG, RobotConditions, Robustness
+from mjfim.records.robustness import MAX_NOISE, MAX_WRONG, RobotConditions
 from mjfim.studies.robustness import assess_robustness, default_latency
 
 # Kinds of limits from which a design can keep a reserve.
@@ -100,6 +102,7 @@ def robustness(
         ),
     ] = None,
     pictures: Pictures = PictureFormat.PNG,
+    verbose: Verbose = False,
     force: Force = False,
 ) -> None:
     """Play a design on simulated robots that differ from the model.
@@ -143,24 +146,13 @@ def robustness(
         )
     seconds = time.perf_counter() - begun
 
+    out.print(render(describe_robustness(result), verbose=verbose))
     with writing(output) as results:
         results.write_robustness_folder(output, result, seconds, pictures)
-    _report(result, runs, seconds, output, pictures)
-    raise typer.Exit(0 if result.ok and result.runs == runs else 1)
-
-
-def _report(
-    result: Robustness, runs: int, seconds: float, output: Path, pictures: PictureFormat
-) -> None:
-    """Print the result, the files and, after Ctrl-C, the number of robots that are missing."""
-    out.print(render(describe_robustness(result)))
-    errors.print(
-        f"{result.runs} runs in {seconds:.0f} s; wrote playback.json, playback.npz, "
-        f"{pictures.file_of('playback')} and tables to {output}/",
-        markup=False,
-    )
+    say_written(output, f" ({result.runs} runs in {seconds:.0f} s)")
     if result.runs < runs:
         errors.print(f"mjfim: interrupted; only {result.runs} of {runs} robots are done")
+    raise typer.Exit(0 if result.ok and result.runs == runs else 1)
 
 
 def parse_reserve(words: Sequence[str]) -> dict[str, float]:

@@ -17,6 +17,7 @@ from mjfim.cli.common import (
     Force,
     InitialOrDesign,
     Pictures,
+    Verbose,
     VideoFile,
     claim_file,
     claim_folder,
@@ -25,6 +26,7 @@ from mjfim.cli.common import (
     keep_result,
     print_result,
     progress,
+    say_written,
     verb,
     write_wanted_video,
     writing,
@@ -39,7 +41,6 @@ from mjfim.output import archive
 from mjfim.output.folders import study_files
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.summaries.monte_carlo import describe_study
-from mjfim.output.text import render
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
 
@@ -106,6 +107,7 @@ def montecarlo(
     ] = None,
     as_json: AsJson = False,
     pictures: Pictures = PictureFormat.PNG,
+    verbose: Verbose = False,
     force: Force = False,
 ) -> None:
     """Compare estimates with the Cramér-Rao bound on the initial and on the designed trajectory."""
@@ -126,10 +128,11 @@ def montecarlo(
 
     if not study.sets:
         raise NoResultError
+    summary = describe_study(study, system.units)
+    print_result(as_json, study.summary(), summary, verbose=verbose)
     with writing(output) as results:
         results.write_study_folder(output, study, pictures)
-    print_result(as_json, study.summary(), render(describe_study(study, system.units)))
-    errors.print(f"wrote {output}/")
+    say_written(output)
     done = {name: found.trials for name, found in study.sets.items()}
     is_complete = done == dict.fromkeys(named, trials)
     if not is_complete:

@@ -9,11 +9,10 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import AsJson, print_result, verb
+from mjfim.cli.common import AsJson, Verbose, print_result, verb
 from mjfim.errors import ExperimentError
 from mjfim.experiment.schema import json_schema
 from mjfim.output.summaries.stated_experiment import describe_experiment
-from mjfim.output.text import render
 from mjfim.studies.stated_experiment import stated_experiment
 
 
@@ -27,6 +26,7 @@ def validate(
         typer.Option("--schema", help="Print the JSON schema of experiment files, for editors."),
     ] = False,
     as_json: AsJson = False,
+    verbose: Verbose = False,
 ) -> None:
     """Say whether an experiment file is correct, and what it states."""
     if schema:
@@ -36,4 +36,4 @@ def validate(
         raise ExperimentError("validate needs an experiment file, or --schema")
 
     stated = stated_experiment(mjfim.Experiment.from_file(experiment))
-    print_result(as_json, stated.summary(), render(describe_experiment(stated)))
+    print_result(as_json, stated.summary(), describe_experiment(stated), verbose=verbose)

@@ -70,10 +70,12 @@ class Column:
     Attributes:
         heading: Its heading.
         left: True for text that is aligned to the left.
+        detail: True where a short form leaves it out.
     """
 
     heading: str | Name
     left: bool = False
+    detail: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +121,6 @@ class SummaryTable:
         groups: Headings above several columns.
         note: Remark below it; may be empty.
         detail: True where a short form leaves it out.
-        unbroken: True where no number may be broken over several lines.
     """
 
     key: str
@@ -129,7 +130,6 @@ class SummaryTable:
     groups: tuple[ColumnGroup, ...] = ()
     note: str = ""
     detail: bool = False
-    unbroken: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,11 +155,13 @@ class Listing:
         title: The heading.
         items: The sentences; further lines of one sentence are separated by line breaks.
         emphasis: How strongly the sentences stand out.
+        detail: True where a short form leaves it out.
     """
 
     title: str
     items: tuple[str, ...]
     emphasis: Emphasis = Emphasis.NORMAL
+    detail: bool = False
 
 
 Part = SummaryTable | Paragraph | Listing
@@ -174,12 +176,14 @@ class Summary:
         outcome: One sentence that says how the work ended.
         parts: Tables, paragraphs and lists, the important one first.
         warnings: Sentences that the user must not overlook.
+        emphasis: How strongly the outcome stands out.
     """
 
     title: str
     outcome: str
     parts: tuple[Part, ...]
     warnings: tuple[str, ...] = ()
+    emphasis: Emphasis = Emphasis.STRONG
 
     def table(self, key: str) -> SummaryTable:
         """Return the table of a name."""
@@ -191,14 +195,17 @@ class Summary:
         return tuple(part for part in self.parts if isinstance(part, SummaryTable))
 
 
-def columns(*headings: str | Name, left: Sequence[str] = ()) -> tuple[Column, ...]:
+def columns(
+    *headings: str | Name, left: Sequence[str] = (), details: Sequence[str] = ()
+) -> tuple[Column, ...]:
     """Return the heads of columns.
 
     Args:
         headings: Heading of each column; the first column holds text.
         left: Headings of further columns that hold text.
+        details: Headings of columns that a short form leaves out.
     """
     return tuple(
-        Column(heading=heading, left=i == 0 or heading in left)
+        Column(heading=heading, left=i == 0 or heading in left, detail=heading in details)
         for i, heading in enumerate(headings)
     )

@@ -546,13 +546,13 @@ class _Verdict:
             if worst.repetitions:
                 needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"
             yield (
-                f"{len(missed)} of {len(identifiable)} parameters miss the wanted sigma with "
+                f"{len(missed)} of {len(identifiable)} parameters miss the wanted σ with "
                 f"{self.source} alone; the worst is {worst.name}: {needed} {worst.wanted:.3g}. A "
                 "designed excitation (`mjfim design`) needs fewer"
             )
         elif self.tested.passed and not self.missing and not unknown and not self.not_excited:
             yield (
-                f"every identifiable parameter reaches its wanted sigma with {self.source}: "
+                f"every identifiable parameter reaches its wanted σ with {self.source}: "
                 "nothing more is needed"
             )
 

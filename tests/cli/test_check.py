@@ -18,9 +18,16 @@ def test_a_table_and_a_conclusion_are_printed_and_nothing_is_written(study: Path
     before = names(study.parent)
     result = run("check", study)
     assert result.exit_code == 0
-    for word in ("m (kg)", "relative σ", "repetitions", "Verdict", "self-test passed", "best case"):
+    for word in ("parameters miss the wanted", "relative σ", "repetitions", "best case"):
         assert word in result.stdout
+    assert "self-test" not in result.stdout
     assert names(study.parent) == before
+
+
+def test_all_tables_and_sentences_are_printed_on_request(study: Path) -> None:
+    result = run("check", study, "--verbose")
+    for word in ("time", "eigenvalues", "derivative self-test passed"):
+        assert word in result.stdout
 
 
 def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:

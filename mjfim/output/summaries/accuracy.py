@@ -15,6 +15,9 @@ BEST_CASE = (
     "σ is the Cramér-Rao bound: the best case, reached if the model and the stated noise are right."
 )
 
+# Heading of the relative standard deviation before a design.
+RELATIVE_INITIAL = "relative σ initial"
+
 # Cell of a standard deviation that is infinite, because others absorb the parameter's effect.
 NOT_ALONE = "not alone"
 
@@ -50,7 +53,14 @@ def accuracy_table(design: Design, units: Sequence[str]) -> SummaryTable:
         key="accuracy",
         title="Predicted standard deviation σ of each parameter after one experiment",
         columns=columns(
-            "parameter", "value", "σ initial", "relative", "σ designed", "relative", "change of σ"
+            "parameter",
+            "value",
+            "σ initial",
+            RELATIVE_INITIAL,
+            "σ designed",
+            "relative σ",
+            "change of σ",
+            details=[RELATIVE_INITIAL],
         ),
         rows=tuple(rows),
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.output.campaign_parameters import CampaignParameters
-from mjfim.output.summary_parts import Emphasis, Paragraph, Row, Summary, SummaryTable, columns
+from mjfim.output.summary_parts import Cell, Emphasis, Name, Row, Summary, SummaryTable, columns
+from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
 from mjfim.records.campaign import Campaign
 from mjfim.records.estimate import Estimate
 
@@ -18,13 +19,13 @@ def describe_campaign(campaign: Campaign, parameters: CampaignParameters) -> Sum
         parameters: Its parameters.
 
     Returns:
-        The estimates and the status; before the first estimate, the status alone.
+        The status and the estimates; before the first estimate, the status alone.
     """
-    status = Paragraph(text=str(campaign))
+    emphasis = Emphasis.STRONG if campaign.reached else Emphasis.STRONG_WARNING
     if campaign.estimate is None:
-        return Summary(title="Campaign", outcome="", parts=(status,))
+        return Summary(title="Campaign", outcome=str(campaign), parts=(), emphasis=emphasis)
 
-    headings = ["parameter", "guess", "estimate", "formal σ", "wanted σ"]
+    headings = ["parameter", NOMINAL.word, IDENTIFIED.word, "formal σ", "wanted σ"]
     if parameters.true is not None:
         headings.append("error")
 
@@ -36,7 +37,7 @@ def describe_campaign(campaign: Campaign, parameters: CampaignParameters) -> Sum
     table = SummaryTable(
         key="campaign", title="Estimates", columns=columns(*headings), rows=tuple(rows)
     )
-    return Summary(title="Campaign", outcome="", parts=(table, status))
+    return Summary(title="Campaign", outcome=str(campaign), parts=(table,), emphasis=emphasis)
 
 
 def _campaign_row(
@@ -50,8 +51,8 @@ def _campaign_row(
     """Return the row of parameter j; `true` is its true value, None if that is not known."""
     value, std = float(estimate.theta[j]), float(estimate.std[j])
     wanted = float(campaign.wanted[j])
-    cells = [
-        estimate.parameters[j],
+    cells: list[Cell] = [
+        Name(name=estimate.parameters[j], unit=estimate.units[j]),
         f"{parameters.guess[j]:.5g}",
         f"{value:.5g}",
         f"{std:.2g}",

@@ -26,12 +26,17 @@ MAX_LISTED_EIGENVALUES = 8
 
 
 def describe_check(check: Check) -> Summary:
-    """Describe predicted standard deviations, inseparable parameters, and the verdict.
+    """Describe the verdict, predicted standard deviations, and inseparable parameters.
 
     Args:
         check: The check.
     """
-    parts: list[Part] = [_check_table(check)]
+    parts: list[Part] = []
+    if len(check.verdict) > 1:
+        emphasis = Emphasis.NORMAL if check.ok else Emphasis.WARNING
+        sentences = tuple(f"• {sentence}" for sentence in check.verdict[1:])
+        parts.append(Listing(title="Further findings", items=sentences, emphasis=emphasis))
+    parts.append(_check_table(check))
 
     for title, groups in (
         (
@@ -48,13 +53,15 @@ def describe_check(check: Check) -> Summary:
     of_size = size_sentence([row.value for row in check.rows], [row.size for row in check.rows])
     if of_size:
         parts.append(Paragraph(text=of_size, emphasis=Emphasis.WEAK))
-    parts.append(Paragraph(text=_eigenvalue_sentence(check)))
-    parts.append(Paragraph(text=_self_test_sentence(check)))
-    emphasis = Emphasis.NORMAL if check.ok else Emphasis.WARNING
-    sentences = tuple(f"• {sentence}" for sentence in check.verdict)
-    parts.append(Listing(title="Verdict", items=sentences, emphasis=emphasis))
     parts.append(Paragraph(text=BEST_CASE, emphasis=Emphasis.WEAK))
-    return Summary(title="", outcome="", parts=tuple(parts))
+    parts.append(Paragraph(text=_eigenvalue_sentence(check), detail=True))
+    parts.append(Paragraph(text=_self_test_sentence(check), detail=True))
+    return Summary(
+        title=f"Check of {check.source}",
+        outcome=check.verdict[0] if check.verdict else "",
+        parts=tuple(parts),
+        emphasis=Emphasis.STRONG if check.ok else Emphasis.STRONG_WARNING,
+    )
 
 
 def _check_table(check: Check) -> SummaryTable:
@@ -62,7 +69,16 @@ def _check_table(check: Check) -> SummaryTable:
     return SummaryTable(
         key="accuracy",
         title=f"Accuracy that {check.source} ({check.horizon:g} s) can give",
-        columns=columns("parameter", "value", "σ", "relative σ", "wanted σ", "repetitions", "time"),
+        columns=columns(
+            "parameter",
+            "value",
+            "σ",
+            "relative σ",
+            "wanted σ",
+            "repetitions",
+            "time",
+            details=["time"],
+        ),
         rows=tuple(_check_row(row) for row in check.rows),
     )
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.output.summaries.accuracy import BEST_CASE
-from mjfim.output.summaries.widths import MAX_COLUMNS
 from mjfim.output.summary_parts import (
     Cell,
-    Column,
     Emphasis,
     Name,
     Paragraph,
@@ -30,9 +28,8 @@ def describe_comparison(comparison: Comparison) -> Summary:
     Args:
         comparison: The comparison.
     """
-    parts: list[Part] = [_method_table(comparison)]
-    if len(comparison.wanted) <= MAX_COLUMNS:
-        parts.append(_method_accuracy_table(comparison))
+    parts: list[Part] = [Paragraph(text=sentence) for sentence in comparison.verdict[1:]]
+    parts.append(_method_table(comparison))
 
     for row in comparison.rows:
         remarks = [] if row.sound else [row.outcome.value]
@@ -45,9 +42,13 @@ def describe_comparison(comparison: Comparison) -> Summary:
         "scales; worst margin: smallest margin of all limits, in percent of half of the range."
     )
     parts.append(Paragraph(text=f"{legend} {BEST_CASE}", emphasis=Emphasis.WEAK))
-    emphasis = Emphasis.STRONG if comparison.ok else Emphasis.STRONG_WARNING
-    parts += [Paragraph(text=sentence, emphasis=emphasis) for sentence in comparison.verdict]
-    return Summary(title="", outcome="", parts=tuple(parts))
+    parts.append(_method_accuracy_table(comparison))
+    return Summary(
+        title=f"{comparison.source}: each method with {budget_in_words(comparison)}",
+        outcome=comparison.verdict[0],
+        parts=tuple(parts),
+        emphasis=Emphasis.STRONG if comparison.ok else Emphasis.STRONG_WARNING,
+    )
 
 
 def budget_in_words(comparison: Comparison) -> str:
@@ -72,12 +73,11 @@ def _method_table(comparison: Comparison) -> SummaryTable:
     return SummaryTable(
         key="methods",
         title=f"{comparison.source}: each method with {budget_in_words(comparison)}",
-        columns=columns(*headings),
+        columns=columns(*headings, details=["time", "steps"]),
         rows=tuple(
             Row(cells=_method_cells(comparison, row), emphasis=_method_emphasis(comparison, row))
             for row in comparison.rows
         ),
-        unbroken=True,
     )
 
 
@@ -107,27 +107,19 @@ def _method_cells(comparison: Comparison, row: MethodResult) -> tuple[Cell, ...]
 
 
 def _method_accuracy_table(comparison: Comparison) -> SummaryTable:
-    """Tabulate every method's standard deviations."""
+    """Tabulate the standard deviation of every parameter with every method."""
     rows = []
-    for row in comparison.rows:
-        cells = [Quantity(value=float(row.std[j])) for j in comparison.wanted]
-        rows.append(
-            Row(
-                cells=(_method_title(comparison, row), *cells),
-                emphasis=_method_emphasis(comparison, row),
-            )
-        )
+    for j in comparison.wanted:
+        name = Name(name=comparison.parameters[j], unit=comparison.units[j])
+        cells = [Quantity(value=float(row.std[j])) for row in comparison.rows]
+        rows.append(Row(cells=(name, *cells)))
 
-    names = [
-        Column(heading=Name(name=comparison.parameters[j], unit=comparison.units[j]))
-        for j in comparison.wanted
-    ]
     return SummaryTable(
         key="accuracy",
         title="σ of each parameter",
-        columns=(*columns("method"), *names),
+        columns=columns("parameter", *(row.title for row in comparison.rows)),
         rows=tuple(rows),
-        unbroken=True,
+        detail=True,
     )
 
 

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from mjfim.errors import listed
-from mjfim.output.summaries.accuracy import BEST_CASE, accuracy_table, size_sentence
+from mjfim.output.summaries.accuracy import (
+    BEST_CASE,
+    accuracy_table,
+    improvement,
+    size_sentence,
+)
 from mjfim.output.summary_parts import (
     Cell,
     Emphasis,
@@ -40,7 +47,7 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
         design: The design.
         units: Unit of each of the p parameters.
     """
-    parts: list[Part] = [accuracy_table(design, units)]
+    parts: list[Part] = [*_start_sentences(design), accuracy_table(design, units)]
 
     of_size = size_sentence(design.theta, design.sizes)
     if of_size:
@@ -59,13 +66,16 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
     parts.append(
         Paragraph(
             text=f"{design.iterations} iterations, {design.seconds:.2f} s, "
-            f"{design.steps / 1e6:.2f} million MuJoCo steps"
+            f"{design.steps / 1e6:.2f} million MuJoCo steps",
+            detail=True,
         )
     )
     if design.nuisance:
         names = listed(design.nuisance)
         parts.append(
-            Paragraph(text=f"nuisance parameters, whose accuracy the design ignores: {names}")
+            Paragraph(
+                text=f"Nuisance parameters, whose accuracy the design ignores: {names}", detail=True
+            )
         )
     if design.combinations:
         parts.append(
@@ -83,10 +93,29 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
     parts.append(eigenvalue_table(design))
     return Summary(
         title="Designed experiment",
-        outcome=design.status.value,
+        outcome=f"{_gain_sentence(design)}{design.status.value}",
         parts=tuple(parts),
         warnings=design.warnings,
+        emphasis=Emphasis.STRONG if design.sound else Emphasis.STRONG_WARNING,
     )
+
+
+def _gain_sentence(design: Design) -> str:
+    """Return how a design changes the standard deviations; empty where nothing is comparable."""
+    changes = []
+    for before, after in zip(design.initial.std, design.final.std, strict=True):
+        if np.isfinite(before) and np.isfinite(after) and min(before, after) > 0.0:
+            changes.append(float(before / after))
+    if not changes:
+        return ""
+
+    least, most = min(changes), max(changes)
+    if least < 1.0:
+        best, worst = improvement(most, 1.0), improvement(least, 1.0)
+        return f"σ of the parameters changes by {best} to {worst}; "
+    if f"{least:.1f}" == f"{most:.1f}":
+        return f"σ of the parameters falls by a factor of {most:.1f}; "
+    return f"σ of the parameters falls by factors of {least:.1f} to {most:.1f}; "
 
 
 def eigenvalue_table(design: Design) -> SummaryTable:
@@ -134,20 +163,6 @@ def _limit_parts(design: Design) -> list[Part]:
         return []
 
     parts: list[Part] = []
-    broken = [str(violation) for violation in design.initial_violations]
-    if broken:
-        shown = "; ".join(broken[:MAX_VIOLATIONS])
-        others = len(broken) - MAX_VIOLATIONS
-        more = f"; and {others} more, see limits.initial in design.json" if others > 0 else ""
-        parts.append(
-            Paragraph(
-                text=f"The initial control violates limits: {shown}{more}. Its standard deviations "
-                "are those of a motion outside the limits."
-            )
-        )
-    if design.scaled_start is not None:
-        parts.append(Paragraph(text=_scaled_sentence(design, design.scaled_start)))
-
     violated = [kind for kind, margin in design.limits.items() if margin < 0.0]
     if violated:
         parts.append(
@@ -169,6 +184,25 @@ def _limit_parts(design: Design) -> list[Part]:
             detail=True,
         )
     )
+    return parts
+
+
+def _start_sentences(design: Design) -> list[Part]:
+    """Return which limits the initial control violates, and how a scaled one compares."""
+    parts: list[Part] = []
+    broken = [str(violation) for violation in design.initial_violations]
+    if broken:
+        shown = "; ".join(broken[:MAX_VIOLATIONS])
+        others = len(broken) - MAX_VIOLATIONS
+        more = f"; and {others} more, see limits.initial in design.json" if others > 0 else ""
+        parts.append(
+            Paragraph(
+                text=f"The initial control violates limits: {shown}{more}. Its standard deviations "
+                "are those of a motion outside the limits."
+            )
+        )
+    if design.scaled_start is not None:
+        parts.append(Paragraph(text=_scaled_sentence(design, design.scaled_start)))
     return parts
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from mjfim.errors import listed
 from mjfim.output.summaries.accuracy import NOT_ALONE
-from mjfim.output.summaries.widths import MAX_COLUMNS, shortened
 from mjfim.output.summary_parts import (
     Cell,
     Emphasis,
@@ -21,10 +20,21 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
+from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
 from mjfim.records.estimate import Estimate, Prediction
 
-# Characters to which file names are shortened in tables of predictions.
-PREDICTION_NAME_WIDTH = 40
+# Largest number of digits of an estimate.
+MAX_DIGITS = 9
+
+# Heading of the standard deviation that is right if the model and the noise are.
+FORMAL = "formal σ"
+
+# Mark of recordings that are part of the last fit, and its meaning.
+FITTED_MARK = " *"
+FITTED_NOTE = (
+    "* predicted by a fit to the other recordings, but part of the last fit; --held-out keeps a "
+    "recording out of it"
+)
 
 
 def describe_estimate(estimate: Estimate) -> Summary:
@@ -34,33 +44,10 @@ def describe_estimate(estimate: Estimate) -> Summary:
         estimate: The estimate.
     """
     parts: list[Part] = [_estimate_table(estimate)]
-
-    # Parameters that differ between recordings: the table shows the first value only.
-    for name, values in estimate.per_recording.items():
-        if len(values) > 1:
-            shown = listed([f"{value:.3g}" for value in values])
-            parts.append(Paragraph(text=f"{name} of each recording: {shown}"))
-
-    verdict = (
-        "not explained by noise: the formal σ underestimates the errors"
-        if estimate.misfit
-        else "consistent with noise"
-    )
-    rms = listed([f"{name} {value:.3g}" for name, value in estimate.residual_rms.items()])
-    parts.append(
-        Paragraph(
-            text=(
-                f"residuals: χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof:,} "
-                f"degrees of freedom, {verdict}; rms: {rms}"
-            )
-        )
-    )
-    parts.append(_residual_table(estimate))
-    parts.append(Paragraph(text=f"{estimate.iterations} iterations, {estimate.seconds:.1f} s"))
     if estimate.restart is not None:
         parts.append(Paragraph(text=str(estimate.restart)))
     if estimate.predictions:
-        parts.append(_prediction_table(estimate.predictions))
+        parts.append(Paragraph(text=_prediction_sentence(estimate.predictions)))
     parts.append(
         Paragraph(
             text=(
@@ -72,11 +59,40 @@ def describe_estimate(estimate: Estimate) -> Summary:
             emphasis=Emphasis.WEAK,
         )
     )
+
+    # Parameters that differ between recordings: the table shows the first value only.
+    for name, values in estimate.per_recording.items():
+        if len(values) > 1:
+            shown = listed([f"{value:.3g}" for value in values])
+            parts.append(Paragraph(text=f"{name} of each recording: {shown}", detail=True))
+
+    parts.append(_residual_table(estimate))
+    if estimate.predictions:
+        parts.append(_prediction_table(estimate.predictions))
+        parts.append(_prediction_details(estimate.predictions))
+    parts.append(
+        Paragraph(text=f"{estimate.iterations} iterations, {estimate.seconds:.1f} s", detail=True)
+    )
+    doubtful = estimate.misfit or not estimate.success
     return Summary(
         title="Estimated parameters",
-        outcome=estimate.status,
+        outcome=f"{_fit_sentence(estimate)}; {estimate.status}",
         parts=tuple(parts),
         warnings=estimate.warnings,
+        emphasis=Emphasis.STRONG_WARNING if doubtful else Emphasis.STRONG,
+    )
+
+
+def _fit_sentence(estimate: Estimate) -> str:
+    """Return whether the residuals are those of the stated noise."""
+    verdict = (
+        "not explained by noise: the formal σ underestimates the errors"
+        if estimate.misfit
+        else "consistent with noise"
+    )
+    return (
+        f"residuals {verdict} (χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof:,} "
+        "degrees of freedom)"
     )
 
 
@@ -85,33 +101,43 @@ def _estimate_table(estimate: Estimate) -> SummaryTable:
     rows = []
     for j, name in enumerate(estimate.parameters):
         low, high = estimate.interval[j]
-        uncertainty: tuple[Cell, ...] = (NOT_ALONE, "-", "-")
+        uncertainty: tuple[Cell, ...] = (NOT_ALONE, "-", "-", "-")
         if np.isfinite(estimate.std[j]):
             uncertainty = (
                 Quantity(value=float(estimate.std[j]), digits=2),
                 Quantity(value=float(0.25 * (high - low)), digits=2),
-                f"{low:.5g} … {high:.5g}",
+                _as_accurate(low, estimate.std[j]),
+                _as_accurate(high, estimate.std[j]),
             )
         cells = (
             Name(name=name, unit=estimate.units[j]),
-            Quantity(value=float(estimate.initial_theta[j]), digits=5),
-            Quantity(value=float(estimate.theta[j]), digits=5),
+            Quantity(value=float(estimate.initial_theta[j]), digits=4),
+            _as_accurate(estimate.theta[j], estimate.std[j]),
             *uncertainty,
             "yes" if name in estimate.at_bound else "",
         )
         rows.append(Row(cells=cells))
 
-    headings = ["parameter", "guess", "estimate", "formal σ", "honest σ", "95 % interval"]
+    headings = ["parameter", NOMINAL.word, IDENTIFIED.word, FORMAL, "honest σ", "95 % low", "high"]
     if estimate.at_bound:
         headings.append("at bound")
     else:
         rows = [Row(cells=row.cells[:-1]) for row in rows]
     return SummaryTable(
         key="estimates",
-        title="Estimates",
-        columns=columns(*headings),
+        title="Estimates with their 95 % intervals",
+        columns=columns(*headings, details=[FORMAL]),
         rows=tuple(rows),
     )
+
+
+def _as_accurate(value: float, std: float) -> Quantity:
+    """Return a value with as many digits as its standard deviation justifies, and one more."""
+    if not (np.isfinite(std) and std > 0.0 and value):
+        return Quantity(value=float(value), digits=5)
+
+    places = np.floor(np.log10(abs(value))) - np.floor(np.log10(std))
+    return Quantity(value=float(value), digits=int(np.clip(places + 2, 2, MAX_DIGITS)))
 
 
 def _residual_table(estimate: Estimate) -> SummaryTable:
@@ -128,48 +154,70 @@ def _residual_table(estimate: Estimate) -> SummaryTable:
     )
 
 
+def _prediction_sentence(predictions: Sequence[Prediction]) -> str:
+    """Return how much better than the nominal model the identified model predicts."""
+    ratios = [prediction.ratio for prediction in predictions if np.isfinite(prediction.ratio)]
+    if not ratios:
+        return "No prediction of data that were not fitted could be compared"
+
+    low, high = f"{100.0 * min(ratios):.3g} %", f"{100.0 * max(ratios):.3g} %"
+    share = low if low == high else f"{low} to {high}"
+    return f"Prediction of data that were not fitted: the error is {share} of the nominal model's"
+
+
 def _prediction_table(predictions: Sequence[Prediction]) -> SummaryTable:
-    """Tabulate prediction errors of the identified and of the nominal model.
-
-    At most `MAX_COLUMNS` outputs are shown.
-    """
-    outputs = predictions[0].identified.outputs
-    measured = [
-        j
-        for j in range(len(outputs))
-        if any(np.isfinite(prediction.identified.rms[j]) for prediction in predictions)
-    ]
-    shown = measured[:MAX_COLUMNS]
-
-    rows = []
-    for prediction in predictions:
-        mark = "" if prediction.held_out else " *"
-        errors = [
-            f"{prediction.identified.rms[j]:.3g} / {prediction.nominal.rms[j]:.3g}" for j in shown
-        ]
-        better = prediction.ratio < 1.0
-        rows.append(
-            Row(
-                cells=(
-                    shortened(prediction.name, PREDICTION_NAME_WIDTH) + mark,
-                    *errors,
-                    f"{prediction.ratio:.2f}",
-                ),
-                emphasis=Emphasis.NORMAL if better else Emphasis.WARNING,
-            )
+    """Tabulate how much better than the nominal model the identified model predicts."""
+    rows = tuple(
+        Row(
+            cells=(_marked(prediction), Quantity(value=prediction.ratio, digits=2)),
+            emphasis=_prediction_emphasis(prediction),
         )
-
-    held_out = all(prediction.held_out for prediction in predictions)
+        for prediction in predictions
+    )
     return SummaryTable(
         key="predictions",
-        title=(
-            "Prediction of recordings that were not fitted: rms error of the identified / of the "
-            "nominal model"
-        ),
-        columns=columns("recording", *(outputs[j] for j in shown), "ratio"),
-        rows=tuple(rows),
-        note=""
-        if held_out
-        else "* predicted by a fit to the other recordings, but part of the final fit; "
-        "--held-out keeps a recording out of the final fit",
+        title="Prediction of recordings that were not fitted: rms error, identified / nominal",
+        columns=columns("recording", "ratio"),
+        rows=rows,
+        note=_prediction_note(predictions),
+        detail=True,
     )
+
+
+def _prediction_details(predictions: Sequence[Prediction]) -> SummaryTable:
+    """Tabulate the prediction errors of both models, output by output."""
+    rows = []
+    for prediction in predictions:
+        identified, nominal = prediction.identified, prediction.nominal
+        for j, output in enumerate(identified.outputs):
+            if not np.isfinite(identified.rms[j]):
+                continue
+            errors = (identified.rms[j], nominal.rms[j], identified.rms[j] / nominal.rms[j])
+            quantities = (Quantity(value=float(error)) for error in errors)
+            rows.append(Row(cells=(_marked(prediction), output, *quantities)))
+
+    return SummaryTable(
+        key="prediction details",
+        title="Prediction errors of every output: root mean square [unit of the output]",
+        columns=columns(
+            "recording", "output", IDENTIFIED.word, NOMINAL.word, "ratio", left=["output"]
+        ),
+        rows=tuple(rows),
+        note=_prediction_note(predictions),
+        detail=True,
+    )
+
+
+def _marked(prediction: Prediction) -> str:
+    """Return the name of a recording, with a mark if it is part of the last fit."""
+    return prediction.name + ("" if prediction.held_out else FITTED_MARK)
+
+
+def _prediction_note(predictions: Sequence[Prediction]) -> str:
+    """Return the meaning of the mark; empty where no recording has it."""
+    return "" if all(prediction.held_out for prediction in predictions) else FITTED_NOTE
+
+
+def _prediction_emphasis(prediction: Prediction) -> Emphasis:
+    """Return a warning where the identified model predicts no better than the nominal one."""
+    return Emphasis.NORMAL if prediction.ratio < 1.0 else Emphasis.WARNING

@@ -6,12 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjfim.output.summaries.widths import shortened
 from mjfim.output.summary_parts import Cell, Quantity, Row, Summary, SummaryTable, columns
 from mjfim.recordings.summary import ColumnSummary, LogSummary
-
-# Characters to which file names are shortened in tables of logs.
-LOG_NAME_WIDTH = 34
 
 # Jitter of a log below this fraction of the sample period is round-off of the time stamps.
 JITTER_ROUND_OFF = 1e-6
@@ -26,7 +22,7 @@ def describe_logs(logs: Sequence[LogSummary]) -> Summary:
     rows = [
         Row(
             cells=(
-                shortened(log.file, LOG_NAME_WIDTH),
+                log.file,
                 f"{log.rows:,}",
                 Quantity(value=log.duration, digits=4, suffix=" s"),
                 Quantity(value=log.rate, digits=5, suffix=" Hz"),

@@ -46,8 +46,22 @@ def describe_study(study: MonteCarloStudy, units: Sequence[str]) -> Summary:
     )
     parts += _covariance_tables(study, units)
     return Summary(
-        title="Monte Carlo study against the Cramér-Rao bound", outcome="", parts=tuple(parts)
+        title="Monte Carlo study against the Cramér-Rao bound",
+        outcome=_efficiency_sentence(study),
+        parts=tuple(parts),
     )
+
+
+def _efficiency_sentence(study: MonteCarloStudy) -> str:
+    """Return the range of the efficiencies along each trajectory."""
+    ranges = []
+    for name, trials in study.sets.items():
+        low, high = min(trials.efficiency), max(trials.efficiency)
+        of_trials = f"in {trials.trials:,} trials"
+        ranges.append(
+            f"{low:.2f} to {high:.2f} {of_trials} along the {shown_word(name)} trajectory"
+        )
+    return f"Efficiency of the estimates: {', and '.join(ranges)} (1 is the best)"
 
 
 def _efficiency_table(
@@ -64,7 +78,8 @@ def _efficiency_table(
             Quantity(value=float(trials.covariance[j, j]), digits=4),
             Quantity(value=float(trials.crlb[j, j]), digits=4),
             f"{trials.efficiency[j]:.3f}",
-            f"{low:.3f} … {high:.3f}",
+            f"{low:.3f}",
+            f"{high:.3f}",
         )
         rows.append(Row(cells=cells, trajectory=trajectory))
 
@@ -74,7 +89,15 @@ def _efficiency_table(
         key=f"efficiency {trajectory}",
         title=title,
         columns=columns(
-            "parameter", "true", "mean", "variance", "bound", "efficiency", "95 % interval"
+            "parameter",
+            "true",
+            "mean",
+            "variance",
+            "bound",
+            "efficiency",
+            "95 % low",
+            "high",
+            details=["true", "mean"],
         ),
         rows=tuple(rows),
     )

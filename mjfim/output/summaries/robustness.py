@@ -9,8 +9,8 @@ from scipy.stats import binom
 
 from mjfim.output.summary_parts import (
     Emphasis,
+    Listing,
     Name,
-    Paragraph,
     Row,
     Summary,
     SummaryTable,
@@ -28,11 +28,15 @@ def describe_robustness(result: Robustness) -> Summary:
     Args:
         result: The study.
     """
-    sentences = [Paragraph(text=f"• {sentence}") for sentence in robustness_sentences(result)]
+    first, *others = robustness_sentences(result)
+    items = tuple(f"• {sentence}" for sentence in others)
+    findings = Listing(title="Further findings", items=items)
+    tables = (_unknown_table(result), _limit_table(result))
     return Summary(
         title="A design played on robots that differ from the model",
-        outcome="",
-        parts=(_unknown_table(result), _limit_table(result), *sentences),
+        outcome=first,
+        parts=(findings, *(table for table in tables if table.rows)),
+        emphasis=Emphasis.STRONG if result.ok else Emphasis.STRONG_WARNING,
     )
 
 

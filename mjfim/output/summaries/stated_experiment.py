@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from mjfim.output.summary_parts import (
     Name,
-    Paragraph,
     Part,
     Quantity,
     Row,
@@ -12,6 +11,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
+from mjfim.output.vocabulary import NOMINAL
 from mjfim.records.stated_experiment import StatedExperiment
 
 
@@ -24,9 +24,12 @@ def describe_experiment(stated: StatedExperiment) -> Summary:
     parts: list[Part] = [_parameters(stated), _outputs(stated)]
     if stated.limits:
         parts.append(_limits(stated))
-    parts += [Paragraph(text=f"Warning: {sentence}") for sentence in stated.warnings]
-    parts.append(Paragraph(text=_verdict(stated)))
-    return Summary(title=stated.source, outcome="", parts=tuple(parts))
+    return Summary(
+        title=stated.source,
+        outcome=_verdict(stated),
+        parts=tuple(parts),
+        warnings=stated.warnings,
+    )
 
 
 def _parameters(stated: StatedExperiment) -> SummaryTable:
@@ -34,7 +37,7 @@ def _parameters(stated: StatedExperiment) -> SummaryTable:
     return SummaryTable(
         key="parameters",
         title="Unknown parameters",
-        columns=columns("parameter", "guess", "lower bound", "upper bound", "nuisance"),
+        columns=columns("parameter", NOMINAL.word, "lower bound", "upper bound", "nuisance"),
         rows=tuple(
             Row(
                 cells=(

@@ -20,8 +20,9 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
-from mjfim.output.summary_parts import Row, Summary, SummaryTable, columns
+from mjfim.output.summary_parts import Cell, Name, Row, Summary, SummaryTable, columns
 from mjfim.output.sysid.sequences import Exported, build, export, silenced
+from mjfim.output.vocabulary import NOMINAL
 from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import write_json
@@ -198,13 +199,14 @@ def describe_sysid_comparison(comparison: SysidComparison) -> Summary:
     rows = []
     for j, p in enumerate(comparison.exported.system.parameters.parameters):
         low, high = estimate.interval[j]
-        cells = (
-            p.name,
+        cells: tuple[Cell, ...] = (
+            Name(name=p.name, unit=p.unit),
             "-" if p.true is None else f"{p.true:.4g}",
             f"{estimate.initial_theta[j]:.4g}",
             f"{estimate.theta[j]:.5g}",
             f"{estimate.std[j]:.2g}",
-            f"{low:.4g} to {high:.4g}",
+            f"{low:.4g}",
+            f"{high:.4g}",
             *(f"{fit.theta[j]:.5g}" for fit in fits),
         )
         rows.append(Row(cells=cells))
@@ -212,7 +214,7 @@ def describe_sysid_comparison(comparison: SysidComparison) -> Summary:
     squares = [f"{fit.chi2:.6g}" for fit in (estimate, *fits)]
     seconds = [f"{fit.seconds:.2f}" for fit in (estimate, *fits)]
     for heading, values in (("χ²", squares), ("seconds", seconds)):
-        rows.append(Row(cells=(heading, "", "", values[0], "", "", *values[1:])))
+        rows.append(Row(cells=(heading, "", "", values[0], "", "", "", *values[1:])))
 
     table = SummaryTable(
         key="estimators",
@@ -220,10 +222,11 @@ def describe_sysid_comparison(comparison: SysidComparison) -> Summary:
         columns=columns(
             "parameter",
             "true",
-            "guess",
+            NOMINAL.word,
             "mjfim",
             "formal σ",
-            "95 % interval",
+            "95 % low",
+            "high",
             "sysid, weighted",
             "sysid, default",
         ),
