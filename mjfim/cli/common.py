@@ -37,6 +37,7 @@ from mjfim.interruption import (
 )
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.progress_text import design_text, fit_text, part_text
+from mjfim.output.report import REPORT
 from mjfim.output.summary_parts import Summary
 from mjfim.output.text import render
 from mjfim.output.video.record import NoVideoError, format_of, require_encoder
@@ -88,9 +89,6 @@ out = Console(
     markup=False,
     emoji=False,
 )
-
-# Page with all results of a folder.
-REPORT = "report.html"
 
 # Files that the running verb wrote, and how many it may write at most.
 _written: list[Path] = []

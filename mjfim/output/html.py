@@ -19,6 +19,7 @@ from mjfim.output.summary_parts import (
     Row,
     Summary,
     SummaryTable,
+    capitalised,
 )
 
 # Style of every emphasis.
@@ -55,7 +56,7 @@ def render(summary: Summary) -> str:
     if summary.title:
         elements.append(_element("p", escape(summary.title), "font-weight: bold"))
     if summary.outcome:
-        elements.append(_element("p", escape(_capitalised(summary.outcome))))
+        elements.append(_element("p", escape(capitalised(summary.outcome))))
 
     warning_style = STYLES[Emphasis.WARNING]
     elements += [
@@ -129,8 +130,3 @@ def _element(tag: str, content: str, style: str = "") -> str:
     """Return an element whose content is HTML already."""
     attribute = f' style="{style}"' if style else ""
     return f"<{tag}{attribute}>{content}</{tag}>"
-
-
-def _capitalised(sentence: str) -> str:
-    """Return a sentence with a capital first letter, and the rest unchanged."""
-    return sentence[:1].upper() + sentence[1:]

@@ -209,3 +209,15 @@ def columns(
         Column(heading=heading, left=i == 0 or heading in left, detail=heading in details)
         for i, heading in enumerate(headings)
     )
+
+
+def capitalised(sentence: str) -> str:
+    """Return a sentence with a capital first letter; symbols and paths stay as they are.
+
+    Args:
+        sentence: The sentence.
+    """
+    first = sentence.partition(" ")[0].rstrip(":;,.")
+    if not (first.isascii() and first.isalpha()):
+        return sentence
+    return sentence[:1].upper() + sentence[1:]

@@ -18,6 +18,7 @@ from mjfim.output.summary_parts import (
     Part,
     Summary,
     SummaryTable,
+    capitalised,
 )
 from mjfim.output.terminal_tables import fold, table_text
 
@@ -196,7 +197,7 @@ def _reduce(some: Sequence[_Block], blocks: Sequence[_Block], *, fewest: int) ->
 def _blocks(summary: Summary, width: int, rule: str, *, verbose: bool) -> Iterator[_Block]:
     """Yield the parts of a summary as text, the important ones first."""
     if summary.outcome:
-        sentence = _capitalised(summary.outcome)
+        sentence = capitalised(summary.outcome)
         yield _Block(head=[(line, summary.emphasis) for line in fold(sentence, width)])
 
     if summary.warnings:
@@ -246,9 +247,3 @@ def _table(table: SummaryTable, width: int, rule: str, *, verbose: bool) -> _Blo
         kind=str(table.columns[0].heading) or "row",
         is_table=True,
     )
-
-
-def _capitalised(sentence: str) -> str:
-    """Return a sentence with a capital first letter; symbols and paths stay as they are."""
-    first = sentence.partition(" ")[0]
-    return sentence[:1].upper() + sentence[1:] if first.isascii() and first.isalpha() else sentence

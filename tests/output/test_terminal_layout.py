@@ -38,6 +38,7 @@ FEW = ("m", "l", "c")
 # Begins of the first row of the first table.
 BEGINS = (
     "m",
+    "nominal",
     "▶",
     LONG[:-2] + "00",
     "left_forearm_and_hand_with_",

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from mjfim.output.summaries.design import describe_design
 from mjfim.output.summaries.estimate import describe_estimate
-from mjfim.output.summary_parts import Emphasis, Listing, Part, Summary, SummaryTable
+from mjfim.output.summary_parts import Emphasis, Listing, Part, Summary, SummaryTable, capitalised
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 
@@ -48,7 +48,7 @@ def render(summary: Summary, legend: str = "", addition: str = "") -> str:
         legend: Sentences that explain the colours of the recording.
         addition: Markdown to append.
     """
-    paragraphs = [f"## {summary.title}", f"**{_capitalised(summary.outcome)}**", legend]
+    paragraphs = [f"## {summary.title}", f"**{capitalised(summary.outcome)}**", legend]
     if summary.warnings:
         paragraphs += ["#### Warnings", _bullets(summary.warnings)]
     paragraphs += [_rendered(part) for part in summary.parts]
@@ -68,11 +68,6 @@ def _rendered(part: Part) -> str:
     if part.emphasis in (Emphasis.STRONG, Emphasis.STRONG_WARNING):
         return f"**{part.text}**"
     return part.text
-
-
-def _capitalised(sentence: str) -> str:
-    """Return a sentence with a capital first letter, and the rest unchanged."""
-    return sentence[:1].upper() + sentence[1:]
 
 
 def _bullets(sentences: Iterable[str]) -> str:
