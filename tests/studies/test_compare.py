@@ -336,7 +336,7 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     }
     assert imread(out / "compare.png").shape[0] > 300
     again = run(
-        "compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"
+        "compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp", "-v"
     )
     assert again.exit_code == 0, again.stderr
     assert names(out) == {
@@ -354,7 +354,7 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         "mjfim's design",
         "worst σ",
         "σ of each parameter",
-        "m (kg)",
+        "m kg",
         "million MuJoCo steps",
         "The design is the best",
     ):
@@ -386,7 +386,17 @@ def test_a_design_that_is_worse_is_reported_as_beaten(
 ) -> None:
     monkeypatch.setattr(compare_module, "design_task", worse(design_task))
     result = run(
-        "compare", study, "-o", tmp_path, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"
+        "compare",
+        study,
+        "-o",
+        tmp_path,
+        "--seconds",
+        60,
+        "--steps",
+        20_000,
+        "--methods",
+        "chirp",
+        "-v",
     )
     assert result.exit_code == 1
     assert "beaten by chirp" in " ".join(result.stdout.split())
