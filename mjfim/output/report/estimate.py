@@ -59,7 +59,8 @@ def estimate_page(estimate: Estimate) -> Page:
 
     sections = [Section(title="Parameters", parts=list(_parameter_parts(estimate, summary)))]
     if estimate.predictions:
-        found = (summary.table("predictions"), _prediction_plots(estimate, labels))
+        tables = (summary.table("predictions"), summary.table("prediction details"))
+        found = (*tables, _prediction_plots(estimate, labels))
         sections.append(Section(title="Predictions", parts=found))
     if len(columns):
         fit = list(_fit_plots(estimate, labels, columns))
@@ -92,7 +93,7 @@ def estimate_page(estimate: Estimate) -> Page:
 
 def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | PlotGroup]:
     """Yield the table of the estimates, their plots, and the sentences of the summary."""
-    elsewhere = {"predictions", "residuals"}
+    elsewhere = {"predictions", "prediction details", "residuals"}
     tables = [part for part in summary.parts if getattr(part, "key", "") not in elsewhere]
     yield tables[0]
 

@@ -47,7 +47,7 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
         design: The design.
         units: Unit of each of the p parameters.
     """
-    parts: list[Part] = [*_start_sentences(design), accuracy_table(design, units)]
+    parts: list[Part] = [accuracy_table(design, units), *_start_sentences(design)]
 
     of_size = size_sentence(design.theta, design.sizes)
     if of_size:
