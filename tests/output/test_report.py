@@ -17,9 +17,9 @@ from mjfim.output.report import REPORT
 from mjfim.output.report.build import page_of, rewrite_report, write_report
 from mjfim.output.report.correlations import correlation_of
 from mjfim.output.report.curves import packed, points_per_curve, thinned
-from mjfim.output.report.page import Video
 from mjfim.output.report.render import no_video_in, rendered, video_in
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
+from mjfim.output.video import Video
 from mjfim.records.design import Design, LimitUsage, Status
 from mjfim.records.shown import ShownRecord
 from tests.support import results
@@ -249,9 +249,15 @@ def test_an_hour_of_signals_stays_small() -> None:
 # ---- video
 
 
-@pytest.mark.parametrize("mime_type", ["video/mp4", "image/gif"])
-def test_a_video_is_embedded_and_found_again(mime_type: str) -> None:
-    video = Video(content=bytes(range(256)), mime_type=mime_type, caption='A "robot" <swings>.')
+def film(media_type: str, caption: str = "It swings.") -> Video:
+    """A made-up video."""
+    content = bytes(range(256))
+    return Video(data=content, media_type=media_type, caption=caption, width=640, height=360)
+
+
+@pytest.mark.parametrize("media_type", ["video/mp4", "image/webp"])
+def test_a_video_is_embedded_and_found_again(media_type: str) -> None:
+    video = film(media_type, 'A "robot" <swings>.')
     html = rendered(page_of(record_of("design")), video=video)
     assert video_in(html) == video
     assert '<a href="#video">' in html
@@ -270,8 +276,7 @@ def test_a_report_is_made_again_byte_for_byte(tmp_path: Path) -> None:
     """Also with a video, which is not rendered again."""
     design = results.design()
     design.save(tmp_path)
-    video = Video(content=b"film", mime_type="video/webm", caption="It swings.")
-    first = write_report(tmp_path, Design, video).read_bytes()
+    first = write_report(tmp_path, Design, film("video/mp4")).read_bytes()
     (tmp_path / "design.json").touch()
     assert rewrite_report(tmp_path).read_bytes() == first
     assert b"\r\n" not in first[:10_000]

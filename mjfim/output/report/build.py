@@ -10,8 +10,9 @@ from mjfim.errors import MjfimError, RecordingError, first_ones, listed
 from mjfim.output.report import REPORT
 from mjfim.output.report.design import design_page
 from mjfim.output.report.estimate import estimate_page
-from mjfim.output.report.page import Page, Video
+from mjfim.output.report.page import Page
 from mjfim.output.report.render import no_video_in, rendered, video_in
+from mjfim.output.video import Video
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.serialization import read_json

@@ -14,26 +14,6 @@ Plotly = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Video:
-    """A video of the robot that a report embeds.
-
-    Attributes:
-        content: The bytes of the file; a GIF is shown as a picture.
-        mime_type: Its type, such as `video/mp4`, `video/webm` or `image/gif`.
-        caption: One sentence that says what it shows.
-    """
-
-    content: bytes
-    mime_type: str
-    caption: str
-
-    @property
-    def is_picture(self) -> bool:
-        """True for a moving picture that is no video for the browser."""
-        return self.mime_type.startswith("image/")
-
-
-@dataclass(frozen=True, kw_only=True)
 class Key:
     """An entry of the legend of a group of plots, which shows and hides its curves.
 

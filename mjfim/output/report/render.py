@@ -14,9 +14,10 @@ from html import unescape
 from typing import Any
 
 from mjfim.output.html import escape
-from mjfim.output.report.page import Page, Panel, PlotGroup, Video
+from mjfim.output.report.page import Page, Panel, PlotGroup
 from mjfim.output.report.palette import palettes
 from mjfim.output.summary_parts import Emphasis, SummaryTable
+from mjfim.output.video import Video
 from mjfim.output.vocabulary import shown_word
 
 # Folder of the templates, beside this module.
@@ -34,7 +35,8 @@ CLASSES = {
 
 # The video of a report, and the sentence that stands there instead; the template writes both.
 VIDEO = re.compile(
-    r'<(?:video|img) class="robot" [^>]*src="data:([\w/.+-]+);base64,([\w+/=]+)"'
+    r'<(?:video|img) class="robot" width="(\d+)" height="(\d+)" [^>]*'
+    r'src="data:([\w/.+-]+);base64,([\w+/=]+)"'
     r'.*?<p class="note">(.*?)</p>',
     re.DOTALL,
 )
@@ -105,8 +107,14 @@ def video_in(html: str) -> Video | None:
     found = VIDEO.search(html)
     if found is None:
         return None
-    mime_type, content, caption = found.groups()
-    return Video(content=base64.b64decode(content), mime_type=mime_type, caption=unescape(caption))
+    width, height, media_type, content, caption = found.groups()
+    return Video(
+        data=base64.b64decode(content),
+        media_type=media_type,
+        caption=unescape(caption),
+        width=int(width),
+        height=int(height),
+    )
 
 
 def no_video_in(html: str) -> str:
