@@ -49,7 +49,9 @@ def check(
     design_file: OtherDesign = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="DIR", help="Folder for check.json and check.png."),
+        typer.Option(
+            "--output", "-o", metavar="DIR", help="Folder for check.json, report.html and pictures."
+        ),
     ] = None,
     as_json: AsJson = False,
     pictures: Pictures = PictureFormat.PNG,

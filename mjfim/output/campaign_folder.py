@@ -34,6 +34,8 @@ from mjfim.output.mjcf.write import write_identified
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import Pictures
 from mjfim.output.plots.style import format_with_uncertainty
+from mjfim.output.report import REPORT
+from mjfim.output.report.build import write_report
 from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound, Round
 from mjfim.records.design import Design
@@ -45,6 +47,7 @@ CAMPAIGN_FILES = (
     SETTINGS_FILE,
     "campaign.json",
     "campaign.npz",
+    REPORT,
     "campaign.png",
     *TABLE_FILES,
     IDENTIFIED,
@@ -258,6 +261,7 @@ class CampaignFolder:
         """
         campaign.save_archive(self.path)
         write_json(self.path / "campaign.json", self._summary(campaign, simulated=simulated))
+        run_optional(lambda: write_report(self.path, Campaign))
         if campaign.estimate is None:
             return ""
 

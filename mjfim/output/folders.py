@@ -59,8 +59,8 @@ DESIGN_FILES = (
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
 # Files that `mjfim check`, `mjfim robustness` and `mjfim export-sysid` may write.
-CHECK_FILES = ("check.json", "check.npz", "check.png", *TABLE_FILES)
-ROBUSTNESS_FILES = ("playback.json", "playback.npz", "playback.png", *TABLE_FILES)
+CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", *TABLE_FILES)
+ROBUSTNESS_FILES = ("playback.json", "playback.npz", REPORT, "playback.png", *TABLE_FILES)
 SYSID_FILES = ("comparison.json", "sysid_report.html")
 
 
@@ -93,7 +93,7 @@ def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
         parameters: Names of the parameters.
     """
     histograms = tuple(f"{histogram_name(name)}.png" for name in parameters)
-    return ("montecarlo.json", "montecarlo.npz", *histograms, *TABLE_FILES)
+    return ("montecarlo.json", "montecarlo.npz", REPORT, *histograms, *TABLE_FILES)
 
 
 def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
         methods: Keys of the baselines.
     """
     controls = tuple(_control_name(method) for method in dict.fromkeys((*methods, DESIGN)))
-    return ("compare.json", "compare.npz", "compare.png", *TABLE_FILES, *controls)
+    return ("compare.json", "compare.npz", REPORT, "compare.png", *TABLE_FILES, *controls)
 
 
 def find_rerun_file(source: Path) -> Path:
@@ -216,7 +216,7 @@ def _write_design_pictures(
 def write_check_folder(
     folder: Path, check: Check, picture_format: PictureFormat = PictureFormat.PNG
 ) -> None:
-    """Write check.json, check.npz and a figure of accuracies and correlations.
+    """Write check.json, check.npz, report.html and a figure of accuracies and correlations.
 
     Args:
         folder: Folder for the results.
@@ -225,6 +225,7 @@ def write_check_folder(
     """
     check.save(folder)
     write_tables(folder, check)
+    run_optional(lambda: write_report(folder, Check))
     run_optional(lambda: _write_figures(folder, check, picture_format))
 
 
@@ -234,7 +235,7 @@ def write_robustness_folder(
     seconds: float,
     picture_format: PictureFormat = PictureFormat.PNG,
 ) -> None:
-    """Write playback.json, playback.npz and a figure of limits, errors and coverage.
+    """Write playback.json, playback.npz, report.html and a figure of limits, errors and coverage.
 
     Args:
         folder: Folder for the results.
@@ -245,6 +246,7 @@ def write_robustness_folder(
     result.save_archive(folder)
     write_json(folder / "playback.json", {**result.summary(), "seconds": seconds})
     write_tables(folder, result)
+    run_optional(lambda: write_report(folder, Robustness))
     run_optional(lambda: _write_figures(folder, result, picture_format))
 
 
@@ -254,7 +256,7 @@ def write_comparison_folder(
     system: System,
     picture_format: PictureFormat = PictureFormat.PNG,
 ) -> None:
-    """Write compare.json, compare.npz, a figure, and the control of each method.
+    """Write compare.json, compare.npz, report.html, a figure, and the control of each method.
 
     An experiment can read each control as its `initial.control`.
 
@@ -271,6 +273,7 @@ def write_comparison_folder(
         if row.control is not None:
             archive.write_control(folder / _control_name(row.method), row.control, system)
     write_tables(folder, comparison)
+    run_optional(lambda: write_report(folder, Comparison))
     run_optional(lambda: _write_figures(folder, comparison, picture_format))
 
 
@@ -325,7 +328,7 @@ def _write_estimate_pictures(
 def write_study_folder(
     folder: Path, study: MonteCarloStudy, picture_format: PictureFormat = PictureFormat.PNG
 ) -> None:
-    """Write montecarlo.json, montecarlo.npz, a histogram per parameter, and the tables as a figure.
+    """Write montecarlo.json, montecarlo.npz, report.html, tables and a histogram per parameter.
 
     Args:
         folder: Folder for the results.
@@ -335,6 +338,7 @@ def write_study_folder(
     study.save(folder)
 
     write_tables(folder, study)
+    run_optional(lambda: write_report(folder, MonteCarloStudy))
     run_optional(lambda: _write_figures(folder, study, picture_format))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from mjfim.output.report.curves import packed, points_per_curve, thinned
 from mjfim.output.report.render import no_video_in, rendered, video_in
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
 from mjfim.output.video import Video
+from mjfim.records.campaign import CampaignStatus
 from mjfim.records.design import Design, LimitUsage, Status
 from mjfim.records.shown import ShownRecord
 from tests.support import results
@@ -30,14 +32,11 @@ HOSTILE = "<script>alert(1)</script>"
 # Largest size of a report [bytes].
 MAX_SIZE = 8_000_000
 
-# Result of every verb that has a report, by the name of the verb.
-MAKERS = {"design": results.design, "identify": results.estimate}
-
 
 @cache
 def record_of(verb: str) -> ShownRecord:
     """The made-up result of a verb."""
-    return MAKERS[verb]()
+    return results.MAKERS[verb]()
 
 
 @cache
@@ -68,7 +67,7 @@ def numbers(array: dict[str, str]) -> np.ndarray:
 # ---- the file
 
 
-@pytest.mark.parametrize("verb", MAKERS)
+@pytest.mark.parametrize("verb", results.MAKERS)
 def test_a_report_needs_no_other_file(verb: str) -> None:
     """The part around the plotting library names no address, and scripts and styles are inline."""
     html = html_of(verb)
@@ -80,7 +79,7 @@ def test_a_report_needs_no_other_file(verb: str) -> None:
     assert "default-src 'none'" in html
 
 
-@pytest.mark.parametrize("verb", MAKERS)
+@pytest.mark.parametrize("verb", results.MAKERS)
 def test_the_verdict_stands_above_the_sections(verb: str) -> None:
     """The first thing is the verdict; every section has an entry in the navigation."""
     html, page = html_of(verb), page_of(record_of(verb))
@@ -91,7 +90,7 @@ def test_the_verdict_stands_above_the_sections(verb: str) -> None:
     assert places == sorted(places)
 
 
-@pytest.mark.parametrize("verb", MAKERS)
+@pytest.mark.parametrize("verb", results.MAKERS)
 def test_every_plot_has_a_place_and_a_unit(verb: str) -> None:
     """The numbers of the places are those of the plots; titles name a unit in brackets."""
     html = html_of(verb)
@@ -102,7 +101,7 @@ def test_every_plot_has_a_place_and_a_unit(verb: str) -> None:
     assert all(re.search(r"\[.+\]", title) for title in titles), titles
 
 
-@pytest.mark.parametrize("verb", MAKERS)
+@pytest.mark.parametrize("verb", results.MAKERS)
 def test_every_colour_has_a_value_in_both_themes(verb: str) -> None:
     """A role without a colour would be drawn in black on a dark page."""
     html = html_of(verb)
@@ -113,10 +112,11 @@ def test_every_colour_has_a_value_in_both_themes(verb: str) -> None:
     assert set(data["palettes"]["light"]) == set(data["palettes"]["dark"])
 
 
-@pytest.mark.parametrize("verb", MAKERS)
+@pytest.mark.parametrize("verb", results.MAKERS)
 def test_names_of_others_are_escaped(verb: str) -> None:
     """A name with a script stays a text, in the page and in the data of the plots."""
-    record = MAKERS[verb](name=HOSTILE, parameters=(HOSTILE, "<img src=x>", "a & b"))
+    names = {"name": HOSTILE} if verb in ("design", "identify", "robustness") else {}
+    record = results.MAKERS[verb](parameters=(HOSTILE, "<img src=x>", "a & b"), **names)
     html = rendered(page_of(record), HOSTILE)
     assert HOSTILE not in html
     assert "<img src=x" not in html
@@ -191,6 +191,38 @@ def test_the_verdict_on_an_estimate(changes: dict[str, Any], level: Level, words
     estimate = results.estimate(**changes)
     assert verdict_of(estimate).level is level
     assert words in verdict_of(estimate).text
+
+
+@pytest.mark.parametrize(
+    ("verb", "changes", "level", "words"),
+    [
+        ("check", {}, Level.GOOD, "σ of 2 %"),
+        ("check", {"refused": ("too long",), "verdict": ("a b",)}, Level.DOUBTFUL, "A b."),
+        ("compare", {}, Level.GOOD, "The design is the best"),
+        ("montecarlo", {}, Level.GOOD, "scatter as predicted"),
+        ("robustness", {}, Level.DOUBTFUL, "of 20 robots keep all limits"),
+        ("campaign", {}, Level.GOOD, "Reached"),
+        ("campaign", {"status": CampaignStatus.INFEASIBLE}, Level.BAD, "No design keeps"),
+        ("campaign", {"status": CampaignStatus.WAITING, "rounds": ()}, Level.GOOD, "waits"),
+    ],
+)
+def test_the_verdict_on_a_study(
+    verb: str, changes: dict[str, Any], level: Level, words: str
+) -> None:
+    record = results.MAKERS[verb](**changes)
+    assert (verdict_of(record).level, words in verdict_of(record).text) == (level, True)
+    assert rendered(page_of(record))
+
+
+def test_fits_that_failed_or_scatter_too_much_put_a_study_in_doubt() -> None:
+    sets = results.study().sets
+    failed = {**sets, "final": replace(sets["final"], failed=3)}
+    assert "3 of 200 (designed)" in verdict_of(results.study(sets=failed)).text
+
+    wide = replace(sets["final"], efficiency_interval=np.tile([0.1, 0.2], (3, 1)))
+    verdict = verdict_of(results.study(sets={**sets, "final": wide}))
+    assert verdict.level is Level.DOUBTFUL
+    assert "the designed trajectory" in verdict.text
 
 
 def test_a_missing_term_is_the_first_next_step() -> None:

@@ -26,9 +26,6 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 # Width and height of the window [CSS pixels]: a laptop and a phone.
 WINDOWS = ((1280, 800), (390, 844))
 
-# Result of every verb that has a report, by the name of the verb.
-MAKERS = {"design": results.design, "identify": results.estimate}
-
 # Time after which the plots must stand [ms].
 PATIENCE = 120_000
 
@@ -100,12 +97,12 @@ def report_file(folder: Path, record: ShownRecord) -> Path:
     return path
 
 
-@pytest.mark.parametrize("verb", MAKERS)
+@pytest.mark.parametrize("verb", results.MAKERS)
 def test_every_plot_is_visible_in_every_window_and_theme(
     verb: str, browser: Any, tmp_path: Path
 ) -> None:
     """No message, no request, no horizontal scrolling of the page, and no empty plot."""
-    view = Viewed(browser, report_file(tmp_path, MAKERS[verb]()), WINDOWS[0], "light")
+    view = Viewed(browser, report_file(tmp_path, results.MAKERS[verb]()), WINDOWS[0], "light")
     view.page.eval_on_selector_all("details", "folds => folds.forEach(f => { f.open = true; })")
     view.page.wait_for_selector(".plot:not([data-drawn])", state="detached", timeout=PATIENCE)
 

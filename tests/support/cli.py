@@ -42,6 +42,7 @@ ESTIMATE = {*ESTIMATE_DATA, "report.html", "estimate.rrd"} | {
 STUDY = {
     "montecarlo.json",
     "montecarlo.npz",
+    "report.html",
     "histogram_m.png",
     "histogram_l.png",
     "histogram_c.png",

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.records.campaign import Campaign, CampaignStatus, Round
+from mjfim.records.check import Check, ConfoundedPair, ParameterCheck, SelfTest
+from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import (
     Design,
     Evaluation,
@@ -20,7 +23,9 @@ from mjfim.records.estimate import (
     Whiteness,
 )
 from mjfim.records.labels import Labels
+from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
+from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
 from mjfim.records.trajectory import Trajectory
 
 # Names of the parameters of all results.
@@ -176,3 +181,172 @@ def missing_term() -> MissingTerm:
         sigmas=12.0,
         share=0.3,
     )
+
+
+def check(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Check:
+    """A check of three parameters, of which the first two are confounded."""
+    rows = tuple(
+        ParameterCheck(
+            name=name,
+            unit=unit,
+            value=value,
+            nuisance=False,
+            size=value,
+            std=0.02 * value,
+            relative=0.02,
+            wanted=0.05 * value,
+            stated=False,
+            repetitions=1,
+            seconds=2.0,
+        )
+        for name, unit, value in zip(parameters, UNITS, THETA.tolist(), strict=True)
+    )
+    std = np.array([row.std for row in rows])
+    fields: dict[str, object] = {
+        "source": "the initial control",
+        "horizon": 2.0,
+        "rows": rows,
+        "wanted": parameters,
+        "information": np.linalg.inv(covariance(std)),
+        "eigenvalues": np.array([1.0, 2.0, 30.0]),
+        "correlation": covariance(np.ones(3)),
+        "confounded": (ConfoundedPair(first=parameters[0], second=parameters[1], correlation=0.8),),
+        "not_separable": (),
+        "not_excited": (),
+        "self_test": SelfTest(roughness=None, recursion=1e-8, slope=1e-6),
+        "verdict": ("every identifiable parameter reaches its wanted sigma",),
+    }
+    return Check(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+def comparison(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Comparison:
+    """A design that is better than one baseline, and one baseline that violates a limit."""
+    rows = tuple(
+        MethodResult(
+            method=method,
+            title=title,
+            outcome=outcome,
+            control=np.zeros((4, 1)),
+            cost=cost,
+            criterion=cost,
+            std=0.01 * cost * THETA,
+            min_eigenvalue=1.0 / cost,
+            worst_relative_std=0.01 * cost,
+            seconds=1.0,
+            steps=1000,
+            margins={"position": 0.1},
+            relative_margins={"position": 0.1},
+        )
+        for method, title, cost, outcome in (
+            ("chirp", "chirp", 2.0, MethodOutcome.INSIDE),
+            ("multisine", "multisine", 0.5, MethodOutcome.OUTSIDE),
+            (DESIGN, "mjfim's design", 1.0, MethodOutcome.INSIDE),
+        )
+    )
+    fields: dict[str, object] = {
+        "source": "study.toml",
+        "criterion": "E",
+        "nats": 0.0,
+        "parameters": parameters,
+        "units": UNITS,
+        "scale": THETA,
+        "nuisance": (),
+        "rows": rows,
+        "seconds": 1.0,
+        "steps": np.inf,
+        "seed": 0,
+        "weighted": False,
+    }
+    return Comparison(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+def trials(std: Array, seed: int) -> TrialStatistics:
+    """Estimates whose scatter is that of the bound."""
+    bound = covariance(std)
+    estimates = np.random.default_rng(seed).multivariate_normal(THETA, bound, size=200)
+    return TrialStatistics(
+        estimates=estimates,
+        mean=estimates.mean(axis=0),
+        covariance=np.cov(estimates.T),
+        crlb=bound,
+        efficiency=np.array([1.0, 0.95, 1.1]),
+        efficiency_interval=np.array([[0.8, 1.2], [0.75, 1.15], [0.9, 1.3]]),
+        trials=200,
+        failed=0,
+        seconds=1.0,
+    )
+
+
+def study(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> MonteCarloStudy:
+    """Trials along the initial and the designed trajectory."""
+    sets = {"initial": trials(0.1 * THETA, 0), "final": trials(0.01 * THETA, 1)}
+    fields: dict[str, object] = {
+        "parameters": parameters,
+        "theta": THETA,
+        "measure_rate": 100.0,
+        "sets": sets,
+        "information": {name: np.linalg.inv(found.crlb) for name, found in sets.items()},
+    }
+    return MonteCarloStudy(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+def robustness(name: str = "hinge", parameters: tuple[str, ...] = PARAMETERS) -> Robustness:
+    """Twenty robots, some of which exceed a limit."""
+    random = np.random.default_rng(0)
+    z = random.normal(size=(20, 3))
+    limits = tuple(
+        AssessedLimit(kind=kind, name=name, lower=-1.0, upper=1.0, scale=1.0)
+        for kind in ("position", "velocity")
+    )
+    return Robustness(
+        conditions=RobotConditions(),
+        names=parameters,
+        units=UNITS,
+        limits=limits,
+        wrong=0.2 * THETA,
+        z=z,
+        error=0.01 * z * THETA,
+        std=np.tile(0.01 * THETA, (20, 1)),
+        predicted=0.01 * THETA,
+        joint=(19, 19),
+        margins=np.array([0.1, 0.4]) + 0.1 * random.normal(size=(20, 2)),
+        planned=np.array([0.1, 0.4]),
+        fit=1.0,
+        misfits=0,
+        restarted=0,
+        troubles={},
+    )
+
+
+def campaign(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Campaign:
+    """Two rounds after which every target is reached."""
+    rounds = tuple(
+        Round(
+            number=number,
+            theta=1.2 * THETA,
+            predicted=0.02 / number * THETA,
+            control=np.zeros((200, 1)),
+            recordings=estimate().recordings,
+            estimate=estimate(parameters=parameters, std=0.02 / number * THETA),
+        )
+        for number in (1, 2)
+    )
+    fields: dict[str, object] = {
+        "parameters": parameters,
+        "wanted": 0.015 * THETA,
+        "rounds": rounds,
+        "status": CampaignStatus.REACHED,
+    }
+    return Campaign(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+# Function that makes the result of each verb.
+MAKERS = {
+    "design": design,
+    "identify": estimate,
+    "check": check,
+    "compare": comparison,
+    "montecarlo": study,
+    "robustness": robustness,
+    "campaign": campaign,
+}

@@ -8,18 +8,36 @@ from pathlib import Path, PurePath
 from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError, RecordingError, first_ones, listed
 from mjfim.output.report import REPORT
+from mjfim.output.report.campaign import campaign_page
+from mjfim.output.report.check import check_page
+from mjfim.output.report.comparison import comparison_page
 from mjfim.output.report.design import design_page
 from mjfim.output.report.estimate import estimate_page
+from mjfim.output.report.monte_carlo import study_page
 from mjfim.output.report.page import Page
 from mjfim.output.report.render import no_video_in, rendered, video_in
+from mjfim.output.report.robustness import robustness_page
 from mjfim.output.video import Video
+from mjfim.records.campaign import Campaign
+from mjfim.records.check import Check
+from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json
 from mjfim.records.shown import ShownRecord
 
 # Kinds of records that have a report.
-KINDS: tuple[type[ShownRecord], ...] = (Design, Estimate)
+KINDS: tuple[type[ShownRecord], ...] = (
+    Campaign,
+    Design,
+    Estimate,
+    Check,
+    MonteCarloStudy,
+    Comparison,
+    Robustness,
+)
 
 
 @singledispatch
@@ -37,6 +55,11 @@ def page_of(record: ShownRecord) -> Page:
 
 page_of.register(Design, design_page)
 page_of.register(Estimate, estimate_page)
+page_of.register(Check, check_page)
+page_of.register(MonteCarloStudy, study_page)
+page_of.register(Comparison, comparison_page)
+page_of.register(Robustness, robustness_page)
+page_of.register(Campaign, campaign_page)
 
 
 def newest_kind(folder: Path) -> type[ShownRecord]:
@@ -115,4 +138,6 @@ def _name(folder: Path, record: ShownRecord) -> str:
             experiment = None
         if isinstance(experiment, str):
             return PurePath(experiment).stem
+    if isinstance(record, Comparison):
+        return PurePath(record.source).stem
     return folder.resolve().name

@@ -24,6 +24,12 @@ DISPLAY_PRECISION = 1e-5
 # Decades of a logarithmic axis below which values between the powers of ten have labels, too.
 SHORT_LOG_AXIS = 2.5
 
+# Decades below which an axis is not logarithmic.
+SHORTEST_LOG_AXIS = 0.75
+
+# Power of ten below which tick labels are written without it.
+MAX_PLAIN_POWER = 4.0
+
 # Characters to which names are shortened on an axis with names.
 AXIS_NAME_WIDTH = 22
 
@@ -232,15 +238,23 @@ def log_axis(title: str, values: Array, *, room: tuple[float, float] = (0.0, 0.0
             plotting library chooses its ends.
     """
     usable = values[np.isfinite(values) & (values > 0.0)]
-    low, high = (
-        (float(v) for v in np.log10([usable.min(), usable.max()])) if usable.size else (0, 1)
-    )
-    span = high - low + sum(room)
+    if not usable.size:
+        return axis(title)
+
+    # A short range has more labels on a linear axis.
+    low, high = (float(value) for value in np.log10([usable.min(), usable.max()]))
+    low, high = low - room[0], high + room[1]
+    span = high - low
+    if span < SHORTEST_LOG_AXIS:
+        return axis(title)
+
     settings: Plotly = {"type": "log", "dtick": max(1, int(np.ceil(span / 6.0)))}
     if span < SHORT_LOG_AXIS:
-        settings = {"type": "log", "dtick": "D2", "tickformat": "~g", "minorloglabels": "complete"}
+        settings.update(dtick="D2", minorloglabels="complete")
+    if max(abs(low), abs(high)) < MAX_PLAIN_POWER:
+        settings["tickformat"] = "~g"
     if any(room):
-        settings["range"] = [low - room[0], high + room[1]]
+        settings["range"] = [low, high]
     return axis(title, **settings)
 
 
@@ -373,4 +387,5 @@ def correlation_panel(correlation: Array, names: Sequence[str], title: str) -> P
         traces=[trace],
         layout={"xaxis": columns, "yaxis": rows, "hovermode": "closest"},
         height=rows_height(max(count, 4), CELL_ROW),
+        narrow=True,
     )

@@ -297,6 +297,8 @@ def _history_plots(design: Design) -> PlotGroup:
         panels.append(_history_panel(title, iterations, margins, logarithmic=False))
 
     note = f"{design.status.value[:1].upper()}{design.status.value[1:]}."
+    if history and not np.isclose(history[0].cost, design.initial.cost, rtol=1e-9, atol=0.0):
+        note += f" The search did not begin at the initial control, but at {design.found_by}."
     if any(row.mu for row in history):
         note += " With limits, the slope is that of log J plus the barrier."
     return PlotGroup(title="Trace of the search", panels=panels, note=note)

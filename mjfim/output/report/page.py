@@ -41,6 +41,7 @@ class Panel:
         height: Height [CSS pixels].
         remark: A few words beside the title; may be empty.
         wide: True where the plot takes the whole width.
+        narrow: True where the plot never takes more than half of the width.
         linked: Plots with the same word here show the same range of the horizontal axis.
         keys: Entries of a legend of this plot alone.
     """
@@ -51,6 +52,7 @@ class Panel:
     height: int = 230
     remark: str = ""
     wide: bool = False
+    narrow: bool = False
     linked: str = ""
     keys: Sequence[Key] = ()
 

@@ -60,7 +60,7 @@ SERIES_DARK = (
 
 # Colours from -1 over 0 to 1.
 DIVERGING_LIGHT = ((0.0, "#2166ac"), (0.5, "#f7f7f7"), (1.0, "#b2182b"))
-DIVERGING_DARK = ((0.0, "#4a9be0"), (0.5, "#262b31"), (1.0, "#e8604c"))
+DIVERGING_DARK = ((0.0, "#2a73b5"), (0.5, "#262b31"), (1.0, "#c2412f"))
 
 
 def palettes() -> dict[str, dict[str, Any]]:
