@@ -38,6 +38,7 @@ def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
         "check.json",
         "check.npz",
         "check.png",
+        "report.html",
         "tables.md",
         "tables.tex",
         MANIFEST,
