@@ -11,7 +11,6 @@ from mjfim.output.report.curves import axis, correlation_panel, curve, dots, lev
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
 from mjfim.output.summaries.campaign import describe_campaign
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
-from mjfim.output.summary_parts import Paragraph
 from mjfim.output.vocabulary import IDENTIFIED, INITIAL, NOMINAL
 from mjfim.records.campaign import Campaign
 
@@ -39,9 +38,8 @@ def campaign_page(campaign: Campaign) -> Page:
         parameters = CampaignParameters.recorded(campaign)
         summary = describe_campaign(campaign, parameters)
 
-        # The status is the verdict, which stands at the top.
-        parts = [part for part in summary.parts if not isinstance(part, Paragraph)]
-        sections.append(Section(title="Estimates", parts=[*parts, *_last_correlation(campaign)]))
+        estimates = [*summary.parts, *_last_correlation(campaign)]
+        sections.append(Section(title="Estimates", parts=estimates))
         rounds = [_std_plots(campaign, parameters), _estimate_plots(campaign, parameters)]
         sections.append(Section(title="Rounds", parts=rounds))
         last = campaign.rounds[-1].estimate

@@ -32,14 +32,12 @@ def check_page(check: Check) -> Page:
     Args:
         check: The check.
     """
-    # The verdict stands at the top already.
-    parts = [
-        part
-        for part in describe_check(check).parts
-        if not (isinstance(part, Listing) and part.title == "Verdict")
-    ]
-    remarks = _remarks(check)
-    accuracy = [parts[0], *([remarks] if remarks else []), *_accuracy_plots(check), *parts[1:]]
+    # The findings stand in full at the top, or below the table.
+    summary = describe_check(check)
+    table = summary.table("accuracy")
+    others = [part for part in summary.parts if part is not table and not _is_verdict(part)]
+    findings = [] if not check.ok else [Listing(title="", items=_sentences(check.verdict))]
+    accuracy = [table, *findings, *_accuracy_plots(check), *others]
     sections = [Section(title="Accuracy", parts=accuracy)]
     if check.violations:
         sections.append(Section(title="Limits", parts=[_violations(check)]))
@@ -65,11 +63,9 @@ def _sentences(verdict: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{sentence[:1].upper()}{sentence[1:]}." for sentence in verdict)
 
 
-def _remarks(check: Check) -> Listing | None:
-    """Return the sentences about an experiment without fault; None for one with a fault."""
-    if not check.ok or not check.verdict:
-        return None
-    return Listing(title="", items=_sentences(check.verdict))
+def _is_verdict(part: Part) -> bool:
+    """Whether a part of the summary is the list of findings."""
+    return isinstance(part, Listing) and part.title == "Further findings"
 
 
 def _accuracy_plots(check: Check) -> Iterator[Part | PlotGroup]:

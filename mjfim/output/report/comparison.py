@@ -42,8 +42,13 @@ def comparison_page(comparison: Comparison) -> Page:
     summary = describe_comparison(comparison)
 
     # The verdict stands at the top already.
-    parts = [part for part in summary.parts if getattr(part, "text", "") not in comparison.verdict]
-    sections = [Section(title="Methods", parts=[parts[0], _method_plots(comparison), *parts[1:]])]
+    table = summary.table("methods")
+    others = [
+        part
+        for part in summary.parts
+        if part is not table and getattr(part, "text", "") not in comparison.verdict
+    ]
+    sections = [Section(title="Methods", parts=[table, _method_plots(comparison), *others])]
     facts = {
         "criterion": comparison.criterion,
         "methods": str(len(comparison.rows)),

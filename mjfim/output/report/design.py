@@ -58,7 +58,12 @@ def design_page(design: Design) -> Page:
 
     # Tables of limits and of the search stand with their plots.
     elsewhere = {"limits", "eigenvalues", "starts"}
-    table, *others = [part for part in summary.parts if getattr(part, "key", "") not in elsewhere]
+    table = summary.table("accuracy")
+    others = [
+        part
+        for part in summary.parts
+        if part is not table and getattr(part, "key", "") not in elsewhere
+    ]
     accuracy = [table, *_accuracy_plots(design, labels), *others]
     sections = [
         Section(title="Accuracy", parts=accuracy),

@@ -94,8 +94,8 @@ def estimate_page(estimate: Estimate) -> Page:
 def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | PlotGroup]:
     """Yield the table of the estimates, their plots, and the sentences of the summary."""
     elsewhere = {"predictions", "prediction details", "residuals"}
-    tables = [part for part in summary.parts if getattr(part, "key", "") not in elsewhere]
-    yield tables[0]
+    table = summary.table("estimates")
+    yield table
 
     names = list(estimate.parameters)
     panels = [_interval_panel(estimate, names)]
@@ -111,7 +111,9 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
         "disagree. A guess of 0 has no relative difference; see the table."
     )
     yield PlotGroup(title="", panels=panels, keys=keys, note=note)
-    yield from tables[1:]
+    for part in summary.parts:
+        if part is not table and getattr(part, "key", "") not in elsewhere:
+            yield part
 
 
 def _interval_panel(estimate: Estimate, names: Sequence[str]) -> Panel:

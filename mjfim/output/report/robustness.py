@@ -14,9 +14,9 @@ from mjfim.output.report.curves import (
     rows_of_bars,
 )
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
-from mjfim.output.summaries.robustness import describe_robustness
+from mjfim.output.summaries.robustness import describe_robustness, robustness_sentences
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
-from mjfim.output.summary_parts import Listing, Paragraph, Part
+from mjfim.output.summary_parts import Listing, Part
 from mjfim.output.vocabulary import DESIGNED, INITIAL, MEASURED
 from mjfim.records.robustness import (
     CONFIDENCE,
@@ -40,8 +40,8 @@ def robustness_page(result: Robustness) -> Page:
         result: The study.
     """
     summary = describe_robustness(result)
-    words = tuple(part.text for part in summary.parts if isinstance(part, Paragraph))
-    sections = [Section(title="Conclusions", parts=[Listing(title="", items=words)])]
+    conclusions = Listing(title="", items=tuple(robustness_sentences(result)))
+    sections = [Section(title="Conclusions", parts=[conclusions])]
     if result.limits:
         sections.append(
             Section(title="Limits", parts=[summary.table("limits"), _limit_plot(result)])
