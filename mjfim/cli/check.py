@@ -33,7 +33,7 @@ from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import CHECK_FILES
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.summaries.check import describe_check
+from mjfim.output.presentation import describe
 from mjfim.recordings.read import read_recording, recording_paths
 
 
@@ -88,7 +88,7 @@ def check(
     with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
 
-    print_result(as_json, result.summary(), describe_check(result), verbose=verbose)
+    print_result(as_json, result.summary(), describe(result), verbose=verbose)
     if output is not None:
         with writing(output) as results:
             results.write_check_folder(output, result, pictures)

@@ -30,7 +30,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.input_files import input_files
 from mjfim.output.folders import comparison_files
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.summaries.comparison import describe_comparison
+from mjfim.output.presentation import describe
 from mjfim.studies.baselines.methods import METHODS
 from mjfim.studies.compare import chosen_methods, compare_task
 
@@ -76,7 +76,7 @@ def compare(
 
     if not result.rows:
         raise NoResultError
-    print_result(as_json, result.summary(), describe_comparison(result), verbose=verbose)
+    print_result(as_json, result.summary(), describe(result), verbose=verbose)
     with writing(output) as results:
         results.write_comparison_folder(output, result, task.system, pictures)
     say_written(output)

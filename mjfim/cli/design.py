@@ -44,7 +44,7 @@ from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import MAX_STARTS
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.summaries.design import describe_design
+from mjfim.output.presentation import describe
 from mjfim.records.design import Design
 from mjfim.records.events import Callback
 
@@ -123,7 +123,7 @@ def design(
     values = result.summary()
     if found is not None:
         values["shortest"] = found.summary()
-    summary = describe_design(result, task.system.units)
+    summary = describe(result)
     print_result(as_json, values, summary, verbose=verbose)
     with writing(output) as results:
         results.write_design_folder(output, result, task.system, pictures)

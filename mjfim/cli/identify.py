@@ -35,7 +35,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.output.folders import estimate_files, parts_of_identified
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.summaries.estimate import describe_estimate
+from mjfim.output.presentation import describe
 from mjfim.output.summaries.logs import describe_logs
 from mjfim.recordings.read import read_log, recording_paths
 
@@ -94,7 +94,7 @@ def identify(
             callback=show,
         )
 
-    summary = describe_estimate(result)
+    summary = describe(result)
     if verbose:
         logs_read = describe_logs([log.summary for log in (*fitted, *predicted)])
         summary = replace(summary, parts=(*summary.parts, *logs_read.parts))

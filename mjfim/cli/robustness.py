@@ -34,7 +34,7 @@ from mjfim.model.limited_elements import KINDS as LIMIT_KINDS
 from mjfim.output.archive import write_design
 from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.summaries.robustness import describe_robustness
+from mjfim.output.presentation import describe
 from mjfim.output.text import render
 from mjfim.parallel import cores
 from mjfim.records.robustness import MAX_NOISE, MAX_WRONG, RobotConditions
@@ -146,7 +146,7 @@ def robustness(
         )
     seconds = time.perf_counter() - begun
 
-    out.print(render(describe_robustness(result), verbose=verbose))
+    out.print(render(describe(result), verbose=verbose))
     with writing(output) as results:
         results.write_robustness_folder(output, result, seconds, pictures)
     say_written(output, f" ({result.runs} runs in {seconds:.0f} s)")

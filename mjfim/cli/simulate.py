@@ -40,7 +40,7 @@ from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import study_files
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.summaries.monte_carlo import describe_study
+from mjfim.output.presentation import describe
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
 
@@ -128,7 +128,7 @@ def montecarlo(
 
     if not study.sets:
         raise NoResultError
-    summary = describe_study(study, system.units)
+    summary = describe(study)
     print_result(as_json, study.summary(), summary, verbose=verbose)
     with writing(output) as results:
         results.write_study_folder(output, study, pictures)

@@ -99,7 +99,7 @@ def test_design_that_stops_at_its_budget(tmp_path: Path, lines: dict[str, str]) 
     path = write_experiment(tmp_path, tolerance="1e-12", **lines)
     result = run("design", path, "-o", tmp_path / "out")
     assert result.exit_code == 0
-    assert "stopped at its budget" in result.stdout
+    assert "Stopped at its budget" in result.stdout
     assert "stopped at its budget" in result.stderr
 
 

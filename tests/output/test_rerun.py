@@ -316,7 +316,7 @@ class TestDesign:
 
     def test_summary_holds_outcome_accuracy_warnings_and_starts(self, file: Path) -> None:
         text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
-        assert "stopped at its budget (max_iterations" in text
+        assert "Stopped at its budget (max_iterations" in text
         assert "| mass | 2 | 0.5 | 25 % | 0.0312 | 1.6 % | ÷ 16.0 |" in text
         assert "Limits are violated: position" in text
         assert "nearly confounded" in text

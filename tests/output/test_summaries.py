@@ -18,7 +18,7 @@ from mjfim.output.summaries.design import describe_design
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summaries.monte_carlo import describe_study
 from mjfim.output.summaries.widths import shortened
-from mjfim.output.summary_parts import Name, Quantity, Summary
+from mjfim.output.summary_parts import Name, Quantity, Summary, capitalised
 from mjfim.output.text import render
 from mjfim.records.design import CombinationAccuracy, Design
 from mjfim.records.estimate import Estimate
@@ -85,7 +85,7 @@ def test_the_terminal_and_markdown_show_the_same_numbers(task: DesignTask, desig
             assert column.detail or all(text in terminal for text in shown)
     assert "Eigenvalues of the Fisher information" in markdown
     assert "Eigenvalues of the Fisher information" not in terminal
-    assert design.status.value in terminal
+    assert capitalised(design.status.value) in terminal
 
 
 def test_an_estimate_names_units_bounds_and_warnings(estimate: Estimate) -> None:

@@ -60,7 +60,6 @@ def describe_check(check: Check) -> Summary:
         title=f"Check of {check.source}",
         outcome=check.verdict[0] if check.verdict else "",
         parts=tuple(parts),
-        emphasis=Emphasis.STRONG if check.ok else Emphasis.STRONG_WARNING,
     )
 
 

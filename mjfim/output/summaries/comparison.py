@@ -47,7 +47,6 @@ def describe_comparison(comparison: Comparison) -> Summary:
         title=f"{comparison.source}: each method with {budget_in_words(comparison)}",
         outcome=comparison.verdict[0],
         parts=tuple(parts),
-        emphasis=Emphasis.STRONG if comparison.ok else Emphasis.STRONG_WARNING,
     )
 
 

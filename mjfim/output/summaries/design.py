@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from mjfim.errors import listed
 from mjfim.output.summaries.accuracy import (
     BEST_CASE,
     accuracy_table,
-    improvement,
     size_sentence,
 )
 from mjfim.output.summary_parts import (
@@ -93,29 +90,10 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
     parts.append(eigenvalue_table(design))
     return Summary(
         title="Designed experiment",
-        outcome=f"{_gain_sentence(design)}{design.status.value}",
+        outcome=design.status.value,
         parts=tuple(parts),
         warnings=design.warnings,
-        emphasis=Emphasis.STRONG if design.sound else Emphasis.STRONG_WARNING,
     )
-
-
-def _gain_sentence(design: Design) -> str:
-    """Return how a design changes the standard deviations; empty where nothing is comparable."""
-    changes = []
-    for before, after in zip(design.initial.std, design.final.std, strict=True):
-        if np.isfinite(before) and np.isfinite(after) and min(before, after) > 0.0:
-            changes.append(float(before / after))
-    if not changes:
-        return ""
-
-    least, most = min(changes), max(changes)
-    if least < 1.0:
-        best, worst = improvement(most, 1.0), improvement(least, 1.0)
-        return f"σ of the parameters changes by {best} to {worst}; "
-    if f"{least:.1f}" == f"{most:.1f}":
-        return f"σ of the parameters falls by a factor of {most:.1f}; "
-    return f"σ of the parameters falls by factors of {least:.1f} to {most:.1f}; "
 
 
 def eigenvalue_table(design: Design) -> SummaryTable:

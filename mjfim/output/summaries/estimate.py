@@ -73,13 +73,11 @@ def describe_estimate(estimate: Estimate) -> Summary:
     parts.append(
         Paragraph(text=f"{estimate.iterations} iterations, {estimate.seconds:.1f} s", detail=True)
     )
-    doubtful = estimate.misfit or not estimate.success
     return Summary(
         title="Estimated parameters",
-        outcome=f"{_fit_sentence(estimate)}; {estimate.status}",
+        outcome=f"{estimate.status}; {_fit_sentence(estimate)}",
         parts=tuple(parts),
         warnings=estimate.warnings,
-        emphasis=Emphasis.STRONG_WARNING if doubtful else Emphasis.STRONG,
     )
 
 
@@ -90,10 +88,7 @@ def _fit_sentence(estimate: Estimate) -> str:
         if estimate.misfit
         else "consistent with noise"
     )
-    return (
-        f"residuals {verdict} (χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof:,} "
-        "degrees of freedom)"
-    )
+    return f"residuals {verdict} (χ²/dof = {estimate.chi2 / estimate.dof:.3f})"
 
 
 def _estimate_table(estimate: Estimate) -> SummaryTable:

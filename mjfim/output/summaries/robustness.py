@@ -36,7 +36,6 @@ def describe_robustness(result: Robustness) -> Summary:
         title="A design played on robots that differ from the model",
         outcome=first,
         parts=(findings, *(table for table in tables if table.rows)),
-        emphasis=Emphasis.STRONG if result.ok else Emphasis.STRONG_WARNING,
     )
 
 

@@ -188,13 +188,18 @@ def _worst_estimate(estimate: Estimate) -> str:
     half_widths = 0.5 * (estimate.interval[:, 1] - estimate.interval[:, 0])
     sizes = np.abs(estimate.theta)
     shares = half_widths / np.where(sizes > 0.0, sizes, np.nan)
-    if not np.isfinite(shares).any():
+
+    # A share of a value that may be zero says nothing.
+    known = np.isfinite(shares) & (shares < 1.0)
+    uncertain = [estimate.parameters[j] for j in np.flatnonzero(~known).tolist()]
+    if not known.any():
         return ""
 
-    worst = int(np.nanargmax(np.where(np.isfinite(shares), shares, np.nan)))
+    worst = int(np.argmax(np.where(known, shares, -np.inf)))
     share = relative(float(half_widths[worst]), float(sizes[worst]))
+    others = f" except {first_ones(uncertain)}, whose interval holds zero," if uncertain else ""
     return (
-        f", and every parameter is known to ± {share} or better (95 % interval, widest for "
+        f", and every parameter{others} is known to ± {share} or better (95 % interval, widest for "
         f"{estimate.parameters[worst]})"
     )
 
