@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from importlib.resources import as_file, files
 from typing import Any
 
-import matplotlib
 import numpy as np
 from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
@@ -85,4 +84,5 @@ class FrameLayout:
 
 def _font(name: str, size: int) -> ImageFont.FreeTypeFont:
     """A font that comes with matplotlib, so that it is the same on every computer."""
-    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name, size)
+    with as_file(files("matplotlib") / "mpl-data" / "fonts" / "ttf" / name) as file:
+        return ImageFont.truetype(file, size)
