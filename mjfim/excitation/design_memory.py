@@ -67,9 +67,12 @@ def _rollouts(system: System) -> int:
 def _moved_samples(system: System) -> int:
     """Numbers per sample of the steps from moved states and controls."""
     state, nu = system.nominal_initial_state.size, len(system.controls)
-    batch = 2 * (1 + state + system.space.nv + nu)
-    each = 5 * state + 2 * nu + 2 * _sensors(system) + batch + _observed(system)
-    return MOVES * (system.space.nx + nu) * each
+    moves = MOVES * (system.space.nx + nu)
+
+    # The numbers of a step itself, and its rows in the batch of rollouts.
+    of_step = 5 * state + 2 * nu + 2 * _sensors(system) + _observed(system)
+    in_batch = 2 * (1 + state + system.space.nv + nu)
+    return moves * (of_step + in_batch)
 
 
 def _held(system: System) -> int:

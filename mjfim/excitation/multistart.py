@@ -255,9 +255,11 @@ class Multistart:
     def _steered_begins(self, results: Sequence[RunResult]) -> list[Array]:
         """Controls, (N, nu) each, from which the limits may be reached without the cost."""
         task = self.fine.task
-        held = [np.broadcast_to(centre, task.control.shape) for centre in reversed(task.centres)]
-        found = [result.control for result in results if result.control is not None]
-        return [np.array(control) for control in (*held, *found[:1])]
+        begins = [np.tile(centre, (task.samples, 1)) for centre in reversed(task.centres)]
+        for result in results:
+            if result.control is not None:
+                return [*begins, np.array(result.control)]
+        return begins
 
     def _continue_inside(
         self, result: RunResult, control: Array

@@ -215,14 +215,23 @@ def _add_joint(
         )
 
     if kind in (BALL, FREE):
-        turning = v + 3 if kind == FREE else v
-        speed = LimitedElement(index=turning, count=3, unit=per_second(ANGLE), size=1.0 / time)
-        kinds["angular_velocity"][name] = speed
-        for i, part in enumerate(ROTATION_VECTOR):
-            about = replace(speed, index=turning + i, count=1, is_part=True)
-            kinds["angular_velocity"][f"{name}.{part}"] = about
-        address = quaternion_address(model, joint)
-        kinds["tilt"][name] = LimitedElement(index=address, count=TILT_COMPONENTS, unit=ANGLE)
+        _add_rotation(found, model, joint, name, time)
+
+
+def _add_rotation(found: LimitedElements, model: Any, joint: int, name: str, time: float) -> None:
+    """Enter the angular velocity and the tilt of a ball joint or a free joint."""
+    kinds = found.by_kind
+    is_free = int(model.jnt_type[joint]) == FREE
+    first = int(model.jnt_dofadr[joint]) + (3 if is_free else 0)
+
+    speed = LimitedElement(index=first, count=3, unit=per_second(ANGLE), size=1.0 / time)
+    kinds["angular_velocity"][name] = speed
+    for i, part in enumerate(ROTATION_VECTOR):
+        about = replace(speed, index=first + i, count=1, is_part=True)
+        kinds["angular_velocity"][f"{name}.{part}"] = about
+
+    address = quaternion_address(model, joint)
+    kinds["tilt"][name] = LimitedElement(index=address, count=TILT_COMPONENTS, unit=ANGLE)
 
 
 def _add_controls(

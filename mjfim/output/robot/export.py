@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.output.robot.joint_trajectory import (
@@ -14,14 +13,11 @@ from mjfim.output.robot.joint_trajectory import (
     trajectory_remarks,
     write_trajectory_yaml,
 )
-from mjfim.output.robot.lerobot_dataset import (
-    DATASET_FILES,
-    unit_of,
-    write_lerobot_dataset,
-)
+from mjfim.output.robot.lerobot_dataset import ANGLE_UNITS, DATASET_FILES, write_lerobot_dataset
+from mjfim.output.robot.options import chosen
 from mjfim.output.robot.plan import RobotPlan
 from mjfim.output.robot.player_script import write_player
-from mjfim.output.robot.ros2_bag import bag_files, storage_of, write_bag
+from mjfim.output.robot.ros2_bag import ENDINGS, bag_files, write_bag
 from mjfim.records.design import Design
 
 # Programs for which a design can be exported.
@@ -53,10 +49,8 @@ def target_of(text: str) -> Target:
     Raises:
         ExperimentError: There is no such target.
     """
-    found: Target | None = next((each for each in get_args(Target) if each == text), None)
-    if found is None:
-        raise ExperimentError(f"--to: {unknown('target', text, get_args(Target))}")
-    return found
+    targets: tuple[Target, ...] = get_args(Target)
+    return chosen("--to", "target", text, targets)
 
 
 def is_folder(target: Target) -> bool:
@@ -135,10 +129,11 @@ def write_export(plan: RobotPlan, path: Path, target: Target, options: ExportOpt
         return [f"`python {path}` says what the design needs, and how to play it"]
 
     if target == "lerobot":
-        write_lerobot_dataset(path, plan, unit_of(options.unit))
+        unit = chosen("--unit", "unit", options.unit, ANGLE_UNITS)
+        write_lerobot_dataset(path, plan, unit)
         return []
 
-    storage = storage_of(options.storage)
+    storage = chosen("--storage", "format", options.storage, ENDINGS)
     trajectory = joint_trajectory(plan, options.positions)
     if target == "ros2":
         write_trajectory_yaml(path, trajectory, plan.name)

@@ -17,7 +17,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError
+from mjfim.output.robot.options import chosen
 from mjfim.output.robot.plan import Drive, DriveKind, RobotPlan
 
 # What the positions of a trajectory are: the planned motion, or the commands of position servos.
@@ -217,15 +218,14 @@ def _content(positions: str | None, are_servos: bool) -> Positions:
     if positions is None:
         return "command" if are_servos else "motion"
 
-    content = next((each for each in get_args(Positions) if each == positions), None)
-    if content is None:
-        raise ExperimentError(f"--positions: {unknown('kind', positions, get_args(Positions))}")
+    kinds: tuple[Positions, ...] = get_args(Positions)
+    content = chosen("--positions", "kind", positions, kinds)
     if content == "command" and not are_servos:
         raise ExperimentError(
             "--positions command: not every driven joint has one position servo, whose control is "
             "a position; leave the option out, or state motion"
         )
-    return "command" if content == "command" else "motion"
+    return content
 
 
 def _is_servo(drives: Sequence[Drive]) -> bool:

@@ -18,13 +18,14 @@ import pyarrow.parquet
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError
 from mjfim.model.coordinates import state_components
 from mjfim.output.robot.plan import Drive, DriveKind, RobotPlan
 from mjfim.records.serialization import write_json
 
 # Units of angles in a dataset.
 AngleUnit = Literal["rad", "deg"]
+ANGLE_UNITS: tuple[AngleUnit, ...] = get_args(AngleUnit)
 
 # Version of the format.
 VERSION = "v3.0"
@@ -63,21 +64,6 @@ FORMAT_LIMITS = {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files
 
 # Largest relative deviation of the rate from a whole number of frames per second.
 RATE_TOLERANCE = 1e-6
-
-
-def unit_of(text: str) -> AngleUnit:
-    """Return the unit of angles that a text names.
-
-    Args:
-        text: Name of the unit.
-
-    Raises:
-        ExperimentError: There is no such unit.
-    """
-    found: AngleUnit | None = next((each for each in get_args(AngleUnit) if each == text), None)
-    if found is None:
-        raise ExperimentError(f"--unit: {unknown('unit', text, get_args(AngleUnit))}")
-    return found
 
 
 def write_lerobot_dataset(folder: Path, plan: RobotPlan, unit: AngleUnit = "rad") -> None:
@@ -145,9 +131,14 @@ def _states(plan: RobotPlan, factor: float) -> tuple[list[str], Array]:
 def _frames(plan: RobotPlan, fps: int) -> dict[str, np.ndarray]:
     """(M+1,) values of the columns that every dataset has."""
     index = np.arange(len(plan.playback.t))
-    values: dict[str, np.ndarray] = dict.fromkeys(DEFAULT_COLUMNS, np.zeros_like(index))
-    values |= {"timestamp": index / fps, "frame_index": index, "index": index}
-    return {name: values[name].astype(kind) for name, kind in DEFAULT_COLUMNS.items()}
+    values = {"timestamp": index / fps, "frame_index": index, "index": index}
+
+    # The other columns number episodes and tasks, of which there is one.
+    zeros = np.zeros_like(index)
+    return {
+        name: np.asarray(values.get(name, zeros), dtype=kind)
+        for name, kind in DEFAULT_COLUMNS.items()
+    }
 
 
 def _column(values: np.ndarray) -> Any:

@@ -33,7 +33,7 @@ import runpy
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
@@ -353,29 +353,23 @@ def play(
     report, log = Report(), Log(controls=plan.controls)
 
     with StopRequest() as request:
-        begin = clock()
         try:
-            row = 0
-            while row < len(plan.ctrl) and not request.wanted:
-                now = _wait(begin + plan.t[row], clock, sleep) - begin
+            for row, now in _rows_in_time(plan, report, clock, sleep):
+                if request.wanted:
+                    report.interrupted = True
+                    break
+
                 measured = plan.measured(read_state())
+                if row == len(plan.ctrl):
+                    log.rows.append((now, np.full(len(plan.controls), math.nan), measured))
+                    break
+
                 wanted = plan.control(row, measured, feedback)
                 control = np.clip(wanted, plan.lower, plan.upper)
                 send_control(control)
                 log.rows.append((now, control, measured))
-
                 report.rows += 1
                 report.clipped += int((control != wanted).any())
-                report.latest = max(report.latest, now - plan.t[row])
-                due = int((clock() - begin) / plan.period)
-                report.skipped += max(due - row - 1, 0)
-                row = max(row + 1, due)
-
-            report.interrupted = request.wanted
-            if not request.wanted:
-                now = _wait(begin + plan.t[-1], clock, sleep) - begin
-                nothing = np.full(len(plan.controls), math.nan)
-                log.rows.append((now, nothing, plan.measured(read_state())))
         finally:
             try:
                 _end(plan, log, send_control, stop)
@@ -384,6 +378,28 @@ def play(
                     log.write(output)
                     report.output = output
     return report
+
+
+def _rows_in_time(
+    plan: Plan, report: Report, clock: Callable[[], float], sleep: Callable[[float], object]
+) -> Iterator[tuple[int, float]]:
+    """Wait for the time of each row; leave out rows whose time has passed.
+
+    Yields:
+        Row and time since the start [s]. The last row is the end of the motion, which has no
+        control.
+    """
+    begin, row, end = clock(), 0, len(plan.ctrl)
+    while row < end:
+        now = _wait(begin + plan.t[row], clock, sleep) - begin
+        report.latest = max(report.latest, now - plan.t[row])
+        yield row, now
+
+        due = min(int((clock() - begin) / plan.period), end)
+        report.skipped += max(due - row - 1, 0)
+        row = max(row + 1, due)
+
+    yield end, _wait(begin + plan.t[end], clock, sleep) - begin
 
 
 def _wait(deadline: float, clock: Callable[[], float], sleep: Callable[[float], object]) -> float:

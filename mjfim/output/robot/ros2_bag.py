@@ -19,7 +19,6 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import remove_earlier_result, replacing
-from mjfim.errors import ExperimentError, unknown
 from mjfim.output.robot.joint_trajectory import (
     NANOSECONDS,
     TRAJECTORY_TOPIC,
@@ -43,21 +42,6 @@ BAG_VERSION = 9
 
 # Time stamp of the start of the design [ns]. A stamp of 0 means that there is no stamp.
 START = NANOSECONDS
-
-
-def storage_of(text: str) -> Storage:
-    """Return the format of bags that a text names.
-
-    Args:
-        text: Name of the format.
-
-    Raises:
-        ExperimentError: There is no such format.
-    """
-    found = next((storage for storage in ENDINGS if storage == text), None)
-    if found is None:
-        raise ExperimentError(f"--storage: {unknown('format', text, ENDINGS)}")
-    return found
 
 
 def bag_files(folder: Path) -> tuple[str, ...]:

@@ -215,9 +215,13 @@ def _width(described: Any) -> int:
 def _names(feature: str, stated: Any, count: int) -> list[str]:
     """Names of the columns of a feature, from its names in any of the forms that are in use."""
     names = list(_flat(stated))
-    if len(names) == count and len(set(names)) == count:
+    are_usable = len(names) == len(set(names)) == count
+    if are_usable:
         return [f"{feature}:{name}" for name in names]
-    return [feature] if count == 1 else [f"{feature}[{i}]" for i in range(count)]
+
+    if count == 1:
+        return [feature]
+    return [f"{feature}[{i}]" for i in range(count)]
 
 
 def _flat(stated: Any, depth: int = 0) -> Iterator[str]:
