@@ -15,7 +15,7 @@ from mjfim.excitation.controls_within_limits import keeps_limits, limited_cost_o
 from mjfim.excitation.design_report import DesignReport
 from mjfim.excitation.designable import identifiability_along, require_designable
 from mjfim.excitation.initial_controls import initial_controls_of
-from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.levels import DescentLevel, require_coarse_factor
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.release_search import ReleaseSearch
 from mjfim.excitation.release_space import ReleaseSpace
@@ -120,6 +120,7 @@ def design_task(
 
     _require_controls(task)
     require_feasible_start(task)
+    require_coarse_factor(task)
     steps_before = task.plant.engine_steps
 
     # Evaluate the initial control and find the combinations that can be identified.
@@ -167,6 +168,7 @@ def _design_release(
 ) -> Design:
     """Design the initial state of a motion whose control is given. See `design`."""
     require_feasible_start(task)
+    require_coarse_factor(task)
     steps_before = task.plant.engine_steps
 
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)

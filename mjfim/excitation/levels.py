@@ -57,6 +57,35 @@ class DescentLevel:
         return replace(problem, information=information, forward_differences_only=is_coarse)
 
 
+def require_coarse_factor(task: DesignTask) -> None:
+    """Check before a design begins that the stated factor of a coarse level can be used.
+
+    Args:
+        task: The stated task.
+
+    Raises:
+        ExperimentError: The factor does not divide the samples. Under hard limits it may divide
+            the engine steps of a sample instead.
+    """
+    descent, samples = task.experiment.descent, task.samples
+    substeps = task.system.grid.substeps
+    factor = descent.coarse
+    if factor == "auto" or descent.method != "lbfgs" or samples % factor == 0:
+        return
+
+    key = f"{task.experiment.source}: descent.coarse: {factor}"
+    if not task.is_limited:
+        valid = ", ".join(str(k) for k in range(1, 17) if samples % k == 0)
+        raise ExperimentError(
+            f"{key} does not divide the {samples} samples; valid for example: {valid}"
+        )
+    if substeps % factor:
+        raise ExperimentError(
+            f"{key} divides neither the {substeps} engine steps of a sample nor the {samples} "
+            "samples"
+        )
+
+
 def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> DesignTask | None:
     """Make the coarse level of a descent without hard limits.
 
@@ -68,22 +97,12 @@ def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> D
     Returns:
         The task with longer samples; None where the experiment states no coarse level, or where
         the initial cost differs from that of the stated task by more than `MAX_COARSE_CHANGE`.
-
-    Raises:
-        ExperimentError: The stated factor does not divide the samples.
     """
     descent = task.experiment.descent
-    is_auto = descent.coarse == "auto"
     factor = AUTO_COARSE_FACTOR if descent.coarse == "auto" else descent.coarse
     if factor == 1 or descent.method != "lbfgs":
         return None
 
-    if not is_auto and task.samples % factor:
-        valid = ", ".join(str(k) for k in range(1, 17) if task.samples % k == 0)
-        raise ExperimentError(
-            f"{task.experiment.source}: descent.coarse: {factor} does not divide the "
-            f"{task.samples} samples; valid for example: {valid}"
-        )
     if task.samples % factor or task.samples < MIN_COARSE_SAMPLES * factor:
         return None
 
@@ -122,10 +141,6 @@ def easier_level(fine: DescentLevel) -> DescentLevel | None:
     Returns:
         A level with a longer timestep or longer samples, and with smoothed friction where the model
         has dry friction; one with smoothed friction alone; None where neither is useful.
-
-    Raises:
-        ExperimentError: A stated factor divides neither the engine steps of a sample nor the
-            samples.
     """
     has_dry_friction = bool(fine.task.system.variant.smoothing_speeds)
     smooth = replace(fine, task=fine.task.smoothed()) if has_dry_friction else fine
@@ -153,11 +168,6 @@ def _coarse_factors(task: DesignTask) -> tuple[int, ...]:
         dividing = tuple(factor for factor in TIMESTEP_FACTORS if substeps % factor == 0)
         return dividing or (SAMPLE_FACTOR,)
 
-    if substeps % stated and task.samples % stated:
-        raise ExperimentError(
-            f"{task.experiment.source}: descent.coarse: {stated} divides neither the {substeps} "
-            f"engine steps of a sample nor the {task.samples} samples"
-        )
     return () if stated == 1 else (stated,)
 
 

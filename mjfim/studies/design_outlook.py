@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from mjfim.errors import MjfimError, first_ones
 from mjfim.excitation.designable import require_designable
 from mjfim.excitation.evaluation import growth_along, growth_warning
+from mjfim.excitation.initial_controls import initial_controls_of
+from mjfim.excitation.levels import require_coarse_factor
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start
 from mjfim.excitation.violations import all_violations_of
@@ -44,6 +46,8 @@ class DesignOutlook:
 
         reasons = (
             _refusal(lambda: require_feasible_start(task)),
+            _refusal(lambda: require_coarse_factor(task)),
+            _refusal(lambda: initial_controls_of(task, None)),
             _refusal(lambda: require_designable(task, identifiability)),
         )
         refused = tuple(reason for reason in reasons if reason)
@@ -70,7 +74,7 @@ class DesignOutlook:
         return (*said, *([self.warning] if self.warning else []))
 
 
-def _refusal(require: Callable[[], None]) -> str:
+def _refusal(require: Callable[[], object]) -> str:
     """The message of the error that a requirement raises; empty where it holds."""
     try:
         require()

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+import mjfim
+from mjfim import memory
 from mjfim.cli import announcements
-from mjfim.errors import ExperimentError, MjfimError
+from mjfim.errors import ExperimentError, MjfimError, SimulationDivergedError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.studies import derivative_test
 from mjfim.studies.check import check_task
+from tests.support import stiff_servos
 from tests.support.stiff_servos import stiff_arm_experiment, stiff_arm_task
 
 # Changes of the experiment that a design refuses, and a part of its message.
@@ -30,9 +33,37 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"parameters": {"m": {"target": "body/fore:mass"}, "s": {"target": "geom/fore:friction"}}},
         "parameters.s changes nothing",
     ),
+    "start too close": (
+        {"limits": {"clearance": 0.3}},
+        "limits.clearance: the initial state is too close: fore - wall",
+    ),
+    "frequency of a further start": (
+        {"limits": {"bandwidth": 5.0}, "descent": {"fourier": [7.0]}},
+        "descent.fourier: 7 Hz is above the bandwidth of 5 Hz",
+    ),
+    "parts of a further start": (
+        {"descent": {"repeats": [7]}},
+        "descent.repeats: 7 does not divide the 50 samples",
+    ),
+    "coarse level": (
+        {"descent": {"coarse": 7}},
+        "descent.coarse: 7 divides neither the 5 engine steps of a sample nor the 50 samples",
+    ),
 }
 
+# A ball below the elbow, which matters where a clearance is stated.
+WALL = '<geom name="wall" type="sphere" size="0.02" pos="0.3 0 0.8"/><body name="upper"'
 
+
+@pytest.fixture
+def walled(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a ball near the arm."""
+    contacts = stiff_servos.STIFF_ARM.replace('contype="0"', "").replace('conaffinity="0"', "")
+    model = contacts.replace('<body name="upper"', WALL)
+    monkeypatch.setattr(stiff_servos, "STIFF_ARM", model)
+
+
+@pytest.mark.usefixtures("walled")
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_check_refuses_what_a_design_refuses_in_the_same_words(name: str, tmp_path: Path) -> None:
     tables, fragment = REFUSED[name]
@@ -46,6 +77,51 @@ def test_a_check_refuses_what_a_design_refuses_in_the_same_words(name: str, tmp_
     assert not found.ok
     assert any(str(error.value) in sentence for sentence in found.verdict)
     assert found.summary()["refused"] == list(found.refused)
+
+
+def test_a_start_that_diverges_is_refused_in_the_same_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = stiff_servos.STIFF_ARM.replace('forcerange="-3 3"', "")
+    shaken = free.replace('kp="1000"', 'kp="1e7"').replace("implicitfast", "Euler")
+    monkeypatch.setattr(stiff_servos, "STIFF_ARM", shaken)
+    said = []
+    for work in (mjfim.design, mjfim.check):
+        with pytest.raises(SimulationDivergedError, match="diverges under this control") as error:
+            work(stiff_arm_experiment(tmp_path, amplitude=1e-3))
+        said.append(str(error.value))
+    assert said[0] == said[1]
+
+
+def test_a_horizon_that_fills_the_memory_is_refused_in_the_same_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "available_memory", lambda: 1e6)
+    said = []
+    for work in (mjfim.design, mjfim.check):
+        with pytest.raises(ExperimentError, match=r"GiB of memory, and .* are available") as error:
+            work(stiff_arm_experiment(tmp_path))
+        said.append(str(error.value))
+    assert said[0] == said[1]
+    assert "horizon: 1 s at 50 Hz" in said[0]
+
+
+def test_parameters_that_do_the_same_are_named_by_both(tmp_path: Path) -> None:
+    parameters = {
+        "a": {"target": "joint/shoulder:damping"},
+        "b": {"target": "actuator/shoulder:biasprm[2]"},
+        "mass": {"target": "body/fore:mass"},
+    }
+    task = stiff_arm_task(
+        tmp_path, amplitude=1e-3, parameters=parameters, descent={"max_iterations": 1}
+    )
+    found, design = check_task(task), design_task(task)
+    assert not found.refused
+    assert not found.ok
+    assert not design.separable
+    assert any("a and b" in text for text in design.combinations)
+    for text in design.combinations:
+        assert any(text in sentence for sentence in found.verdict)
 
 
 def test_a_check_says_which_limits_the_start_violates_and_when(tmp_path: Path) -> None:
