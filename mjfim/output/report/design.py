@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import complete_labels
 from mjfim.output.report.correlations import correlation_of
 from mjfim.output.report.curves import (
@@ -38,6 +39,10 @@ TRAJECTORY_KEYS = (
 
 # Largest number of plots in one group; of more columns, the first ones are shown.
 MAX_PANELS = 36
+
+# Distance of a bound from the motion, relative to the range of the motion, up to which its plot
+# shows the bound.
+NEAR_BOUND = 1.0
 
 # Largest number of curves of one kind of limit; of more, those that come closest to a bound.
 MAX_LIMIT_CURVES = 8
@@ -155,6 +160,7 @@ def _motion_plots(design: Design, labels: Labels) -> Iterator[PlotGroup]:
         ("Velocities", "qvel", labels.velocities),
         ("Controls", "ctrl", labels.controls),
     )
+    bounds = _bounds_by_label(design, labels)
     curves = 2 * (1 + sum(len(names) for _, _, names in groups))
     limit = points_per_curve(curves + len(design.usage))
     thinned = len(design.trajectory.t) > limit
@@ -164,21 +170,46 @@ def _motion_plots(design: Design, labels: Labels) -> Iterator[PlotGroup]:
         if not names:
             continue
         panels = [
-            _signal_panel(design, quantity, i, name, limit)
+            _signal_panel(design, quantity, i, name, limit, bounds.get((quantity, name), ()))
             for i, name in enumerate(names[:MAX_PANELS])
         ]
-        note = ""
+        has_bounds = any((quantity, name) in bounds for name in names)
+        note = "Dashed lines: limits. " if has_bounds else ""
         if len(names) > MAX_PANELS:
-            note = (
+            note += (
                 f"The first {MAX_PANELS} of {len(names)} columns are shown; all of them are in "
                 "design.npz."
             )
         yield PlotGroup(title=title, panels=panels, keys=TRAJECTORY_KEYS, note=note)
 
 
-def _signal_panel(design: Design, quantity: str, column: int, label: str, limit: int) -> Panel:
-    """Return the plot of one column of both trajectories."""
-    traces = []
+def _bounds_by_label(design: Design, labels: Labels) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return the finite bounds of positions, velocities and controls, by quantity and label."""
+    kinds = (
+        ("position", "qpos", labels.qpos, ""),
+        ("velocity", "qvel", labels.velocities, " velocity"),
+        ("control", "ctrl", labels.controls, ""),
+    )
+    bounds = {}
+    for kind, quantity, names, ending in kinds:
+        label_of = {split_unit(label)[0].removesuffix(ending): label for label in names}
+        for usage in design.usage:
+            is_known = np.isfinite(usage.lower) or np.isfinite(usage.upper)
+            if usage.kind == kind and usage.name in label_of and is_known:
+                bounds[quantity, label_of[usage.name]] = (usage.lower, usage.upper)
+    return bounds
+
+
+def _signal_panel(
+    design: Design,
+    quantity: str,
+    column: int,
+    label: str,
+    limit: int,
+    bounds: tuple[float, float] | tuple[()],
+) -> Panel:
+    """Return the plot of one column of both trajectories, with its bounds."""
+    traces, extremes = [], []
     for evaluation, term in ((design.initial, INITIAL), (design.final, DESIGNED)):
         t = evaluation.trajectory.t
         values = getattr(evaluation.trajectory, quantity)[:, column]
@@ -187,7 +218,18 @@ def _signal_panel(design: Design, quantity: str, column: int, label: str, limit:
             # The last control is held until the end.
             values = np.append(values, values[-1])
         traces.append(curve(t, values, term.word, term.word, limit=limit, held=held))
-    return Panel(title=label, traces=traces, layout={"xaxis": axis("time [s]")}, linked="time")
+        extremes += [float(values.min()), float(values.max())]
+
+    lines = [bound for bound in bounds if np.isfinite(bound)]
+    layout: Plotly = {"xaxis": axis("time [s]"), "shapes": [level(y, "bound") for y in lines]}
+    reach = NEAR_BOUND * float(np.ptp(extremes))
+    near = [y for y in lines if min(extremes) - reach <= y <= max(extremes) + reach]
+    if near:
+        # A bound that the motion comes near is inside the plot.
+        ends = [*extremes, *near]
+        room = 0.06 * float(np.ptp(ends))
+        layout["yaxis"] = axis(range=[min(ends) - room, max(ends) + room])
+    return Panel(title=label, traces=traces, layout=layout, linked="time")
 
 
 def _information_plot(design: Design, limit: int, *, thinned: bool) -> PlotGroup:

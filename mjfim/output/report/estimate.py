@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import PurePath
 
 import numpy as np
@@ -32,6 +33,7 @@ from mjfim.output.summary_parts import Listing, Part, Quantity, Summary
 from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
 from mjfim.records.estimate import Estimate, Prediction
 from mjfim.records.labels import Labels
+from mjfim.records.recording import Recording
 
 # Largest number of outputs that are drawn; of more, those whose residuals over sigma are largest.
 MAX_OUTPUTS = 12
@@ -39,11 +41,10 @@ MAX_OUTPUTS = 12
 # Largest number of recordings whose signals are drawn.
 MAX_RECORDINGS = 8
 
-# Entries of the legend of signals.
-SIGNAL_KEYS = (
-    Key(name=MEASURED.word, role=MEASURED.word, shape="dot"),
-    Key(name=IDENTIFIED.word, role=IDENTIFIED.word),
-)
+# Largest number of segments whose beginnings are drawn as lines.
+MAX_SEGMENTS = 20
+
+# Entries of the legend of tests of the residuals.
 RESIDUAL_KEYS = (Key(name="residual", role=MEASURED.word), Key(name="95 %", role="band"))
 
 
@@ -59,14 +60,18 @@ def estimate_page(estimate: Estimate) -> Page:
 
     sections = [Section(title="Parameters", parts=list(_parameter_parts(estimate, summary)))]
     if estimate.predictions:
-        tables = (summary.table("predictions"), summary.table("prediction details"))
-        found = (*tables, _prediction_plots(estimate, labels))
+        found: list[Part | PlotGroup] = [summary.table("predictions")]
+        found += [summary.table("prediction details"), _prediction_plots(estimate, labels)]
+        found += _held_out_plots(estimate, labels, columns)
         sections.append(Section(title="Predictions", parts=found))
     if len(columns):
         fit = list(_fit_plots(estimate, labels, columns))
         sections.append(Section(title="Signals", parts=fit))
         tests = list(_residual_plots(estimate, labels, columns))
         sections.append(Section(title="Residuals", parts=[summary.table("residuals"), *tests]))
+    trace = _trace_plots(estimate)
+    if trace is not None:
+        sections.append(Section(title="Search", parts=[trace]))
     if estimate.missing_terms:
         sections.append(Section(title="Missing terms", parts=[_missing_terms(estimate)]))
 
@@ -209,7 +214,89 @@ def _prediction_panel(found: Sequence[Prediction], j: int, label: str) -> Panel:
     )
 
 
+def _held_out_plots(
+    estimate: Estimate, labels: Labels, columns: Sequence[int]
+) -> Iterator[PlotGroup]:
+    """Yield measured, identified and nominal signals of the held-out recordings."""
+    shown = [p for p in estimate.predictions if p.recording is not None][:MAX_RECORDINGS]
+    limit = points_per_curve(3 * len(columns) * (len(shown) + len(estimate.recordings)))
+    for k, prediction in enumerate(shown):
+        recording = prediction.recording
+        if recording is None or len(prediction.identified_outputs) != len(recording.t):
+            continue
+        signals = _Signals(
+            recording=recording,
+            identified=prediction.identified_outputs,
+            nominal=prediction.nominal_outputs,
+        )
+        name = PurePath(prediction.name).name
+        panels = [
+            _signal_panel(signals, j, labels, limit, f"held out {k}")
+            for j in columns
+            if j < len(recording.outputs)
+        ]
+        yield PlotGroup(
+            title=f"Prediction of {name}, which was not fitted",
+            panels=panels,
+            keys=_signal_keys(signals),
+            folded=k > 0,
+        )
+
+
 # ---- signals
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Signals:
+    """Measured and simulated outputs of one recording.
+
+    Attributes:
+        recording: The recording.
+        identified: (M, ny) outputs of the identified model [unit of the output].
+        nominal: (M, ny) outputs of the nominal model; empty where they are not known.
+        begins: Times at which segments begin, which the fit joins [s].
+    """
+
+    recording: Recording
+    identified: Array
+    nominal: Array
+    begins: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def has_nominal(self) -> bool:
+        """True where the outputs of the nominal model are known."""
+        return len(self.nominal) == len(self.recording.t)
+
+
+def _signal_keys(signals: _Signals) -> list[Key]:
+    """Return the entries of the legend of measured and simulated signals."""
+    keys = [
+        Key(name=MEASURED.word, role=MEASURED.word, shape="dot"),
+        Key(name=IDENTIFIED.word, role=IDENTIFIED.word),
+    ]
+    if signals.has_nominal:
+        keys.append(Key(name=NOMINAL.word, role=NOMINAL.word))
+    return keys
+
+
+def _signal_panel(signals: _Signals, j: int, labels: Labels, limit: int, linked: str) -> Panel:
+    """Return the plot of one output of a recording; the nominal model lies at the back."""
+    t, recording = signals.recording.t, signals.recording
+    traces = []
+    if signals.has_nominal:
+        values = signals.nominal[:, j]
+        traces.append(curve(t, values, NOMINAL.word, NOMINAL.word, limit=limit, width=1.1))
+    traces += [
+        _measured_dots(t, recording.y[:, j], limit),
+        curve(t, signals.identified[:, j], IDENTIFIED.word, IDENTIFIED.word, limit=limit),
+    ]
+
+    # With many segments, lines would hide the curves.
+    begins = signals.begins[1:] if len(signals.begins) <= MAX_SEGMENTS else ()
+    shapes = [level(float(begin), "grid", across="y", dash="dot") for begin in begins]
+    layout = {"xaxis": axis("time [s]"), "shapes": shapes}
+    title = labels.output(recording.outputs[j])
+    return Panel(title=title, traces=traces, layout=layout, linked=linked)
 
 
 def _shown_outputs(estimate: Estimate) -> list[int]:
@@ -226,25 +313,30 @@ def _fit_plots(estimate: Estimate, labels: Labels, columns: Sequence[int]) -> It
     shown = estimate.recordings[:MAX_RECORDINGS]
     limit = points_per_curve(3 * len(columns) * len(shown))
     outputs = estimate.recordings[0].outputs
+    nominal: tuple[Array, ...] = getattr(estimate, "nominal", ())
+    segments: tuple[Array, ...] = getattr(estimate, "segments", ())
     for i, recording in enumerate(shown):
-        predicted = estimate.predicted[i]
+        signals = _Signals(
+            recording=recording,
+            identified=estimate.predicted[i],
+            nominal=nominal[i] if i < len(nominal) else np.zeros((0, 0)),
+            begins=segments[i] if i < len(segments) else np.zeros(0),
+        )
         panels, residuals = [], []
         for j in columns:
-            label = labels.output(outputs[j])
-            traces = [
-                _measured_dots(recording.t, recording.y[:, j], limit),
-                curve(recording.t, predicted[:, j], IDENTIFIED.word, IDENTIFIED.word, limit=limit),
-            ]
-            layout = {"xaxis": axis("time [s]")}
-            panels.append(Panel(title=label, traces=traces, layout=layout, linked=f"time {i}"))
-            residual = recording.y[:, j] - predicted[:, j]
+            panels.append(_signal_panel(signals, j, labels, limit, f"time {i}"))
+            residual = recording.y[:, j] - estimate.predicted[i][:, j]
             sigma = estimate.sigma.get(outputs[j], float("nan"))
+            label = labels.output(outputs[j])
             residuals.append(_residual_panel(recording.t, residual, sigma, label, limit, i))
 
         name = PurePath(recording.name).name
-        note = _signal_note(estimate, len(columns), len(recording.t) > limit)
         yield PlotGroup(
-            title=f"Fit to {name}", panels=panels, keys=SIGNAL_KEYS, note=note, folded=i > 0
+            title=f"Fit to {name}",
+            panels=panels,
+            keys=_signal_keys(signals),
+            note=_signal_note(estimate, len(columns), signals, limit),
+            folded=i > 0,
         )
         yield PlotGroup(
             title=f"Residuals of {name} over time",
@@ -259,9 +351,11 @@ def _measured_dots(t: Array, values: Array, limit: int) -> Plotly:
     return dots(t, values, MEASURED.word, MEASURED.word, limit=limit, size=3.0)
 
 
-def _signal_note(estimate: Estimate, drawn: int, thinned: bool) -> str:
-    """Say what the plots leave out."""
+def _signal_note(estimate: Estimate, drawn: int, signals: _Signals, limit: int) -> str:
+    """Say what dotted lines mean, and what the plots leave out."""
     parts = []
+    if 1 < len(signals.begins) <= MAX_SEGMENTS:
+        parts.append("Dotted lines: segments of the fit, each with an initial state of its own.")
     outputs = len(estimate.recordings[0].outputs)
     if drawn < outputs:
         parts.append(
@@ -271,7 +365,7 @@ def _signal_note(estimate: Estimate, drawn: int, thinned: bool) -> str:
         parts.append(
             f"The first {MAX_RECORDINGS} of {len(estimate.recordings)} recordings are drawn."
         )
-    if thinned:
+    if len(signals.recording.t) > limit:
         parts.append(
             "Long curves are thinned for display: the smallest and the largest value of each "
             "interval are drawn, so that peaks stay; estimate.npz has all samples."
@@ -369,6 +463,47 @@ def _spectrum_panel(residuals: Residuals, name: str) -> Panel:
         },
         linked="frequency",
     )
+
+
+# ---- search
+
+
+def _trace_plots(estimate: Estimate) -> PlotGroup | None:
+    """Return the parameters over the iterations of the fit; None where they are not known."""
+    trace: Array = getattr(estimate, "trace", np.zeros((0, 0)))
+    if len(trace) < 2:
+        return None
+
+    iterations = np.arange(float(len(trace)))
+    panels = []
+    for j, name in enumerate(estimate.parameters[:MAX_OUTPUTS]):
+        line = curve(iterations, trace[:, j], IDENTIFIED.word, IDENTIFIED.word)
+        line["mode"] = "lines+markers"
+        line["marker"] = {"size": 4, "color": f"role:{IDENTIFIED.word}"}
+        unit = estimate.units[j] or "model unit"
+        guess = float(estimate.initial_theta[j])
+        panels.append(
+            Panel(
+                title=f"{name} [{unit}]",
+                traces=[line],
+                layout={
+                    "xaxis": axis("iteration [–]"),
+                    "shapes": [level(guess, NOMINAL.word)],
+                },
+                remark=f"{Quantity(value=guess)} → {Quantity(value=float(estimate.theta[j]))}",
+                linked="iteration",
+            )
+        )
+    keys = [Key(name=IDENTIFIED.word, role=IDENTIFIED.word)]
+    note = "The dashed line is the guess."
+    if len(estimate.parameters) > MAX_OUTPUTS:
+        note += f" The first {MAX_OUTPUTS} of {len(estimate.parameters)} parameters are drawn."
+    return PlotGroup(
+        title="Parameters over the iterations of the fit", panels=panels, keys=keys, note=note
+    )
+
+
+# ---- missing terms
 
 
 def _missing_terms(estimate: Estimate) -> Listing:
