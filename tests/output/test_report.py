@@ -179,6 +179,12 @@ def test_the_verdict_on_a_design(changes: dict[str, Any], level: Level, words: s
     assert next_steps(design)
 
 
+def test_a_rough_design_asks_for_another_motion_not_for_more_time() -> None:
+    steps = next_steps(results.design(status=Status.ROUGH))
+    assert "contacts" in steps[0]
+    assert not any("more time" in step for step in steps)
+
+
 @pytest.mark.parametrize(
     ("changes", "level", "words"),
     [

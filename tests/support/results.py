@@ -33,6 +33,9 @@ PARAMETERS = ("mass", "length", "damping")
 UNITS = ("kg", "m", "N m s/rad")
 THETA = np.array([2.0, 1.0, 0.5])
 
+# Bound of the position of a design [rad].
+BOUND = 1.125
+
 # Correlation of the estimates of the first two parameters.
 CORRELATION = 0.8
 
@@ -110,7 +113,16 @@ def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
         "steps": 1000,
         "seconds": 1.5,
         "limits": {"position": 0.1},
-        "usage": (LimitUsage(kind="position", name=name, t=final.trajectory.t, share=share),),
+        "usage": (
+            LimitUsage(
+                kind="position",
+                name=name,
+                t=final.trajectory.t,
+                share=share,
+                lower=-BOUND,
+                upper=BOUND,
+            ),
+        ),
         "labels": labels(name),
     }
     return Design(**{**fields, **changes})  # type: ignore[arg-type]
@@ -164,7 +176,15 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
             ),
         ),
         "predictions": (
-            Prediction(name="logs/new.csv", identified=errors[0], nominal=errors[1], held_out=True),
+            Prediction(
+                name="logs/new.csv",
+                identified=errors[0],
+                nominal=errors[1],
+                held_out=True,
+                recording=recording,
+                identified_outputs=predicted,
+                nominal_outputs=0.8 * predicted,
+            ),
         ),
         "labels": labels(name),
     }

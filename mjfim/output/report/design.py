@@ -130,7 +130,9 @@ def _accuracy_plots(design: Design, labels: Labels) -> Iterator[PlotGroup]:
         Key(name=INITIAL.word, role=INITIAL.word, shape="bar"),
         Key(name=DESIGNED.word, role=DESIGNED.word, shape="bar"),
     ]
-    note = "No bar: the parameter is not identifiable alone from this trajectory."
+    note = (
+        "No bar: the parameter is not identifiable alone from this trajectory, or its value is 0."
+    )
     some_missing = not (np.isfinite(initial).all() and np.isfinite(designed).all())
     yield PlotGroup(title="", panels=panels, keys=keys, note=note if some_missing else "")
 

@@ -16,7 +16,7 @@ from mjfim.output.vocabulary import shown_word
 from mjfim.records.campaign import Campaign, CampaignStatus
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
-from mjfim.records.design import Design
+from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.robustness import Robustness
@@ -141,7 +141,12 @@ def _steps_after_design(design: Design) -> Iterator[str]:
             f"Remove or fix one parameter of each group, give it a prior, or measure another "
             f"output: {groups}."
         )
-    if not design.status.success:
+    if design.status is Status.ROUGH:
+        yield (
+            "Keep the motion away from contacts, dry friction and saturated actuators: begin with "
+            "an initial control of smaller amplitude, or state narrower limits."
+        )
+    elif not design.status.success:
         yield "Allow more time or iterations in the table `[descent]` for a better design."
     if design.sound:
         yield "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o FILE`."
