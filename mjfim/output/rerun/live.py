@@ -1,0 +1,299 @@
+"""The live view of a search: cost and information over the iterates, and the newest motion."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.output import vocabulary
+from mjfim.output.progress_text import progress_line
+from mjfim.output.rerun.camera import Camera, place_camera
+from mjfim.output.rerun.layout import ASPECT_WITHOUT_TEXT, robot_views
+from mjfim.output.rerun.scene import (
+    BodyPoses,
+    EntityParts,
+    body_parts,
+    body_poses,
+    entity_path,
+    is_moving,
+    log_robot,
+    rerun_quaternion,
+)
+from mjfim.output.rerun.shapes import RobotStyle
+from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
+from mjfim.records.iterates import IterateMotion
+
+# Shortest time between two transmissions [s].
+UPDATE_SECONDS = 0.3
+
+# Largest number of points of a series in one transmission.
+MAX_POINTS = 500
+
+# Samples of a motion from which its path is drawn.
+PATH_SAMPLES = 60
+
+# Transmissions in which the robot passes through its motion once.
+UPDATES_PER_MOTION = 12
+
+# Longest time to wait at the end for what is still to be transmitted [s].
+FLUSH_SECONDS = 3.0
+
+# Timeline of the events, which are counted over all starts and phases.
+TIMELINE = "event"
+
+# Entity and style of the robot.
+ROBOT: EntityParts = ("robot",)
+STYLE = RobotStyle(accent=vocabulary.DESIGNED.rgb)
+
+# Colours of series that share a plot, one after the other.
+COLOURS = (
+    vocabulary.DESIGNED.rgb,
+    vocabulary.INITIAL.rgb,
+    *(term.rgb for term in (vocabulary.MEASURED, vocabulary.NOMINAL, vocabulary.IDENTIFIED)),
+    vocabulary.OTHER.rgb,
+)
+
+# Titles of the plots by the kind of event.
+PLOTS: dict[type[Event], dict[str, str]] = {
+    DesignEvent: {"cost": "log10 of the cost J", "eigenvalue": "log10 of λ_min"},
+    FitEvent: {
+        "squares": "log10 of half the sum of squares",
+        "step": "log10 of the step [σ]",
+    },
+    StudyEvent: {"share": "finished [%]"},
+}
+
+
+@dataclass(kw_only=True)
+class _Series:
+    """Points of one curve that are not transmitted yet.
+
+    Attributes:
+        parts: Its entity.
+        events: Numbers of the events.
+        values: Values.
+    """
+
+    parts: EntityParts
+    events: list[int] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+
+    def send(self, rec: rr.RecordingStream) -> None:
+        """Transmit the points, at most `MAX_POINTS` of them.
+
+        Args:
+            rec: The connection.
+        """
+        if not self.events:
+            return
+        rows = evenly_spread_indices(len(self.events), MAX_POINTS)
+        timeline = rr.TimeColumn(TIMELINE, sequence=np.array(self.events, dtype=np.int64)[rows])
+        columns = rr.Scalars.columns(scalars=np.array(self.values)[rows])
+        rec.send_columns(entity_path(self.parts), [timeline], columns, strict=True)
+        self.events.clear()
+        self.values.clear()
+
+
+class LiveShow:
+    """Transmits events to a viewer, a few times a second at most."""
+
+    def __init__(
+        self,
+        rec: rr.RecordingStream,
+        model: mujoco.MjModel,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Show the events of searches on one model.
+
+        Args:
+            rec: The connection.
+            model: The model.
+            now: Clock [s].
+        """
+        self._rec = rec
+        self._model = model
+        self._now = now
+        self._sent = -np.inf
+        self._events = 0
+        self._updates = 0
+        self._kinds: list[type[Event]] = []
+        self._series: dict[EntityParts, _Series] = {}
+        self._text = ""
+        self._motion: IterateMotion | None = None
+        self._camera: Camera | None = None
+        rec.set_log_time_enabled(False)
+
+    @classmethod
+    def connected(cls, url: str, model: mujoco.MjModel) -> LiveShow:
+        """Connect to a viewer.
+
+        Args:
+            url: Where it listens.
+            model: The model.
+        """
+        rec = rr.RecordingStream("mjfim live")
+        rec.connect_grpc(url)
+        return cls(rec, model)
+
+    def __call__(self, event: Event) -> None:
+        """Take an event, and transmit what was taken if the last time was a moment ago.
+
+        Args:
+            event: The event.
+        """
+        is_first = type(event) not in self._kinds
+        if is_first:
+            self._kinds.append(type(event))
+        self._take(event)
+
+        if is_first or self._now() - self._sent >= UPDATE_SECONDS:
+            self._transmit()
+
+    def end(self) -> None:
+        """Transmit what was taken, and close the connection."""
+        self._transmit()
+        self._rec.flush(timeout_sec=FLUSH_SECONDS)
+        self._rec.disconnect()
+
+    def _take(self, event: Event) -> None:
+        """Keep the numbers of an event."""
+        if isinstance(event, DesignEvent):
+            self._add("cost", event.start, _logarithm(event.row.cost))
+            self._add("eigenvalue", event.start, _logarithm(event.row.min_eigenvalue))
+            self._motion = event.row.motion or self._motion
+        elif isinstance(event, FitEvent):
+            self._add("squares", event.phase, _logarithm(event.cost))
+            self._add("step", event.phase, _logarithm(event.step))
+        elif event.count is not None:
+            share = (event.index + event.share) / max(event.count, 1)
+            self._add("share", event.study, 100.0 * share)
+        self._text = progress_line(event).text
+        self._events += 1
+
+    def _add(self, plot: str, name: str, value: float) -> None:
+        """Add a point to a curve; a value that is not finite is left out."""
+        if not np.isfinite(value):
+            return
+
+        parts = (plot, name)
+        if parts not in self._series:
+            beside = sum(known[0] == plot for known in self._series)
+            colour = COLOURS[beside % len(COLOURS)]
+            line = rr.SeriesLines(colors=[colour], names=[name], widths=[2.0])
+            self._rec.log(entity_path(parts), line, static=True, strict=True)
+            self._series[parts] = _Series(parts=parts)
+
+        series = self._series[parts]
+        series.events.append(self._events)
+        series.values.append(value)
+
+    # ---- transmission
+
+    def _transmit(self) -> None:
+        """Transmit what was taken."""
+        self._sent = self._now()
+        if not self._events:
+            return
+
+        for series in self._series.values():
+            series.send(self._rec)
+
+        self._rec.set_time(TIMELINE, sequence=self._events - 1)
+        text = rr.TextDocument(self._text)
+        self._rec.log(entity_path(("progress",)), text, strict=True)
+        if self._motion is not None:
+            self._show_motion(self._motion)
+        self._rec.reset_time()
+        self._arrange()
+        self._updates += 1
+
+    def _show_motion(self, motion: IterateMotion) -> None:
+        """Draw the path of the robot's end, and the robot at one sample of its motion."""
+        rows = evenly_spread_indices(len(motion.t), PATH_SAMPLES)
+        qpos = np.asarray(motion.qpos, dtype=np.float64)[rows]
+        if not np.isfinite(qpos).all():
+            return
+
+        poses = body_poses(self._model, np.asarray(motion.t, dtype=np.float64)[rows], qpos)
+        if self._camera is None:
+            self._begin_robot(poses)
+
+        # With every transmission, the robot moves on.
+        share = self._updates % UPDATES_PER_MOTION / UPDATES_PER_MOTION
+        sample = round(share * (len(rows) - 1))
+        for body in filter(lambda b: is_moving(self._model, b), range(1, self._model.nbody)):
+            pose = rr.Transform3D(
+                translation=poses.positions[sample, body],
+                quaternion=rerun_quaternion(poses.quaternions[sample, body]),
+            )
+            self._rec.log(entity_path(body_parts(self._model, ROBOT, body)), pose, strict=True)
+
+        path = rr.LineStrips3D(
+            [_path_of_end(self._model, poses)],
+            colors=[STYLE.accent],
+            radii=rr.Radius.ui_points(1.5),
+        )
+        self._rec.log(entity_path((*ROBOT, "path")), path, strict=True)
+
+    def _begin_robot(self, poses: BodyPoses) -> None:
+        """Log the shapes of the robot, and place the camera."""
+        self._camera = place_camera(self._model, [poses], 1, ASPECT_WITHOUT_TEXT)
+        first = BodyPoses(
+            t=poses.t[:1], positions=poses.positions[:1], quaternions=poses.quaternions[:1]
+        )
+        log_robot(self._rec, self._model, ROBOT, first, STYLE)
+        self._arranged: tuple[object, ...] = ()
+
+    def _arrange(self) -> None:
+        """Lay out the plots of the kinds of events that came, and the robot."""
+        content = (tuple(self._kinds), self._camera is not None)
+        if content == getattr(self, "_arranged", ()):
+            return
+        self._arranged = content
+
+        plots: list[rrb.View] = []
+        for kind in self._kinds:
+            for plot, title in PLOTS[kind].items():
+                plots.append(rrb.TimeSeriesView(origin=entity_path((plot,)), name=title))
+        progress = rrb.TextDocumentView(origin=entity_path(("progress",)), name="progress")
+        right = rrb.Vertical(*plots, progress, row_shares=[3] * len(plots) + [1])
+        layout: rrb.Container = right
+        if self._camera is not None:
+            views = robot_views(self._model, self._camera, {"newest iterate": ROBOT})
+            layout = rrb.Horizontal(*views, right)
+
+        panel = rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following")
+        blueprint = rrb.Blueprint(
+            layout,
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            panel,
+            auto_layout=False,
+            auto_views=False,
+        )
+        self._rec.send_blueprint(blueprint, make_active=True, make_default=True)
+
+
+def _logarithm(value: float) -> float:
+    """Logarithm to base 10; NaN where there is none."""
+    return float(np.log10(value)) if value > 0.0 else float("nan")
+
+
+def _path_of_end(model: mujoco.MjModel, poses: BodyPoses) -> Array:
+    """Return the (n, 3) path of the body at the end of the robot that travels farthest [m]."""
+    depth = np.zeros(model.nbody, dtype=np.intp)
+    for body in range(1, model.nbody):
+        depth[body] = depth[model.body_parentid[body]] + 1
+
+    travelled = np.linalg.norm(np.diff(poses.positions, axis=0), axis=2).sum(axis=0)
+    moving = travelled > 0.0
+    deepest = np.where(moving, depth, 0).max()
+    end = int(np.argmax(np.where(depth == deepest, travelled, -1.0)))
+    return poses.positions[:, end]
