@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mjfim.experiment.simulate import simulate
     from mjfim.identification.cross_validation import predict
     from mjfim.identification.identify import identify
+    from mjfim.output.live import live
     from mjfim.output.robot.export import export_design
     from mjfim.output.video.results import save_video
     from mjfim.parallel import Pool
@@ -64,6 +65,7 @@ __all__ = [
     "evaluate",
     "export_design",
     "identify",
+    "live",
     "monte_carlo",
     "predict",
     "run_campaign",
@@ -88,6 +90,7 @@ MODULES = {
     "predict": "mjfim.identification.cross_validation",
     "identify": "mjfim.identification.identify",
     "export_design": "mjfim.output.robot.export",
+    "live": "mjfim.output.live",
     "save_video": "mjfim.output.video.results",
     "Pool": "mjfim.parallel",
     "Campaign": "mjfim.records.campaign",

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from typer.core import TyperCommand
 
 import mjfim
 from mjfim.atomic_io import observed_by, remove_temporary_files
@@ -42,7 +43,7 @@ from mjfim.output.summary_parts import Summary
 from mjfim.output.text import render
 from mjfim.output.video.record import NoVideoError, format_of, require_encoder
 from mjfim.parallel import LOST_SENTENCE, MAX_THREADS, Pool
-from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
+from mjfim.records.events import Callback, DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.serialization import as_json as records_as_json
 
 if TYPE_CHECKING:
@@ -172,6 +173,15 @@ VideoFile = Annotated[
         "--video",
         metavar="FILE.mp4 | FILE.gif",
         help="Video of the robot, drawn by MuJoCo; no display is needed.",
+    ),
+]
+
+LiveView = Annotated[
+    str | None,
+    typer.Option(
+        "--live",
+        metavar="[ADDRESS]",
+        help="Show the search in a Rerun viewer while it runs; in the one at HOST:PORT if given.",
     ),
 ]
 
@@ -423,7 +433,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         if interruption.presses:
             raise typer.Exit(INTERRUPTED_CODE)
 
-    app.command(function.__name__.rstrip("_").replace("_", "-"))(wrapped)
+    app.command(function.__name__.rstrip("_").replace("_", "-"), cls=VerbCommand)(wrapped)
     return wrapped
 
 
@@ -459,6 +469,64 @@ def _say_what_is_there(interruption: Interruption) -> None:
         f"interrupted; {interruption.folder}/ holds only a part of the results, but each file in "
         "it is complete"
     )
+
+
+class VerbCommand(TyperCommand):
+    """A verb whose option --live may stand without an address."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Complete --live, and parse the arguments.
+
+        Args:
+            ctx: Context of the command line.
+            args: Words of the command line.
+        """
+        return super().parse_args(ctx, with_live_address(args))
+
+
+def with_live_address(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line, in which --live has an address.
+
+    Args:
+        words: The words. A word after --live is its address only if it looks like one.
+    """
+    from mjfim.output.live import ADDRESS, HERE
+
+    completed: list[str] = []
+    for k, word in enumerate(words):
+        follower = words[k + 1] if k + 1 < len(words) else ""
+        is_alone = word == "--live" and not ADDRESS.fullmatch(follower)
+        completed.append(f"--live={HERE}" if is_alone else word)
+    return completed
+
+
+@contextmanager
+def watched(address: str | None, system: System, display: Callback) -> Iterator[Callback]:
+    """Pass events on to the display, and to a viewer if the user wants to watch.
+
+    Args:
+        address: Value of the option --live, or None.
+        system: The experiment.
+        display: Shows the progress.
+
+    Yields:
+        The function that takes the events.
+    """
+    if address is None:
+        yield display
+        return
+
+    from mjfim.output.live import HERE, live_system
+
+    where = None if address == HERE else address
+    with live_system(system, where, say=_announce) as show:
+
+        def both(event: Event) -> None:
+            """Show an event twice."""
+            display(event)
+            show(event)
+
+        yield both
 
 
 class ProgressDisplay:

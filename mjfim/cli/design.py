@@ -18,6 +18,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
+    LiveView,
     Pictures,
     Threads,
     Verbose,
@@ -30,6 +31,7 @@ from mjfim.cli.common import (
     progress,
     say_written,
     verb,
+    watched,
     worker_processes,
     write_wanted_video,
     writing,
@@ -88,6 +90,7 @@ def design(
     ] = False,
     pictures: Pictures = PictureFormat.PNG,
     video: VideoFile = None,
+    live: LiveView = None,
     force: Force = False,
     threads: Threads = None,
 ) -> None:
@@ -107,7 +110,8 @@ def design(
 
     with (
         several(task) as executor,
-        progress("designing") as show,
+        progress("designing") as display,
+        watched(live, system, display) as show,
         stop_on_interrupt() as stop,
     ):
         found = _shortest(task, show, executor, stop) if shortest else None

@@ -15,6 +15,7 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Force,
+    LiveView,
     Pictures,
     Threads,
     Verbose,
@@ -26,6 +27,7 @@ from mjfim.cli.common import (
     progress,
     say_written,
     verb,
+    watched,
     write_wanted_video,
     writing,
 )
@@ -64,6 +66,7 @@ def identify(
         typer.Option(help="least_squares, which keeps bounds, or newton, the paper's method."),
     ] = "least_squares",
     video: VideoFile = None,
+    live: LiveView = None,
     as_json: AsJson = False,
     pictures: Pictures = PictureFormat.PNG,
     verbose: Verbose = False,
@@ -81,11 +84,14 @@ def identify(
     claim_video(video, inputs, force=force)
     claim_folder(output, pictures.files(names), inputs, force=force)
 
-    with progress("reading") as show:
+    with (
+        progress("reading") as display,
+        watched(live, system, display) as show,
+    ):
         fitted = [read_log(path, system.channels) for path in logs]
         predicted = [read_log(path, system.channels) for path in held_out_logs]
         announce_recordings(system, [log.recording for log in fitted], fit=True)
-        show.describe("fitting")
+        display.describe("fitting")
         result = identify_system(
             system,
             [log.recording for log in fitted],

@@ -16,6 +16,7 @@ from mjfim.cli.common import (
     Folder,
     Force,
     InitialOrDesign,
+    LiveView,
     Pictures,
     Verbose,
     VideoFile,
@@ -28,6 +29,7 @@ from mjfim.cli.common import (
     progress,
     say_written,
     verb,
+    watched,
     write_wanted_video,
     writing,
 )
@@ -105,6 +107,7 @@ def montecarlo(
         float | None,
         typer.Option(min=0.0, help="Rate of the measurements in Hz; overrides measure_rate."),
     ] = None,
+    live: LiveView = None,
     as_json: AsJson = False,
     pictures: Pictures = PictureFormat.PNG,
     verbose: Verbose = False,
@@ -123,7 +126,7 @@ def montecarlo(
 
     require_memory_for_trials(system, named, trials)
     announce_trials(system, named, trials)
-    with progress(f"{trials} trials") as show:
+    with progress(f"{trials} trials") as display, watched(live, system, display) as show:
         study = monte_carlo_system(system, named, trials=trials, seed=seed, callback=show)
 
     if not study.sets:

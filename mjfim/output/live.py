@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 DEFAULT_PORT = 9876
 DEFAULT_ADDRESS = f"127.0.0.1:{DEFAULT_PORT}"
 
+# Address that stands for the viewer of this computer, which may be opened.
+HERE = "here"
+
 # Form of an address: a host with a port, or a URL of Rerun.
 ADDRESS = re.compile(r"rerun(\+https?)?://\S+|[\w.-]+:\d{1,5}")
 

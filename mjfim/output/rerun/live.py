@@ -60,15 +60,27 @@ COLOURS = (
     vocabulary.OTHER.rgb,
 )
 
-# Titles of the plots by the kind of event.
-PLOTS: dict[type[Event], dict[str, str]] = {
-    DesignEvent: {"cost": "log10 of the cost J", "eigenvalue": "log10 of λ_min"},
-    FitEvent: {
-        "squares": "log10 of half the sum of squares",
-        "step": "log10 of the step [σ]",
+# Growth of the distance at which the camera has the motion in view, above which it steps back.
+STEP_BACK = 1.25
+
+# Corners of the legends: where falling curves and rising curves are not.
+FALLING, RISING = rrb.Corner2D.RightTop, rrb.Corner2D.RightBottom
+
+# Titles and legends of the plots by the kind of event.
+PLOTS: dict[type[Event], dict[str, tuple[str, rrb.Corner2D]]] = {
+    DesignEvent: {
+        "cost": ("log10 of the cost J", FALLING),
+        "eigenvalue": ("log10 of λ_min", RISING),
     },
-    StudyEvent: {"share": "finished [%]"},
+    FitEvent: {
+        "squares": ("log10 of half the sum of squares", FALLING),
+        "step": ("log10 of the step [σ]", FALLING),
+    },
+    StudyEvent: {"share": ("finished [%]", RISING)},
 }
+
+# Text before the first event.
+WAITING = "The first result is on its way."
 
 
 @dataclass(kw_only=True)
@@ -121,14 +133,19 @@ class LiveShow:
         self._model = model
         self._now = now
         self._sent = -np.inf
-        self._events = 0
+        self._events = self._transmitted = 0
         self._updates = 0
         self._kinds: list[type[Event]] = []
         self._series: dict[EntityParts, _Series] = {}
         self._text = ""
         self._motion: IterateMotion | None = None
         self._camera: Camera | None = None
+        self._arranged: tuple[object, ...] = ()
+
+        # The viewer shows something from the beginning.
         rec.set_log_time_enabled(False)
+        self._show_text(WAITING)
+        self._arrange()
 
     @classmethod
     def connected(cls, url: str, model: mujoco.MjModel) -> LiveShow:
@@ -199,20 +216,24 @@ class LiveShow:
     def _transmit(self) -> None:
         """Transmit what was taken."""
         self._sent = self._now()
-        if not self._events:
+        if self._events == self._transmitted:
             return
+        self._transmitted = self._events
 
         for series in self._series.values():
             series.send(self._rec)
 
         self._rec.set_time(TIMELINE, sequence=self._events - 1)
-        text = rr.TextDocument(self._text)
-        self._rec.log(entity_path(("progress",)), text, strict=True)
+        self._show_text(self._text)
         if self._motion is not None:
             self._show_motion(self._motion)
         self._rec.reset_time()
         self._arrange()
         self._updates += 1
+
+    def _show_text(self, text: str) -> None:
+        """Show what is done."""
+        self._rec.log(entity_path(("progress",)), rr.TextDocument(text), strict=True)
 
     def _show_motion(self, motion: IterateMotion) -> None:
         """Draw the path of the robot's end, and the robot at one sample of its motion."""
@@ -222,8 +243,7 @@ class LiveShow:
             return
 
         poses = body_poses(self._model, np.asarray(motion.t, dtype=np.float64)[rows], qpos)
-        if self._camera is None:
-            self._begin_robot(poses)
+        self._see(poses)
 
         # With every transmission, the robot moves on.
         share = self._updates % UPDATES_PER_MOTION / UPDATES_PER_MOTION
@@ -242,26 +262,31 @@ class LiveShow:
         )
         self._rec.log(entity_path((*ROBOT, "path")), path, strict=True)
 
-    def _begin_robot(self, poses: BodyPoses) -> None:
-        """Log the shapes of the robot, and place the camera."""
-        self._camera = place_camera(self._model, [poses], 1, ASPECT_WITHOUT_TEXT)
-        first = BodyPoses(
-            t=poses.t[:1], positions=poses.positions[:1], quaternions=poses.quaternions[:1]
-        )
-        log_robot(self._rec, self._model, ROBOT, first, STYLE)
-        self._arranged: tuple[object, ...] = ()
+    def _see(self, poses: BodyPoses) -> None:
+        """Place the camera so that a motion is in view; at the first one, log the shapes."""
+        camera = place_camera(self._model, [poses], 1, ASPECT_WITHOUT_TEXT)
+        if self._camera is None:
+            first = BodyPoses(
+                t=poses.t[:1], positions=poses.positions[:1], quaternions=poses.quaternions[:1]
+            )
+            log_robot(self._rec, self._model, ROBOT, first, STYLE)
+            self._camera = camera
+        elif _distance(camera) > STEP_BACK * _distance(self._camera):
+            self._camera = camera
 
     def _arrange(self) -> None:
         """Lay out the plots of the kinds of events that came, and the robot."""
-        content = (tuple(self._kinds), self._camera is not None)
-        if content == getattr(self, "_arranged", ()):
+        content = (tuple(self._kinds), self._camera)
+        if content == self._arranged:
             return
         self._arranged = content
 
         plots: list[rrb.View] = []
         for kind in self._kinds:
-            for plot, title in PLOTS[kind].items():
-                plots.append(rrb.TimeSeriesView(origin=entity_path((plot,)), name=title))
+            for plot, (title, corner) in PLOTS[kind].items():
+                legend = rrb.PlotLegend(corner)
+                origin = entity_path((plot,))
+                plots.append(rrb.TimeSeriesView(origin=origin, name=title, plot_legend=legend))
         progress = rrb.TextDocumentView(origin=entity_path(("progress",)), name="progress")
         right = rrb.Vertical(*plots, progress, row_shares=[3] * len(plots) + [1])
         layout: rrb.Container = right
@@ -284,6 +309,11 @@ class LiveShow:
 def _logarithm(value: float) -> float:
     """Logarithm to base 10; NaN where there is none."""
     return float(np.log10(value)) if value > 0.0 else float("nan")
+
+
+def _distance(camera: Camera) -> float:
+    """Distance of a camera from the point at which it looks [m]."""
+    return float(np.linalg.norm(np.subtract(camera.position, camera.target)))
 
 
 def _path_of_end(model: mujoco.MjModel, poses: BodyPoses) -> Array:

@@ -1,0 +1,254 @@
+"""The live view: what a viewer receives, and searches that do not depend on it."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rerun")
+import rerun as rr
+from rerun.chunk import RrdReader
+
+import mjfim
+from mjfim.cli.common import with_live_address
+from mjfim.errors import ExperimentError, NoResultError
+from mjfim.experiment.system import System
+from mjfim.output import live as live_module
+from mjfim.output.live import HERE, live, url_of
+from mjfim.output.rerun.live import UPDATE_SECONDS, LiveShow
+from mjfim.records.design import Design
+from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
+from tests.support.paths import MODELS
+
+
+@pytest.fixture(scope="module")
+def experiment() -> mjfim.Experiment:
+    """A short cart-pendulum experiment with few iterations."""
+    stated = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return stated.replace(horizon=0.5, descent={"max_iterations": 4})
+
+
+@pytest.fixture(scope="module")
+def searched(experiment: mjfim.Experiment) -> tuple[Design, list[DesignEvent]]:
+    """A design without a viewer, and its events."""
+    events: list[DesignEvent] = []
+    return mjfim.design(experiment, callback=events.append), events
+
+
+class Clock:
+    """A clock that moves on by a step whenever it is read."""
+
+    def __init__(self, step: float) -> None:
+        self.time, self.step = 0.0, step
+
+    def __call__(self) -> float:
+        self.time += self.step
+        return self.time
+
+
+class Received:
+    """What a viewer would receive, read back from a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._chunks = list(RrdReader(path).stream().to_chunks())
+        self.entities = {str(chunk.entity_path) for chunk in self._chunks}
+
+    def rows(self, entity: str, component: str) -> tuple[list[int], list[Any]]:
+        """Numbers of the events and values of a component, in the order of the events."""
+        found: list[tuple[int, Any]] = []
+        for chunk in self._chunks:
+            batch = chunk.to_record_batch()
+            if str(chunk.entity_path) == entity and {component, "event"} <= {*batch.schema.names}:
+                numbers = batch.column("event").cast("int64").to_pylist()
+                found += zip(numbers, batch.column(component).to_pylist(), strict=True)
+        found.sort(key=lambda row: row[0])
+        return [number for number, _ in found], [value for _, value in found]
+
+    def series(self, entity: str) -> list[float]:
+        """Values of a curve."""
+        return [value for (value,) in self.rows(entity, "Scalars:scalars")[1]]
+
+
+def watched(
+    events: Sequence[Event], experiment: mjfim.Experiment, folder: Path, step: float
+) -> Received:
+    """Transmit events into a file, with a clock that moves on by a step."""
+    system = System.resolve(experiment)
+    rec = rr.RecordingStream("test")
+    rec.save(folder / "live.rrd")
+    show = LiveShow(rec, system.model_at(system.theta), now=Clock(step))
+    for event in events:
+        show(event)
+    show.end()
+
+    received = Received(folder / "live.rrd")
+    assert not any("warnings" in entity for entity in received.entities)
+    return received
+
+
+class TestShown:
+    def test_every_iterate_of_a_design_changes_curves_robot_and_path(
+        self,
+        searched: tuple[Design, list[DesignEvent]],
+        experiment: mjfim.Experiment,
+        tmp_path: Path,
+    ) -> None:
+        design, events = searched
+        received = watched(events, experiment, tmp_path, step=2.0 * UPDATE_SECONDS)
+
+        costs = [row.cost for row in design.history]
+        eigenvalues = [row.min_eigenvalue for row in design.history]
+        start = "initial\\ control"
+        np.testing.assert_allclose(received.series(f"/cost/{start}"), np.log10(costs))
+        np.testing.assert_allclose(received.series(f"/eigenvalue/{start}"), np.log10(eigenvalues))
+
+        numbers, paths = received.rows("/robot/path", "LineStrips3D:strips")
+        assert numbers == list(range(len(events)))
+        assert all(np.isfinite(path).all() for path in paths)
+        assert not np.allclose(paths[0], paths[-1])
+        _, places = received.rows("/robot/bodies/bob", "Transform3D:translation")
+        assert len(places) == len(events)
+
+    def test_transmissions_are_rare_and_lose_no_point(
+        self,
+        searched: tuple[Design, list[DesignEvent]],
+        experiment: mjfim.Experiment,
+        tmp_path: Path,
+    ) -> None:
+        """A clock that stands still gives one transmission at the begin and one at the end."""
+        _, events = searched
+        many = [replace(event) for _ in range(20) for event in events]
+        received = watched(many, experiment, tmp_path, step=0.0)
+
+        assert len(received.series("/cost/initial\\ control")) == len(many)
+        numbers, _ = received.rows("/robot/path", "LineStrips3D:strips")
+        assert numbers == [0, len(many) - 1]
+
+    def test_fits_and_studies_have_their_curves(
+        self, experiment: mjfim.Experiment, tmp_path: Path
+    ) -> None:
+        fits = [
+            FitEvent(phase="all data", iteration=i, cost=10.0**-i, step=0.1 if i else np.inf)
+            for i in range(4)
+        ]
+        parts = [
+            StudyEvent(study="monte_carlo", part="initial", index=k, count=2, share=0.5)
+            for k in range(2)
+        ]
+        received = watched([*fits, *parts], experiment, tmp_path, step=1.0)
+        assert received.series("/squares/all\\ data") == pytest.approx([0.0, -1.0, -2.0, -3.0])
+        assert received.series("/step/all\\ data") == pytest.approx([-1.0] * 3)
+        assert received.series("/share/monte_carlo") == pytest.approx([25.0, 75.0])
+
+
+class TestIndependence:
+    def test_without_a_viewer_the_result_is_the_same(
+        self, searched: tuple[Design, list[DesignEvent]], experiment: mjfim.Experiment
+    ) -> None:
+        """Nobody listens at the port."""
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+
+        said: list[str] = []
+        with live(experiment, f"127.0.0.1:{port}", say=said.append) as show:
+            design = mjfim.design(experiment, callback=show)
+
+        (sentence,) = said
+        assert "there is no live view: nothing listens at" in sentence
+        assert_equal(design, searched[0])
+
+    def test_without_a_display_a_sentence_says_so(
+        self, experiment: mjfim.Experiment, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(live_module, "has_display", lambda: False)
+        monkeypatch.setattr(live_module, "_is_listening", lambda url: False)
+        said: list[str] = []
+        with live(experiment, say=said.append):
+            pass
+        assert said == [
+            "there is no live view: this computer has no display; start a viewer on another one "
+            "with `rerun`, and state its address, such as --live HOST:9876"
+        ]
+
+    def test_a_viewer_that_fails_ends_the_view_only(self) -> None:
+        calls: list[Event | None] = []
+
+        class Failing:
+            def __call__(self, event: Event) -> None:
+                calls.append(event)
+                raise RuntimeError("connection lost")
+
+            def end(self) -> None:
+                calls.append(None)
+
+        said: list[str] = []
+        show = live_module._Watched(Failing(), said.append)  # type: ignore[arg-type]
+        event = FitEvent(phase="all data", iteration=0, cost=1.0, step=1.0)
+        for _ in range(3):
+            show(event)
+        show.end()
+        assert said == ["the live view ended: connection lost"]
+        assert calls == [event]
+
+    def test_ctrl_c_reaches_the_search(self) -> None:
+        class Interrupted:
+            def __call__(self, event: Event) -> None:
+                raise NoResultError
+
+        show = live_module._Watched(Interrupted(), print)  # type: ignore[arg-type]
+        with pytest.raises(NoResultError):
+            show(FitEvent(phase="all data", iteration=0, cost=1.0, step=1.0))
+
+    @pytest.mark.slow
+    def test_with_a_server_the_result_is_the_same(
+        self, searched: tuple[Design, list[DesignEvent]], experiment: mjfim.Experiment
+    ) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        with rr.RecordingStream("server") as server:
+            server.serve_grpc(grpc_port=port)
+            said: list[str] = []
+            with live(experiment, f"127.0.0.1:{port}", say=said.append) as show:
+                design = mjfim.design(experiment, callback=show)
+            server.disconnect()
+
+        assert said == []
+        assert_equal(design, searched[0])
+
+
+def assert_equal(design: Design, expected: Design) -> None:
+    """Two designs are the same in every bit."""
+    assert np.array_equal(design.trajectory.ctrl, expected.trajectory.ctrl)
+    assert np.array_equal(design.final.information, expected.final.information)
+    assert [row.cost for row in design.history] == [row.cost for row in expected.history]
+
+
+class TestAddress:
+    def test_forms(self) -> None:
+        assert url_of("robot.local:9876") == "rerun+http://robot.local:9876/proxy"
+        assert url_of("rerun+http://a:1/proxy") == "rerun+http://a:1/proxy"
+        with pytest.raises(ExperimentError, match=r"--live here: an address is HOST:PORT"):
+            url_of("here")
+
+    @pytest.mark.parametrize(
+        ("words", "completed"),
+        [
+            (["a.toml", "--live"], ["a.toml", f"--live={HERE}"]),
+            (["--live", "a.toml"], [f"--live={HERE}", "a.toml"]),
+            (["--live", "host:9876", "a.toml"], ["--live", "host:9876", "a.toml"]),
+            (["--live", "-o", "out"], [f"--live={HERE}", "-o", "out"]),
+            (["--live=host:1"], ["--live=host:1"]),
+        ],
+    )
+    def test_the_option_may_stand_without_an_address(
+        self, words: list[str], completed: list[str]
+    ) -> None:
+        assert with_live_address(words) == completed
