@@ -113,7 +113,8 @@ def read_log(path: Path, channels: Channels) -> Log:
 
     # The control of the last row is left out, because it would act after the end of the recording.
     # A model without actuators has none.
-    controls = [columns[name][:-1] for name in channels.control_columns]
+    constant = {name: np.full(len(t), value) for name, value in spec.constants.items()}
+    controls = [(columns | constant)[name][:-1] for name in channels.control_columns]
     ctrl = np.column_stack(controls) if controls else np.zeros((len(t) - 1, 0))
     y = np.column_stack([columns[name] for name in measured])
     column_names = {name: source.column for name, source in sources.items()}
@@ -157,10 +158,18 @@ def check_spec(channels: Channels) -> None:
     units = units_of(channels.model)
     units.update(dict.fromkeys(channels.control_columns, "any"))
 
-    for name, source in channels.spec.sources.items():
+    for name in channels.spec.columns:
         if name not in units:
             raise ExperimentError(f"{where}: {unknown_coordinate('column', name, list(units))}")
+
+    for name, source in channels.spec.sources.items():
         check_unit(f"{where}.{name}", source, units[name])
+    for name in channels.spec.constants:
+        if name not in channels.control_columns:
+            raise ExperimentError(
+                f"{where}.{name}: a number is the value of a constant control, and this is a "
+                "measured column; state the name of the column in the log"
+            )
 
 
 def _check_units_of_controls(table: Table, sources: Mapping[str, ColumnSpec]) -> None:
@@ -185,8 +194,8 @@ def _check_units_of_controls(table: Table, sources: Mapping[str, ColumnSpec]) ->
 def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     """Rules of all columns of the recording, first the controls, then the measured columns.
 
-    A control without a stated rule is read under its default name. Measured columns are read under
-    their default names only if the experiment file states none of them.
+    A control without a stated rule or value is read under its default name. Measured columns are
+    read under their default names only if the experiment file states none of them.
     """
     stated = channels.spec.sources
     default = _columns_by_default_name(table, channels)
@@ -194,11 +203,14 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     controls = {
         name: stated.get(name) or ColumnSpec(column=default.get(name, name))
         for name in channels.control_columns
+        if name not in channels.spec.constants
     }
     # The look-up of a missing column raises the error that explains it.
     for name, source in controls.items():
         if name not in stated:
-            _require_default(table, name, source.column, key=f'[recording.columns] "{name}"')
+            key = f'[recording.columns] "{name}"'
+            off = f"; if the motor was off or its control constant, state the value: {key} = 0.0"
+            _require_default(table, name, source.column, key=key, otherwise=off)
         table.column(source.column)
 
     measured = {name: source for name, source in stated.items() if name not in controls}
@@ -218,7 +230,9 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     return {**controls, **measured}
 
 
-def _require_default(table: Table, name: str, column: str, *, key: str) -> None:
+def _require_default(
+    table: Table, name: str, column: str, *, key: str, otherwise: str = ""
+) -> None:
     """Raise RecordingError if the log lacks a column that the experiment file does not state.
 
     Args:
@@ -226,6 +240,7 @@ def _require_default(table: Table, name: str, column: str, *, key: str) -> None:
         name: What the column holds.
         column: Name that the column has in the files of mjfim.
         key: Key of the experiment file that states another name.
+        otherwise: End of the message, where there is another way.
     """
     if column in table.names:
         return
@@ -238,7 +253,7 @@ def _require_default(table: Table, name: str, column: str, *, key: str) -> None:
     proposal = plain[near] if near else "<name of the column in the log>"
     raise RecordingError(
         f"{table.source}: column {column!r} is missing; found: {listed(table.names)}. If another "
-        f'column holds it, state its name in the experiment file: {key} = "{proposal}"'
+        f'column holds it, state its name in the experiment file: {key} = "{proposal}"{otherwise}'
     )
 
 
@@ -319,7 +334,7 @@ def _matrices(channels: Channels) -> dict[str, list[str]]:
 
     A matrix is left out if stated rules replace it.
     """
-    stated = channels.spec.sources
+    stated = channels.spec.columns
     state = [component.name for component in state_components(channels.model)]
     nq = channels.model.nq
 

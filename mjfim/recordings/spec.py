@@ -149,11 +149,12 @@ class RecordingSpec(Section):
         default=0.1,
         description="Longest accepted gap in the time stamps or in a column [s].",
     )
-    columns: dict[str, str | ColumnSpec] = Field(
+    columns: dict[str, str | Finite | ColumnSpec] = Field(
         default={},
         description=(
             "Sources of the columns of the recording, by `ctrl:<actuator>`, `qpos:<joint>`, "
-            "`qvel:<joint>` or sensor: the name of a column of the log, or a table. Default: the "
+            "`qvel:<joint>` or sensor: the name of a column of the log, or a table; for a control "
+            "also a number, its constant value (0.0 for a motor that is off). Default: the "
             "columns of the log have these names."
         ),
     )
@@ -167,8 +168,14 @@ class RecordingSpec(Section):
 
     @property
     def sources(self) -> dict[str, ColumnSpec]:
-        """Rule of every stated column; a mere name becomes a rule without conversion."""
+        """Rule of every stated column of a log; a mere name becomes a rule without conversion."""
         return {
             name: ColumnSpec(column=source) if isinstance(source, str) else source
             for name, source in self.columns.items()
+            if not isinstance(source, float)
         }
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """Constant values, which no column of a log holds [unit of the model]."""
+        return {name: source for name, source in self.columns.items() if isinstance(source, float)}

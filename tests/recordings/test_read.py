@@ -461,8 +461,31 @@ def test_columns_that_are_missing(read: Read) -> None:
         for source in (name, {"column": "q", "multiply_by": [name]}):
             with pytest.raises(RecordingError, match=said):
                 read({"q": wave(), "note": np.array(["x"] * M)}, columns={"qpos:pin": source})
-    with pytest.raises(RecordingError, match=r"column 'ctrl:push' is missing"):
+    said = r"column 'ctrl:push' is missing.*constant, state the value: .* \"ctrl:push\" = 0\.0$"
+    with pytest.raises(RecordingError, match=said):
         read({"t": T, "q": wave(), "ctrl:turn": T}, bare=True, columns={"qpos:pin": "q"})
+
+
+def test_a_control_may_be_a_constant_that_no_column_holds(read: Read) -> None:
+    """A swing-down with the motors off, for example; a column of the same name is not read."""
+    off = {"ctrl:push": 0, "ctrl:turn": 0.25}
+    alone = read({"t": T, "qpos:pin": wave()}, bare=True, columns=off)
+    beside = read({"qpos:pin": wave()}, columns=off)
+    for logged in (alone, beside):
+        assert np.array_equal(logged.recording.ctrl, np.tile([0.0, 0.25], (M - 1, 1)))
+        assert [each.name for each in logged.summary.columns] == ["qpos:pin"]
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"qpos:pin": 0.5}, "columns.qpos:pin: a number is the value of a constant control"),
+        ({"ctrl:pull": 0.5}, "unknown column 'ctrl:pull'"),
+    ],
+)
+def test_only_controls_may_be_constants(read: Read, columns: dict[str, float], said: str) -> None:
+    with pytest.raises(ExperimentError, match=said):
+        read({"qpos:pin": wave()}, columns=columns)
 
 
 # ---- degrees
