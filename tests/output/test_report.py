@@ -179,6 +179,19 @@ def test_the_verdict_on_a_design(changes: dict[str, Any], level: Level, words: s
     assert next_steps(design)
 
 
+def test_a_limit_that_swings_fast_is_drawn_as_an_envelope() -> None:
+    """Of 2,000 swings, the largest size in each of 150 intervals remains."""
+    t = np.linspace(0.0, 2.0, 20_001)
+    share = (0.5 + 0.2 * t) * np.sin(2e3 * np.pi * t)
+    usage = LimitUsage(kind="force", name="motor", t=t, share=share, lower=-1.0, upper=1.0)
+    panels = data_of(rendered(page_of(results.design(usage=(usage,)))))["panels"]
+    panel = next(p for p in panels if p["linked"] == "limits")
+    values = numbers(panel["traces"][0]["y"])
+    assert len(values) == 150
+    assert values.max() == pytest.approx(100.0 * np.abs(share).max())
+    assert panel["layout"]["yaxis"]["range"][0] == 0.0
+
+
 def test_a_rough_design_asks_for_another_motion_not_for_more_time() -> None:
     steps = next_steps(results.design(status=Status.ROUGH))
     assert "contacts" in steps[0]

@@ -47,6 +47,10 @@ NEAR_BOUND = 1.0
 # Largest number of curves of one kind of limit; of more, those that come closest to a bound.
 MAX_LIMIT_CURVES = 8
 
+# Number of turns of a curve above which it would be solid ink, so that an envelope is drawn, and
+# number of intervals of the envelope.
+MAX_TURNS, ENVELOPE_INTERVALS = 120, 150
+
 # Colours of the curves of limits, in the order of their closeness to a bound.
 LIMIT_ROLES = tuple(f"series{i}" for i in range(MAX_LIMIT_CURVES))
 
@@ -278,7 +282,8 @@ def _limit_plots(design: Design) -> PlotGroup:
         panels.append(_limit_panel(design, kind, usages, limit))
     note = (
         "Every engine step of the designed motion on the stated model, in percent of the way from "
-        "the middle of the range to its bound; the dashed lines are the bounds."
+        "the middle of the range to its bound; the dashed lines are the bounds. Where a curve "
+        "swings too fast to be seen, its largest size in short intervals is drawn."
     )
     return PlotGroup(title="How much of each limit is used", panels=panels, note=note)
 
@@ -287,39 +292,60 @@ def _limit_panel(design: Design, kind: str, usages: list[LimitUsage], limit: int
     """Return the plot of one kind of limit; the curves closest to a bound are drawn."""
     closest_first = sorted(usages, key=lambda usage: -float(np.abs(usage.share).max()))
     shown = closest_first[:MAX_LIMIT_CURVES]
+    is_dense = any(_turns(usage.share) > MAX_TURNS for usage in shown)
     traces, keys = [], []
     for usage, role in zip(shown, LIMIT_ROLES, strict=False):
         percent = 100.0 * usage.share
-        largest = float(np.abs(percent).max())
-        name = f"{usage.name} {largest:.0f} %"
-        traces.append(curve(usage.t, percent, name, role, limit=limit, width=1.3))
+        name = f"{usage.name} {float(np.abs(percent).max()):.0f} %"
+        times, values = _envelope(usage.t, percent) if is_dense else (usage.t, percent)
+        traces.append(curve(times, values, name, role, limit=limit, width=1.3))
         keys.append(Key(name=name, role=role))
 
+    # A clearance has one bound, and an envelope shows the closer one.
     largest = 100.0 * float(np.abs(closest_first[0].share).max())
-    is_clearance = kind == "clearance"
+    one_sided = is_dense or kind == "clearance"
     reach = max(112.0, 1.08 * largest)
-    bounds = [level(100.0, "bound")] + ([] if is_clearance else [level(-100.0, "bound")])
-    beyond = [band(100.0, reach, "forbidden")]
-    if not is_clearance:
-        beyond.append(band(-reach, -100.0, "forbidden"))
+    shapes = [level(100.0, "bound"), band(100.0, reach, "forbidden")]
+    if not one_sided:
+        shapes += [level(-100.0, "bound"), band(-reach, -100.0, "forbidden")]
 
     margin = design.limits.get(kind, float("nan"))
     remark = f"violated by {-margin:.3g}" if margin < 0.0 else f"smallest margin {margin:.3g}"
     more = len(usages) - len(shown)
-    unit = "required / actual distance [%]" if is_clearance else "place in the range [%]"
-    title = f"{kind.replace('_', ' ')}: {unit}"
     return Panel(
-        title=title,
+        title=f"{kind.replace('_', ' ')}: {_limit_title(kind, is_dense=is_dense)}",
         traces=traces,
         layout={
             "xaxis": axis("time [s]"),
-            "yaxis": axis(range=[0.0 if is_clearance else -reach, reach]),
-            "shapes": [*bounds, *beyond],
+            "yaxis": axis(range=[0.0 if one_sided else -reach, reach]),
+            "shapes": shapes,
         },
         remark=remark + (f"; {more} curves with smaller shares are not drawn" if more else ""),
         linked="limits",
         keys=keys,
     )
+
+
+def _limit_title(kind: str, *, is_dense: bool) -> str:
+    """Return what the vertical axis of a limit shows."""
+    if kind == "clearance":
+        return "required / actual distance [%]"
+    return "largest use in short intervals [%]" if is_dense else "place in the range [%]"
+
+
+def _turns(values: Array) -> int:
+    """Return how often a curve turns up or down."""
+    slopes = np.sign(np.diff(values))
+    slopes = slopes[slopes != 0.0]
+    return int(np.count_nonzero(np.diff(slopes)))
+
+
+def _envelope(t: Array, values: Array) -> tuple[Array, Array]:
+    """Return the largest size of a curve in short intervals, with their middle times."""
+    parts = np.array_split(np.abs(values), min(ENVELOPE_INTERVALS, len(values)))
+    times = np.array_split(t, len(parts))
+    middles = np.array([float(part.mean()) for part in times])
+    return middles, np.array([float(part.max()) for part in parts])
 
 
 # ---- optimisation
@@ -346,10 +372,18 @@ def _history_plots(design: Design) -> PlotGroup:
         panels.append(_history_panel(title, iterations, margins, logarithmic=False))
 
     note = f"{design.status.value[:1].upper()}{design.status.value[1:]}."
-    if history and not np.isclose(history[0].cost, design.initial.cost, rtol=1e-9, atol=0.0):
+    is_other = history and not np.isclose(history[0].cost, design.initial.cost, rtol=1e-9, atol=0.0)
+    rates = list(dict.fromkeys(row.rate for row in history if row.rate > 0.0))
+    if is_other and design.found_by != "initial control":
         note += f" The search did not begin at the initial control, but at {design.found_by}."
+    if len(rates) > 1:
+        shown = " → ".join(f"{rate:g}" for rate in rates)
+        note += f" The time grid becomes finer ({shown} Hz), which changes the cost at once."
     if any(row.mu for row in history):
-        note += " With limits, the slope is that of log J plus the barrier."
+        note += (
+            " With limits, the slope is that of log J plus the barrier, and a vertical step of a "
+            "curve is a new stage of the barrier."
+        )
     return PlotGroup(title="Trace of the search", panels=panels, note=note)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 from mjfim.output.html import escape
 from mjfim.output.report.page import Page, Panel, PlotGroup
 from mjfim.output.report.palette import palettes
-from mjfim.output.summary_parts import Emphasis, SummaryTable
+from mjfim.output.summary_parts import Emphasis, SummaryTable, capitalised
 from mjfim.output.video import Video
 from mjfim.output.vocabulary import shown_word
 
@@ -32,6 +32,9 @@ CLASSES = {
     Emphasis.STRONG_WARNING: "warning-row warning strong",
     Emphasis.DERIVED: "derived",
 }
+
+# Space between a number and its sign of percent or of a standard deviation.
+UNIT_SPACE = re.compile(r"(?<=\d) (?=[%σ])|(?<=±) (?=\d)")
 
 # The video of a report, and the sentence that stands there instead; the template writes both.
 VIDEO = re.compile(
@@ -70,12 +73,14 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
     number_of = {id(panel): i for i, panel in enumerate(panels)}
     environment.filters.update(
         base64=lambda content: base64.b64encode(content).decode("ascii"),
+        capital=capitalised,
         colours=_plain_colours,
         emphasis_class=CLASSES.__getitem__,
         group_heads=lambda table: list(_group_heads(table)),
         kind_of=lambda part: type(part).__name__,
         panel_number=lambda panel: number_of[id(panel)],
-        prose=lambda text: Markup(escape(text)),
+        prose=lambda text: Markup(UNIT_SPACE.sub("\u00a0", escape(text))),
+        sentence=_as_sentence,
         without_bullet=lambda text: text.removeprefix("• "),
     )
 
@@ -143,6 +148,11 @@ def _as_json(panel: Panel) -> dict[str, Any]:
         "height": panel.height,
         "linked": panel.linked,
     }
+
+
+def _as_sentence(text: str) -> str:
+    """Return a text with a capital first letter and a full stop."""
+    return capitalised(text) + ("" if text.endswith((".", "!", "?")) else ".")
 
 
 def _plain_colours(palette: Mapping[str, Any]) -> list[tuple[str, str]]:
