@@ -12,11 +12,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.output.report.page import Panel, Plotly
 
-# Number of points of all curves of a report together; a longer log is thinned for display.
-MAX_POINTS = 120_000
-
-# Smallest and largest number of points of one curve.
-FEWEST_POINTS, MOST_POINTS = 200, 4000
+# Smallest and largest number of points of one curve; a longer one is thinned for display.
+FEWEST_POINTS, MOST_POINTS = 40, 4000
 
 # Share of the range of values below which single precision is exact enough for display.
 DISPLAY_PRECISION = 1e-5
@@ -66,13 +63,21 @@ def packed(values: Array | Sequence[float]) -> dict[str, str]:
     return {"dtype": kind, "bdata": base64.b64encode(content).decode("ascii")}
 
 
-def points_per_curve(curves: int) -> int:
-    """Return how many points each of several curves may have.
+def points_per_curve(lengths: Sequence[int], points: int) -> int:
+    """Return how many points each curve may have, so that all together have at most so many.
 
     Args:
-        curves: Number of all curves of a report.
+        lengths: Number of points of each curve.
+        points: Number of points of all curves together, as long as every curve keeps a few.
     """
-    return int(np.clip(MAX_POINTS // max(curves, 1), FEWEST_POINTS, MOST_POINTS))
+    low, high = FEWEST_POINTS, MOST_POINTS
+    while low < high:
+        middle = (low + high + 1) // 2
+        if sum(min(length, middle) for length in lengths) <= points:
+            low = middle
+        else:
+            high = middle - 1
+    return low
 
 
 def thinned(values: Array, limit: int) -> np.ndarray:
@@ -107,6 +112,34 @@ def thinned(values: Array, limit: int) -> np.ndarray:
     return np.unique(np.minimum(ends, count - 1))
 
 
+def is_line(trace: Plotly) -> bool:
+    """Whether a trace is a line or dots, whose points are arrays that are thinned for display.
+
+    Args:
+        trace: The trace.
+    """
+    return bool(trace["type"] == "scatter")
+
+
+def packed_trace(trace: Plotly, limit: int) -> Plotly:
+    """Return a trace with at most so many points, as the plotting library reads it from text.
+
+    Args:
+        trace: The trace; only lines and dots are changed.
+        limit: Largest number of points.
+    """
+    if not is_line(trace):
+        return trace
+
+    # Points with intervals are few, and each is shown.
+    has_intervals = "error_x" in trace or "error_y" in trace
+    kept = thinned(trace["y"], len(trace["y"]) if has_intervals else limit)
+    changed: Plotly = {"x": packed(trace["x"][kept]), "y": packed(trace["y"][kept])}
+    if "text" in trace:
+        changed["text"] = [trace["text"][i] for i in kept]
+    return {**trace, **changed}
+
+
 # ---- traces
 
 
@@ -116,32 +149,29 @@ def curve(
     name: str,
     role: str,
     *,
-    limit: int = MOST_POINTS,
     width: float = 1.6,
     dash: str = "solid",
     held: bool = False,
 ) -> Plotly:
-    """Return a line.
+    """Return a line, all points of it.
 
     Args:
         x: (n,) horizontal values.
         y: (n,) vertical values; NaN is a gap.
         name: Name in the legend.
         role: Role of its colour.
-        limit: Largest number of points.
         width: Line width [CSS pixels].
         dash: "solid", "dot" or "dash".
         held: True where a value is held until the next one.
     """
-    kept = thinned(y, limit)
     line = {"color": f"role:{role}", "width": width, "dash": dash}
     if held:
         line["shape"] = "hv"
     return {
         "type": "scatter",
         "mode": "lines",
-        "x": packed(x[kept]),
-        "y": packed(y[kept]),
+        "x": np.asarray(x, dtype=np.float64),
+        "y": np.asarray(y, dtype=np.float64),
         "name": escape(name),
         "legendgroup": name,
         "line": line,
@@ -154,35 +184,32 @@ def dots(
     name: str,
     role: str,
     *,
-    limit: int = MOST_POINTS,
     size: float = 4.0,
     symbol: str = "circle",
     texts: Sequence[str] | None = None,
 ) -> Plotly:
-    """Return dots.
+    """Return dots, all of them.
 
     Args:
         x: (n,) horizontal values.
         y: (n,) vertical values.
         name: Name in the legend.
         role: Role of their colour.
-        limit: Largest number of dots.
         size: Diameter [CSS pixels].
         symbol: Symbol of the plotting library.
         texts: n texts that are shown at the pointer.
     """
-    kept = thinned(y, limit)
     trace: Plotly = {
         "type": "scatter",
         "mode": "markers",
-        "x": packed(x[kept]),
-        "y": packed(y[kept]),
+        "x": np.asarray(x, dtype=np.float64),
+        "y": np.asarray(y, dtype=np.float64),
         "name": escape(name),
         "legendgroup": name,
         "marker": {"color": f"role:{role}", "size": size, "symbol": symbol},
     }
     if texts is not None:
-        trace["text"] = [escape(texts[i]) for i in kept]
+        trace["text"] = [escape(text) for text in texts]
         trace["hoverinfo"] = "text+name"
     return trace
 

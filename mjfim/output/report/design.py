@@ -17,7 +17,6 @@ from mjfim.output.report.curves import (
     curve,
     level,
     log_axis,
-    points_per_curve,
     row_axis,
     rows_height,
     rows_of_bars,
@@ -167,16 +166,12 @@ def _motion_plots(design: Design, labels: Labels) -> Iterator[PlotGroup]:
         ("Controls", "ctrl", labels.controls),
     )
     bounds = _bounds_by_label(design, labels)
-    curves = 2 * (1 + sum(len(names) for _, _, names in groups))
-    limit = points_per_curve(curves + len(design.usage))
-    thinned = len(design.trajectory.t) > limit
-
-    yield _information_plot(design, limit, thinned=thinned)
+    yield _information_plot(design)
     for title, quantity, names in groups:
         if not names:
             continue
         panels = [
-            _signal_panel(design, quantity, i, name, limit, bounds.get((quantity, name), ()))
+            _signal_panel(design, quantity, i, name, bounds.get((quantity, name), ()))
             for i, name in enumerate(names[:MAX_PANELS])
         ]
         has_bounds = any((quantity, name) in bounds for name in names)
@@ -211,7 +206,6 @@ def _signal_panel(
     quantity: str,
     column: int,
     label: str,
-    limit: int,
     bounds: tuple[float, float] | tuple[()],
 ) -> Panel:
     """Return the plot of one column of both trajectories, with its bounds."""
@@ -223,7 +217,7 @@ def _signal_panel(
         if held:
             # The last control is held until the end.
             values = np.append(values, values[-1])
-        traces.append(curve(t, values, term.word, term.word, limit=limit, held=held))
+        traces.append(curve(t, values, term.word, term.word, held=held))
         extremes += [float(values.min()), float(values.max())]
 
     lines = [bound for bound in bounds if np.isfinite(bound)]
@@ -238,10 +232,10 @@ def _signal_panel(
     return Panel(title=label, traces=traces, layout=layout, linked="time")
 
 
-def _information_plot(design: Design, limit: int, *, thinned: bool) -> PlotGroup:
+def _information_plot(design: Design) -> PlotGroup:
     """Return the plot of the information that is gathered up to each time."""
     traces = [
-        _root_information(evaluation, term.word, limit)
+        _root_information(evaluation, term.word)
         for evaluation, term in ((design.initial, INITIAL), (design.final, DESIGNED))
     ]
     panel = Panel(
@@ -255,18 +249,13 @@ def _information_plot(design: Design, limit: int, *, thinned: bool) -> PlotGroup
         "λ_min: smallest eigenvalue of the Fisher information up to time t, divided by the rate of "
         "the measurements. It rises where the motion tells most."
     )
-    if thinned:
-        note += (
-            " Long curves are thinned for display: the smallest and the largest value of each "
-            "interval are drawn, so that peaks stay; design.npz has all samples."
-        )
     return PlotGroup(title="Information", panels=[panel], keys=TRAJECTORY_KEYS, note=note)
 
 
-def _root_information(evaluation: Evaluation, name: str, limit: int) -> Plotly:
+def _root_information(evaluation: Evaluation, name: str) -> Plotly:
     """Return the curve of the root of the smallest eigenvalue of one trajectory."""
     root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
-    return curve(evaluation.trajectory.t, root, name, name, limit=limit)
+    return curve(evaluation.trajectory.t, root, name, name)
 
 
 # ---- limits
@@ -275,11 +264,10 @@ def _root_information(evaluation: Evaluation, name: str, limit: int) -> Plotly:
 def _limit_plots(design: Design) -> PlotGroup:
     """Return a plot of the used share of each limit, one for each kind."""
     kinds = list(dict.fromkeys(usage.kind for usage in design.usage))
-    limit = points_per_curve(len(design.usage) + 2 * len(kinds))
     panels = []
     for kind in kinds:
         usages = [usage for usage in design.usage if usage.kind == kind]
-        panels.append(_limit_panel(design, kind, usages, limit))
+        panels.append(_limit_panel(design, kind, usages))
     note = (
         "Every engine step of the designed motion on the stated model, in percent of the way from "
         "the middle of the range to its bound; the dashed lines are the bounds. Where a curve "
@@ -288,7 +276,7 @@ def _limit_plots(design: Design) -> PlotGroup:
     return PlotGroup(title="How much of each limit is used", panels=panels, note=note)
 
 
-def _limit_panel(design: Design, kind: str, usages: list[LimitUsage], limit: int) -> Panel:
+def _limit_panel(design: Design, kind: str, usages: list[LimitUsage]) -> Panel:
     """Return the plot of one kind of limit; the curves closest to a bound are drawn."""
     closest_first = sorted(usages, key=lambda usage: -float(np.abs(usage.share).max()))
     shown = closest_first[:MAX_LIMIT_CURVES]
@@ -298,7 +286,7 @@ def _limit_panel(design: Design, kind: str, usages: list[LimitUsage], limit: int
         percent = 100.0 * usage.share
         name = f"{usage.name} {float(np.abs(percent).max()):.0f} %"
         times, values = _envelope(usage.t, percent) if is_dense else (usage.t, percent)
-        traces.append(curve(times, values, name, role, limit=limit, width=1.3))
+        traces.append(curve(times, values, name, role, width=1.3))
         keys.append(Key(name=name, role=role))
 
     # A clearance has one bound, and an envelope shows the closer one.

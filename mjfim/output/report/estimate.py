@@ -20,7 +20,6 @@ from mjfim.output.report.curves import (
     dots,
     level,
     log_axis,
-    points_per_curve,
     row_axis,
     rows_height,
     rows_of_bars,
@@ -219,7 +218,6 @@ def _held_out_plots(
 ) -> Iterator[PlotGroup]:
     """Yield measured, identified and nominal signals of the held-out recordings."""
     shown = [p for p in estimate.predictions if p.recording is not None][:MAX_RECORDINGS]
-    limit = points_per_curve(3 * len(columns) * (len(shown) + len(estimate.recordings)))
     for k, prediction in enumerate(shown):
         recording = prediction.recording
         if recording is None or len(prediction.identified_outputs) != len(recording.t):
@@ -231,7 +229,7 @@ def _held_out_plots(
         )
         name = PurePath(prediction.name).name
         panels = [
-            _signal_panel(signals, j, labels, limit, f"held out {k}")
+            _signal_panel(signals, j, labels, f"held out {k}")
             for j in columns
             if j < len(recording.outputs)
         ]
@@ -279,16 +277,16 @@ def _signal_keys(signals: _Signals) -> list[Key]:
     return keys
 
 
-def _signal_panel(signals: _Signals, j: int, labels: Labels, limit: int, linked: str) -> Panel:
+def _signal_panel(signals: _Signals, j: int, labels: Labels, linked: str) -> Panel:
     """Return the plot of one output of a recording; the nominal model lies at the back."""
     t, recording = signals.recording.t, signals.recording
     traces = []
     if signals.has_nominal:
         values = signals.nominal[:, j]
-        traces.append(curve(t, values, NOMINAL.word, NOMINAL.word, limit=limit, width=1.1))
+        traces.append(curve(t, values, NOMINAL.word, NOMINAL.word, width=1.1))
     traces += [
-        _measured_dots(t, recording.y[:, j], limit),
-        curve(t, signals.identified[:, j], IDENTIFIED.word, IDENTIFIED.word, limit=limit),
+        _measured_dots(t, recording.y[:, j]),
+        curve(t, signals.identified[:, j], IDENTIFIED.word, IDENTIFIED.word),
     ]
 
     # With many segments, lines would hide the curves.
@@ -311,7 +309,6 @@ def _shown_outputs(estimate: Estimate) -> list[int]:
 def _fit_plots(estimate: Estimate, labels: Labels, columns: Sequence[int]) -> Iterator[PlotGroup]:
     """Yield the measured and the identified signals of every recording, and their residuals."""
     shown = estimate.recordings[:MAX_RECORDINGS]
-    limit = points_per_curve(3 * len(columns) * len(shown))
     outputs = estimate.recordings[0].outputs
     nominal: tuple[Array, ...] = getattr(estimate, "nominal", ())
     segments: tuple[Array, ...] = getattr(estimate, "segments", ())
@@ -324,18 +321,18 @@ def _fit_plots(estimate: Estimate, labels: Labels, columns: Sequence[int]) -> It
         )
         panels, residuals = [], []
         for j in columns:
-            panels.append(_signal_panel(signals, j, labels, limit, f"time {i}"))
+            panels.append(_signal_panel(signals, j, labels, f"time {i}"))
             residual = recording.y[:, j] - estimate.predicted[i][:, j]
             sigma = estimate.sigma.get(outputs[j], float("nan"))
             label = labels.output(outputs[j])
-            residuals.append(_residual_panel(recording.t, residual, sigma, label, limit, i))
+            residuals.append(_residual_panel(recording.t, residual, sigma, label, i))
 
         name = PurePath(recording.name).name
         yield PlotGroup(
             title=f"Fit to {name}",
             panels=panels,
             keys=_signal_keys(signals),
-            note=_signal_note(estimate, len(columns), signals, limit),
+            note=_signal_note(estimate, len(columns), signals),
             folded=i > 0,
         )
         yield PlotGroup(
@@ -346,12 +343,12 @@ def _fit_plots(estimate: Estimate, labels: Labels, columns: Sequence[int]) -> It
         )
 
 
-def _measured_dots(t: Array, values: Array, limit: int) -> Plotly:
+def _measured_dots(t: Array, values: Array) -> Plotly:
     """Return the measured values of one output as small dots."""
-    return dots(t, values, MEASURED.word, MEASURED.word, limit=limit, size=3.0)
+    return dots(t, values, MEASURED.word, MEASURED.word, size=3.0)
 
 
-def _signal_note(estimate: Estimate, drawn: int, signals: _Signals, limit: int) -> str:
+def _signal_note(estimate: Estimate, drawn: int, signals: _Signals) -> str:
     """Say what dotted lines mean, and what the plots leave out."""
     parts = []
     if 1 < len(signals.begins) <= MAX_SEGMENTS:
@@ -365,24 +362,17 @@ def _signal_note(estimate: Estimate, drawn: int, signals: _Signals, limit: int) 
         parts.append(
             f"The first {MAX_RECORDINGS} of {len(estimate.recordings)} recordings are drawn."
         )
-    if len(signals.recording.t) > limit:
-        parts.append(
-            "Long curves are thinned for display: the smallest and the largest value of each "
-            "interval are drawn, so that peaks stay; estimate.npz has all samples."
-        )
     return " ".join(parts)
 
 
-def _residual_panel(
-    t: Array, residual: Array, sigma: float, label: str, limit: int, i: int
-) -> Panel:
+def _residual_panel(t: Array, residual: Array, sigma: float, label: str, i: int) -> Panel:
     """Return the plot of the residuals of one output in one recording over time."""
     name, unit = split_unit(label)
     known = residual[np.isfinite(residual)]
     outside = 100.0 * float(np.mean(np.abs(known) > 2.0 * sigma)) if known.size else float("nan")
     return Panel(
         title=f"{name}: residual [{unit or '–'}]",
-        traces=[dots(t, residual, "residual", MEASURED.word, limit=limit)],
+        traces=[dots(t, residual, "residual", MEASURED.word)],
         layout={"xaxis": axis("time [s]"), "shapes": [band(-2.0 * sigma, 2.0 * sigma)]},
         remark=f"{outside:.1f} % outside ± 2 σ (noise: 4.6 %)",
         linked=f"time {i}",

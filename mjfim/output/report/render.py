@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import unescape
 from typing import Any
 
 from mjfim.output.html import escape
+from mjfim.output.report.curves import is_line, packed_trace, points_per_curve
 from mjfim.output.report.page import Page, Panel, PlotGroup
 from mjfim.output.report.palette import palettes
 from mjfim.output.summary_parts import Emphasis, SummaryTable, capitalised
@@ -32,6 +33,12 @@ CLASSES = {
     Emphasis.STRONG_WARNING: "warning-row warning strong",
     Emphasis.DERIVED: "derived",
 }
+
+# Largest size of a report, and size of its tables and sentences [bytes].
+MAX_SIZE, TEXT_SIZE = 7_800_000, 250_000
+
+# Largest size of a point of a curve in the file [bytes].
+POINT_SIZE = 22
 
 # Space between a number and its sign of percent or of a standard deviation.
 UNIT_SPACE = re.compile(r"(?<=\d) (?=[%σ])|(?<=±) (?=\d)")
@@ -69,7 +76,9 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
         trim_blocks=True,
         keep_trailing_newline=True,
     )
+    library = get_plotlyjs()
     panels = list(_panels(page))
+    limit = _limit_of(panels, len(library), video)
     number_of = {id(panel): i for i, panel in enumerate(panels)}
     environment.filters.update(
         base64=lambda content: base64.b64encode(content).decode("ascii"),
@@ -81,6 +90,7 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
         panel_number=lambda panel: number_of[id(panel)],
         prose=lambda text: Markup(UNIT_SPACE.sub("\u00a0", escape(text))),
         sentence=_as_sentence,
+        thinned=lambda group: _is_thinned(group, limit),
         without_bullet=lambda text: text.removeprefix("• "),
     )
 
@@ -89,7 +99,7 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
         return Markup(loader.get_source(environment, file)[0])
 
     colours = palettes()
-    data = {"palettes": colours, "panels": [_as_json(panel) for panel in panels]}
+    data = {"palettes": colours, "panels": [_as_json(panel, limit) for panel in panels]}
     return environment.get_template("report.html.j2").render(
         page=page,
         name=name,
@@ -99,7 +109,7 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
         data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
         css=own_file("report.css"),
         js=own_file("report.js"),
-        plotly=Markup(get_plotlyjs()),
+        plotly=Markup(library),
     )
 
 
@@ -140,10 +150,29 @@ def _panels(page: Page) -> Iterator[Panel]:
                 yield from part.panels
 
 
-def _as_json(panel: Panel) -> dict[str, Any]:
+def _limit_of(panels: Sequence[Panel], library: int, video: Video | None) -> int:
+    """Return how many points a curve may have, so that the file is small enough.
+
+    Args:
+        panels: All plots.
+        library: Size of the plotting library [bytes].
+        video: The video, or None.
+    """
+    taken = library + TEXT_SIZE + (0 if video is None else 4 * len(video.data) // 3)
+    points = max(MAX_SIZE - taken, 0) // POINT_SIZE
+    lengths = [len(trace["y"]) for p in panels for trace in p.traces if is_line(trace)]
+    return points_per_curve(lengths, points)
+
+
+def _is_thinned(group: PlotGroup, limit: int) -> bool:
+    """Whether a curve of a group of plots has more points than are drawn."""
+    return any(is_line(t) and len(t["y"]) > limit for panel in group.panels for t in panel.traces)
+
+
+def _as_json(panel: Panel, limit: int) -> dict[str, Any]:
     """Return what the script of the page reads of a plot."""
     return {
-        "traces": list(panel.traces),
+        "traces": [packed_trace(trace, limit) for trace in panel.traces],
         "layout": panel.layout,
         "height": panel.height,
         "linked": panel.linked,
