@@ -14,6 +14,10 @@ from mjfim.atomic_io import replacing
 # BLAS reads the variable when NumPy is imported, which is later than this line.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# The reports of designs and estimates get no videos, which take seconds. Tests of videos ask for
+# the fixture `drawing`.
+os.environ["MUJOCO_GL"] = "disable"
+
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Restore Python's handler of SIGINT.
@@ -21,6 +25,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     A background job of a shell inherits SIGINT as ignored, and then the tests of Ctrl-C would fail.
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def drawing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let MuJoCo draw, by any kind of OpenGL that this computer has."""
+    monkeypatch.delenv("MUJOCO_GL")
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from mjfim.output.plots.pictures import Pictures, fit_names, histogram_name, pic
 from mjfim.output.presentation import describe
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import write_report
+from mjfim.output.video.results import video_for_report
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
@@ -202,6 +203,13 @@ def write_design_folder(
 
     run_optional(lambda: write_report(folder, Design))
     run_optional(lambda: _write_design_pictures(folder, design, system, picture_format))
+    run_optional(lambda: _add_video(folder, design, system))
+
+
+def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
+    """Write the report once more, with a video or with the sentence why there is none."""
+    video, sentence = video_for_report(system, result)
+    write_report(folder, type(result), video, sentence)
 
 
 def _write_design_pictures(
@@ -309,6 +317,7 @@ def write_estimate_folder(
 
     run_optional(lambda: write_report(folder, Estimate))
     run_optional(lambda: _write_estimate_pictures(folder, estimate, system, picture_format))
+    run_optional(lambda: _add_video(folder, estimate, system))
     return remarks
 
 

@@ -109,6 +109,7 @@ def test_without_a_renderer_there_is_no_video_and_a_sentence_says_so(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("drawing")
 def test_video_of_a_recording_is_written_again(study: Path, archived: Path, tmp_path: Path) -> None:
     """A second run replaces what the first one wrote."""
     target, film = tmp_path / "recording.csv", tmp_path / "film.gif"

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
+from mjfim.experiment.system import System
 from mjfim.output import vocabulary
 from mjfim.output.video import NoVideoError
 from mjfim.output.video.film import (
@@ -23,7 +25,9 @@ from mjfim.output.video.film import (
 )
 from mjfim.output.video.record import Video, format_of
 from mjfim.output.video.rendering import Effort, back_ends, render
+from mjfim.output.video.results import video_for_report
 from mjfim.records.trajectory import Trajectory
+from tests.support.paths import MODELS
 
 SWING = """
 <mujoco>
@@ -155,6 +159,21 @@ class TestVideo:
         with pytest.raises(NoVideoError, match="MUJOCO_GL turns drawing off"):
             render(film_of_estimate(swing, swinging(1.0), None), "gif")
 
+    def test_a_report_says_why_it_has_no_video(self) -> None:
+        """Nothing is drawn while tests run, see `tests/conftest.py`."""
+        system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+        resting = motion(np.array([0.0, 1.0]), np.zeros((2, 2)))
+        assert video_for_report(system, resting) == (
+            None,
+            "There is no video of the robot: the variable MUJOCO_GL turns drawing off.",
+        )
+
+        # A motion that diverged cannot be drawn anywhere.
+        diverged = motion(np.array([0.0, 1.0]), np.full((2, 2), np.nan))
+        video, sentence = video_for_report(system, diverged)
+        assert video is None
+        assert "positions that are not finite" in sentence
+
     def test_a_stated_context_is_the_only_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("MUJOCO_GL", "egl")
         assert back_ends() == ("egl",)
@@ -162,6 +181,7 @@ class TestVideo:
         assert len(back_ends()) >= 1
 
     @pytest.mark.slow
+    @pytest.mark.usefixtures("drawing")
     def test_mp4_shows_both_motions(self, swing: mujoco.MjModel, tmp_path: Path) -> None:
         av = pytest.importorskip("av", reason="mp4 needs the extra `video`")
         named = {"initial": swinging(4.0, 0.0), "final": swinging(4.0, 1.0)}
@@ -183,6 +203,7 @@ class TestVideo:
         assert change[: half - 20].max() < 40 < change[half + 20 :].max()
 
     @pytest.mark.slow
+    @pytest.mark.usefixtures("drawing")
     def test_gif_repeats_for_ever(self, swing: mujoco.MjModel) -> None:
         video = drawn(film_of_estimate(swing, swinging(3.0), swinging(3.0, 0.6)), "gif")
         with Image.open(io.BytesIO(video.data)) as picture:

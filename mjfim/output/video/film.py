@@ -15,6 +15,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.output import vocabulary
 from mjfim.output.rerun.scene import BodyPoses, body_poses
 from mjfim.output.video.camera import FilmCamera, lowered, place_film_camera
+from mjfim.output.video.record import NoVideoError
 from mjfim.output.vocabulary import Term
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Trajectory
@@ -190,6 +191,9 @@ def film_of_estimate(
 
 def _film(model: mujoco.MjModel, motions: Sequence[Sequence[tuple[Term, Trajectory]]]) -> Film:
     """Film motions: a view for each list, in which the motions after the first are ghosts."""
+    if not all(np.isfinite(each.qpos).all() for view in motions for _, each in view):
+        raise NoVideoError("the motion has positions that are not finite")
+
     longest = max((each for view in motions for _, each in view), key=lambda each: each.t[-1])
     begin, end = float(longest.t[0]), float(longest.t[-1])
     speed = film_speed(end - begin)

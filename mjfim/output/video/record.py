@@ -68,6 +68,15 @@ def format_of(path: Path) -> Format:
     return found
 
 
+def has_encoder(kind: Format) -> bool:
+    """Return whether a format can be written.
+
+    Args:
+        kind: The format.
+    """
+    return kind != "mp4" or find_spec("av") is not None
+
+
 def require_encoder(kind: Format) -> None:
     """Make sure before the work that a format can be written.
 
@@ -77,7 +86,7 @@ def require_encoder(kind: Format) -> None:
     Raises:
         NoVideoError: A package is missing.
     """
-    if kind == "mp4" and find_spec("av") is None:
+    if not has_encoder(kind):
         raise NoVideoError(
             "mp4 needs the package av; install it with `pip install 'mjfim[video]'`, or write a "
             "file that ends in .gif"

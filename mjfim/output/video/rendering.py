@@ -87,11 +87,14 @@ def render(film: Film, kind: Format, effort: Effort = WANTED) -> Video:
         NoVideoError: Nothing can be drawn here, or not in time.
     """
     require_encoder(kind)
-    with tempfile.TemporaryDirectory(prefix="mjfim-video-") as name:
-        folder = Path(name)
-        _write_job(folder, film, kind, effort)
-        result = _drawn(folder, effort)
-        data = (folder / f"film.{kind}").read_bytes()
+    try:
+        with tempfile.TemporaryDirectory(prefix="mjfim-video-") as name:
+            folder = Path(name)
+            _write_job(folder, film, kind, effort)
+            result = _drawn(folder, effort)
+            data = (folder / f"film.{kind}").read_bytes()
+    except OSError as error:
+        raise NoVideoError(f"its temporary files cannot be written ({error})") from None
 
     return Video(
         data=data,

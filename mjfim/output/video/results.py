@@ -13,8 +13,15 @@ from mjfim.output.video.film import (
     film_of_estimate,
     film_of_trajectories,
 )
-from mjfim.output.video.record import NoVideoError, Video, format_of
-from mjfim.output.video.rendering import WANTED, Effort, render
+from mjfim.output.video.record import (
+    Format,
+    NoVideoError,
+    Video,
+    format_of,
+    has_encoder,
+    require_encoder,
+)
+from mjfim.output.video.rendering import ADDED, WANTED, render
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Trajectory
@@ -41,24 +48,42 @@ def save_video(experiment: Experiment, result: Filmed, path: str | Path) -> Vide
         NoVideoError: Nothing can be drawn on this computer, or a package is missing.
         RecordingError: The ending of the file is another one.
     """
-    kind = format_of(Path(path))
-    video = render(film_of(System.resolve(experiment), result), kind, WANTED)
-    video.save(Path(path))
-    return video
+    require_encoder(format_of(Path(path)))
+    return write_video(Path(path), System.resolve(experiment), result)
 
 
-def write_video(path: Path, system: System, result: Filmed, effort: Effort = WANTED) -> Video:
+def write_video(path: Path, system: System, result: Filmed) -> Video:
     """Write a video of a result. See `save_video`.
 
     Args:
         path: The file.
         system: The experiment, resolved.
         result: The result.
-        effort: What it may cost.
     """
-    video = render(film_of(system, result), format_of(path), effort)
+    video = render(film_of(system, result), format_of(path), WANTED)
     video.save(path)
     return video
+
+
+def video_for_report(system: System, result: Filmed) -> tuple[Video | None, str]:
+    """Draw a video for a report, if that takes little time.
+
+    Args:
+        system: The experiment, resolved.
+        result: The result.
+
+    Returns:
+        The video or None, and the sentence that says why there is none.
+    """
+    # Every browser shows both; an mp4 is smaller.
+    kind: Format = "mp4" if has_encoder("mp4") else "webp"
+    try:
+        video = render(film_of(system, result), kind, ADDED)
+        if len(video.data) > ADDED.max_bytes:
+            raise NoVideoError("its file is larger than 2 MB")
+    except NoVideoError as reason:
+        return None, f"There is no video of the robot: {reason}."
+    return video, ""
 
 
 def film_of(system: System, result: Filmed) -> Film:

@@ -134,7 +134,8 @@ def film(
         drawing.close()
 
     if rate / step < float(job["fewest_frames"]):
-        return {"reason": f"drawing it takes about {seconds:.0f} s on this computer"}
+        text = f"drawing it takes about {seconds:.0f} s here, for which --video FILE.mp4 waits"
+        return {"reason": text}
 
     chosen = range(0, frames, step)
     width, height = drawing.size
