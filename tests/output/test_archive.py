@@ -30,6 +30,7 @@ from mjfim.output import archive
 from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings import read as logs
 from mjfim.records.design import Design
+from mjfim.records.iterates import MAX_MOTIONS, MOTION_SAMPLES
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import as_json
 from mjfim.records.trajectory import Trajectory
@@ -88,7 +89,9 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
     """Names and shapes of all arrays, for the designed and the initial trajectory."""
     with np.load(folder / "design.npz", allow_pickle=False) as data:
         shapes = {key: data[key].shape for key in data.files}
-        kinds = {data[key].dtype for key in data.files if key != "record"}
+        motions = {key for key in data.files if key.startswith("motions.")}
+        kinds = {data[key].dtype for key in {*data.files} - motions - {"record"}}
+        kinds_of_motions = {data[key].dtype for key in motions}
         psi = data["initial_sensitivity"]
     known = {
         "t": (N + 1,),
@@ -100,8 +103,13 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         "sensitivity": (N + 1, 2 * NV, P),
     }
     further = {"information": (P, P), "eigenvalues": (P,), "std": (P,), "min_eigenvalue": (N + 1,)}
+    m = shapes["motions.iteration"][0]
+    moving = {"t": (), "qpos": (NQ,), "ctrl": (NU,)}
+    assert 2 <= m <= MAX_MOTIONS
     assert shapes == {
         **known,
+        "motions.iteration": (m,),
+        **{f"motions.{key}": (m, MOTION_SAMPLES, *size) for key, size in moving.items()},
         **{f"initial_{key}": shape for key, shape in known.items()},
         **{f"final.{key}": shape for key, shape in further.items()},
         **{f"initial.{key}": shape for key, shape in further.items()},
@@ -109,6 +117,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         "record": (),
     }
     assert kinds == {np.dtype("float64")}
+    assert kinds_of_motions == {np.dtype("float32")}
     assert np.array_equal(psi, design.initial.sensitivity)
 
 
