@@ -30,11 +30,13 @@ class Term:
         word: The word for it.
         colour: Its colour, as `#rrggbb`.
         colour_on_dark: A brighter shade of it, for thin lines and text on a dark page.
+        colour_name: The word for its colour.
     """
 
     word: str
     colour: str
     colour_on_dark: str
+    colour_name: str
 
     @property
     def rgb(self) -> tuple[int, int, int]:
@@ -43,14 +45,16 @@ class Term:
         return red, green, blue
 
 
-INITIAL = Term(word="initial", colour="#0077bb", colour_on_dark="#4fb0f0")
-DESIGNED = Term(word="designed", colour="#cc3311", colour_on_dark="#ff7f66")
-NOMINAL = Term(word="nominal", colour="#ee7733", colour_on_dark="#f7a55c")
-MEASURED = Term(word="measured", colour="#009988", colour_on_dark="#2fc9b5")
-IDENTIFIED = Term(word="identified", colour="#aa3377", colour_on_dark="#e884bd")
+INITIAL = Term(word="initial", colour="#0077bb", colour_on_dark="#4fb0f0", colour_name="blue")
+DESIGNED = Term(word="designed", colour="#cc3311", colour_on_dark="#ff7f66", colour_name="red")
+NOMINAL = Term(word="nominal", colour="#ee7733", colour_on_dark="#f7a55c", colour_name="orange")
+MEASURED = Term(word="measured", colour="#009988", colour_on_dark="#2fc9b5", colour_name="teal")
+IDENTIFIED = Term(
+    word="identified", colour="#aa3377", colour_on_dark="#e884bd", colour_name="purple"
+)
 
 # What is beside the five, such as a baseline.
-OTHER = Term(word="other", colour="#8a6d3b", colour_on_dark="#cdb07a")
+OTHER = Term(word="other", colour="#8a6d3b", colour_on_dark="#cdb07a", colour_name="brown")
 
 TERMS = (INITIAL, DESIGNED, NOMINAL, MEASURED, IDENTIFIED)
 

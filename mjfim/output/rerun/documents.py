@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import mujoco
@@ -11,56 +13,67 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.arrays import evenly_spread_indices
-from mjfim.model.coordinates import output_label
 from mjfim.output import vocabulary
-from mjfim.output.rerun.camera import place_camera
-from mjfim.output.rerun.history import history_bars, history_lines, log_history
+from mjfim.output.rerun.camera import Camera, place_camera
+from mjfim.output.rerun.history import HistoryPlot, history_plots
+from mjfim.output.rerun.iterates import (
+    IterateCurves,
+    IteratePlot,
+    iterate_plots,
+    log_poses_of_iterates,
+)
 from mjfim.output.rerun.layout import (
     ASPECT_WITH_TEXT,
     ASPECT_WITHOUT_TEXT,
     arrange,
     open_recording,
-    recording_page,
     robot_views,
-    state_parts,
+    separate_and_overlaid,
 )
-from mjfim.output.rerun.panels import (
-    LayoutPart,
-    dof_positions,
-    grid_parts,
-    log_dots,
-    log_line,
-    log_steps,
-    series_view,
-    stack_parts,
-)
+from mjfim.output.rerun.limits import limits_of_design, limits_of_model, usage_plots
+from mjfim.output.rerun.outputs import held_out_plots, output_plots
+from mjfim.output.rerun.panels import grid_tabs
 from mjfim.output.rerun.phase_plots import PhasePlot, parameters_with_phase_plot
-from mjfim.output.rerun.scene import body_poses, entity_path, log_end_path, log_robot
+from mjfim.output.rerun.scene import (
+    BodyPoses,
+    body_poses,
+    end_point,
+    entity_path,
+    log_end_path,
+    log_robot,
+)
+from mjfim.output.rerun.series import Curve, SeriesPlot, views_of
 from mjfim.output.rerun.shapes import RobotStyle
+from mjfim.output.rerun.states import ShownTrajectory, StatePlots, state_plots
 from mjfim.output.rerun.text import design_text, estimate_text
 from mjfim.records.design import Design, Evaluation
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
 from mjfim.records.trajectory import Trajectory
 
-# Styles of the initial and the designed trajectory, and of a predicted and a measured motion.
+# Styles of the initial and the designed trajectory, and of the identified and the measured motion.
 INITIAL = RobotStyle(accent=vocabulary.INITIAL.rgb)
 DESIGNED = RobotStyle(accent=vocabulary.DESIGNED.rgb)
-PREDICTED = RobotStyle(accent=vocabulary.IDENTIFIED.rgb)
-MEASURED = RobotStyle(accent=vocabulary.MEASURED.rgb, opacity=0.4)
+IDENTIFIED = RobotStyle(accent=vocabulary.IDENTIFIED.rgb)
+MEASURED = RobotStyle(accent=vocabulary.MEASURED.rgb, outline=True)
 
 # Styles of further trajectories and series, one after the other.
 FURTHER_STYLES = (
     RobotStyle(accent=(60, 160, 90)),
     RobotStyle(accent=(160, 90, 200)),
-    PREDICTED,
+    IDENTIFIED,
     RobotStyle(accent=(20, 160, 170)),
 )
 
 # Styles of trajectories with a known name.
-STYLES_BY_NAME = {"initial": INITIAL, vocabulary.DESIGNED.word: DESIGNED}
+STYLES_BY_NAME = {vocabulary.INITIAL.word: INITIAL, vocabulary.DESIGNED.word: DESIGNED}
 
-# Largest number of samples of a recording, or of a motion, in a file.
+# Entities of the robots of a design, and styles of the plots over the iterations.
+INITIAL_ROOT = ("robots", vocabulary.INITIAL.word)
+DESIGNED_ROOT = ("robots", vocabulary.DESIGNED.word)
+HISTORY_STYLES = (DESIGNED,) * 4
+
+# Largest number of samples of a motion in a file.
 MAX_SAMPLES = 20_000
 
 
@@ -70,7 +83,7 @@ MAX_SAMPLES = 20_000
 def log_design(
     path: Path, model: mujoco.MjModel, design: Design, labels: Labels, *, addition: str = ""
 ) -> None:
-    """Write design.rrd: both robots, their signals, sensitivities, history and a summary.
+    """Write design.rrd: both robots, their signals, sensitivities, the search and a summary.
 
     Args:
         path: The file.
@@ -79,74 +92,174 @@ def log_design(
         labels: Labels of the model's columns, usually `labels_of_model(model)`.
         addition: Markdown to append to the summary.
     """
-    evaluations = {"initial": design.initial, "designed": design.final}
-    poses = {
-        name: body_poses(model, evaluation.trajectory.t, evaluation.trajectory.qpos)
-        for name, evaluation in evaluations.items()
-    }
+    content = _DesignContent.of(model, design, labels)
+    poses = content.poses
     camera = place_camera(model, list(poses.values()), views=2, aspect=ASPECT_WITH_TEXT)
     titles = {
-        "initial trajectory (blue)": ("robots", "initial"),
-        "designed trajectory (red)": ("robots", "designed"),
+        f"{term.word} trajectory ({term.colour_name})": ("robots", term.word)
+        for term in (vocabulary.INITIAL, vocabulary.DESIGNED)
     }
-    plots = [
-        PhasePlot.of_most_sensitive(design, j, model.nv) for j in parameters_with_phase_plot(design)
-    ]
-    views = robot_views(model, camera, titles)
-    layout = arrange(views, camera, _design_panels(design, labels, plots))
+    layout = arrange(_robots(model, camera, titles), content.tabs(labels))
 
     units = labels.parameter_units or ("",) * len(design.parameters)
     with open_recording(path, model, "design", layout) as rec:
         _log_text(rec, design_text(design, units, addition))
-        log_history(rec, design.history, (DESIGNED, INITIAL, *FURTHER_STYLES))
-        for plot in plots:
-            plot.log_axes(rec, labels)
-        for name, evaluation in evaluations.items():
-            root, style = ("robots", name), STYLES_BY_NAME[name]
-            log_robot(rec, model, root, poses[name], style, on_iteration=True)
-            log_end_path(rec, model, root, poses[name], style)
-            _log_states(rec, model, evaluation.trajectory, labels, name=name, style=style)
-            _log_information(rec, evaluation, plots, name=name, style=style)
+        content.log(rec, labels)
 
 
-def _log_information(
-    rec: rr.RecordingStream,
-    evaluation: Evaluation,
-    plots: Sequence[PhasePlot],
-    *,
-    name: str,
-    style: RobotStyle,
-) -> None:
-    """Log the information over time and the sensitivities of one trajectory.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _DesignContent:
+    """What design.rrd shows of a design, computed once for the layout and for the data.
 
-    The information is the root of its smallest eigenvalue.
+    Attributes:
+        model: The model.
+        evaluations: Both trajectories with their information, by name.
+        poses: Poses of the bodies along both trajectories.
+        states: Plots of states and controls.
+        series: Plots of the use of limits and of the information, by the name of their tab.
+        phase_plots: Phase plots of the sensitivities.
+        iterates: Motions of the iterates; None without any.
+        iterate_plots: Their curves.
+        history_plots: Plots over the iterations.
     """
-    t = evaluation.trajectory.t
-    root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
-    log_line(rec, ("information", name), t, root, name=name, style=style)
-    for plot in plots:
-        plot.log_curve(rec, t, evaluation.sensitivity, name=name, style=style)
+
+    model: mujoco.MjModel
+    evaluations: Mapping[str, Evaluation]
+    poses: Mapping[str, BodyPoses]
+    states: StatePlots
+    series: Mapping[str, Sequence[SeriesPlot]]
+    phase_plots: Sequence[PhasePlot]
+    iterates: IterateCurves | None
+    iterate_plots: Sequence[IteratePlot]
+    history_plots: Sequence[HistoryPlot]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, design: Design, labels: Labels) -> _DesignContent:
+        """Compute what is shown.
+
+        Args:
+            model: The model.
+            design: The design.
+            labels: Labels of the model's columns.
+        """
+        evaluations = {
+            vocabulary.INITIAL.word: design.initial,
+            vocabulary.DESIGNED.word: design.final,
+        }
+        shown = [
+            ShownTrajectory(name=name, trajectory=evaluation.trajectory, style=STYLES_BY_NAME[name])
+            for name, evaluation in evaluations.items()
+        ]
+        limits = limits_of_design(model, design)
+        iterates = IterateCurves.of(model, design)
+        states = state_plots(model, labels, shown, limits, iterates)
+        drawn: list[IteratePlot] = []
+        if iterates is not None:
+            drawn = iterate_plots(
+                iterates,
+                design.initial.trajectory,
+                states.titles_and_limits("positions"),
+                states.titles_and_limits("controls"),
+            )
+
+        return cls(
+            model=model,
+            evaluations=evaluations,
+            poses={
+                name: body_poses(model, evaluation.trajectory.t, evaluation.trajectory.qpos)
+                for name, evaluation in evaluations.items()
+            },
+            states=states,
+            series={
+                "limits": usage_plots(design.usage, design.history),
+                "information": [_information_plot(design, evaluations)],
+            },
+            phase_plots=[
+                PhasePlot.of_most_sensitive(design, j, model.nv)
+                for j in parameters_with_phase_plot(design)
+            ],
+            iterates=iterates,
+            iterate_plots=drawn,
+            history_plots=history_plots(design.history, HISTORY_STYLES, design.found_by),
+        )
+
+    def tabs(self, labels: Labels) -> list[rrb.Grid]:
+        """Return the tabs of all signals.
+
+        Args:
+            labels: Labels of the model's columns.
+        """
+        tabs = self.states.tabs()
+        for name, plots in self.series.items():
+            tabs += grid_tabs(name, views_of(plots))
+        tabs += grid_tabs("sensitivities ψ", [plot.view(labels) for plot in self.phase_plots])
+        tabs += grid_tabs("optimiser", [shown.plot.view() for shown in self.history_plots])
+        return tabs + grid_tabs("iterates", [shown.plot.view() for shown in self.iterate_plots])
+
+    def log(self, rec: rr.RecordingStream, labels: Labels) -> None:
+        """Log all data.
+
+        Args:
+            rec: The recording.
+            labels: Labels of the model's columns.
+        """
+        for series in (self.states.plots, *self.series.values()):
+            for plot in series:
+                plot.log(rec)
+        for history in self.history_plots:
+            history.log(rec)
+
+        for phase in self.phase_plots:
+            phase.log_axes(rec, labels)
+            for name, evaluation in self.evaluations.items():
+                style = STYLES_BY_NAME[name]
+                t = evaluation.trajectory.t
+                phase.log_curve(rec, t, evaluation.sensitivity, name=name, style=style)
+
+        for name, poses in self.poses.items():
+            style = STYLES_BY_NAME[name]
+            log_robot(rec, self.model, ("robots", name), poses, style)
+        self._log_iterates(rec)
+
+    def _log_iterates(self, rec: rr.RecordingStream) -> None:
+        """Log the paths of both robots and the motions of the iterates."""
+        initial, designed = self.poses.values()
+        log_end_path(rec, self.model, INITIAL_ROOT, initial, INITIAL)
+        if self.iterates is None:
+            log_end_path(rec, self.model, DESIGNED_ROOT, designed, DESIGNED)
+            return
+
+        end = end_point(self.model, designed)
+        path = None if end is None else end.path(designed)
+        log_poses_of_iterates(rec, DESIGNED_ROOT, self.iterates, DESIGNED, end, path)
+        trajectory = self.evaluations[vocabulary.INITIAL.word].trajectory
+        still = IterateCurves.of_one(self.model, trajectory)
+        log_poses_of_iterates(rec, INITIAL_ROOT, still, INITIAL, None)
+        for plot in self.iterate_plots:
+            plot.log(rec, self.iterates.iterations, INITIAL, DESIGNED)
 
 
-def _design_panels(design: Design, labels: Labels, plots: Sequence[PhasePlot]) -> list[LayoutPart]:
-    """Return the signals of a design.
+def _information_plot(design: Design, evaluations: Mapping[str, Evaluation]) -> SeriesPlot:
+    """Root of the smallest eigenvalue of the information up to each time.
 
-    The history has a tab for itself, because the viewer draws one timeline at a time.
+    On the timeline `iteration`, it is that of the whole motion of each iterate.
     """
-    states = state_parts(labels)
+    curves = []
+    for name, evaluation in evaluations.items():
+        root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
+        colour = STYLES_BY_NAME[name].accent
+        curves.append(Curve(name=name, t=evaluation.trajectory.t, values=root, colour=colour))
+
+    eigenvalues = np.array([row.min_eigenvalue for row in design.history])
+    over_search = Curve(
+        name="iterates",
+        t=np.array([row.iteration for row in design.history], dtype=np.float64),
+        values=np.sqrt(np.maximum(eigenvalues, 0.0)),
+        colour=DESIGNED.accent,
+        timeline="iteration",
+    )
     title = "√λ_min of the information up to each time [√s / θ-unit]"
-    information = series_view(("information",), title)
-    sensitivities = grid_parts("sensitivity ψ", [plot.view(labels) for plot in plots])
-
-    lines = history_lines(design.history)
-    if not lines:
-        return [*states, LayoutPart(content=information), *sensitivities]
-
-    beside = LayoutPart(content=rrb.Horizontal(information, history_bars(design.history)))
-    name = "trajectories (timeline: sim_time)"
-    signals = stack_parts([*states, beside, *sensitivities], name=name)
-    history = grid_parts("optimiser (timeline: iteration)", lines, columns=2)[0]
-    return [LayoutPart(content=rrb.Tabs(signals, history.content, active_tab=0))]
+    return SeriesPlot(parts=("information",), title=title, curves=[*curves, over_search])
 
 
 # ---- estimates
@@ -157,74 +270,48 @@ def log_estimate(
     model: mujoco.MjModel,
     estimate: Estimate,
     measured: Trajectory | None,
-    predicted: Trajectory,
+    identified: Trajectory,
     labels: Labels,
     *,
     addition: str = "",
 ) -> None:
-    """Write estimate.rrd: predicted and measured robot and outputs, residuals and a summary.
+    """Write estimate.rrd: identified and measured robot and outputs, residuals and a summary.
 
     Args:
         path: The file.
         model: The identified model.
         estimate: The estimate.
-        measured: Measured motion, drawn as a transparent robot; None where positions were not
-            measured.
-        predicted: Predicted motion.
+        measured: Measured motion, drawn as an outline; None where positions were not measured.
+        identified: Motion of the identified model.
         labels: Labels of the model's columns.
         addition: Markdown to append to the summary.
     """
-    trajectories = {"predicted": _thinned(predicted)}
-    styles = {"predicted": PREDICTED, "measured": MEASURED}
-    title = "identified robot (purple)"
+    term = vocabulary.IDENTIFIED
+    shown = [ShownTrajectory(name=term.word, trajectory=_thinned(identified), style=IDENTIFIED)]
+    title = f"{term.word} robot ({term.colour_name})"
     if measured is not None:
-        trajectories["measured"] = _thinned(measured)
-        title += " and measured robot (teal, transparent)"
+        term = vocabulary.MEASURED
+        shown.append(ShownTrajectory(name=term.word, trajectory=_thinned(measured), style=MEASURED))
+        title += f", {term.word} robot ({term.colour_name} outline)"
 
     poses = {
-        name: body_poses(model, trajectory.t, trajectory.qpos)
-        for name, trajectory in trajectories.items()
+        each.name: body_poses(model, each.trajectory.t, each.trajectory.qpos) for each in shown
     }
     camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
-    pages = [recording_page(model, k, recording) for k, recording in enumerate(estimate.recordings)]
-    pages.append(stack_parts(state_parts(labels), name="states and controls"))
-    signals = LayoutPart(content=rrb.Tabs(*pages, active_tab=0))
-    views = robot_views(model, camera, {title: ("robots",)})
-    layout = arrange(views, camera, [signals])
+    recordings = [*output_plots(model, estimate), *held_out_plots(model, estimate)]
+    states = state_plots(model, labels, shown, limits_of_model(model))
+    tabs = [tab for recording in recordings for tab in recording.tabs()]
+    view = robot_views(model, camera, {title: ("robots",)})[0]
+    layout = arrange(view, [*tabs, *states.tabs()])
 
     with open_recording(path, model, "estimate", layout) as rec:
         _log_text(rec, estimate_text(estimate, addition))
-        log_end_path(rec, model, ("robots", "predicted"), poses["predicted"], PREDICTED)
-        for name, trajectory in trajectories.items():
-            log_robot(rec, model, ("robots", name), poses[name], styles[name])
-            _log_states(rec, model, trajectory, labels, name=name, style=styles[name])
-        for k in range(len(estimate.recordings)):
-            _log_outputs(rec, model, estimate, k)
-
-
-def _log_outputs(
-    rec: rr.RecordingStream, model: mujoco.MjModel, estimate: Estimate, index: int
-) -> None:
-    """Log measured and predicted outputs of one recording, and their differences."""
-    recording = estimate.recordings[index]
-    rows = evenly_spread_indices(len(recording.t), MAX_SAMPLES)
-    t = recording.t[rows]
-    for column, output in enumerate(recording.outputs):
-        parts = (f"recording {index + 1}", output_label(model, output))
-        measured = recording.y[rows, column]
-        predicted = estimate.predicted[index][rows, column]
-
-        under = ("outputs", *parts)
-        log_dots(rec, (*under, "measured"), t, measured, name="measured", style=MEASURED)
-        log_line(rec, (*under, "predicted"), t, predicted, name="predicted", style=PREDICTED)
-        log_dots(
-            rec,
-            ("residuals", *parts),
-            t,
-            measured - predicted,
-            name="measured - predicted",
-            style=MEASURED,
-        )
+        for plot in chain(states.plots, *(recording.plots for recording in recordings)):
+            plot.log(rec)
+        for each in shown:
+            log_robot(rec, model, ("robots", each.name), poses[each.name], each.style)
+        root = ("robots", vocabulary.IDENTIFIED.word)
+        log_end_path(rec, model, root, poses[vocabulary.IDENTIFIED.word], IDENTIFIED)
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:
@@ -261,15 +348,20 @@ def log_trajectories(
     }
     motions = list(poses.values())
     camera = place_camera(model, motions, views=len(motions), aspect=ASPECT_WITHOUT_TEXT)
-    views = robot_views(model, camera, {name: ("robots", name) for name in trajectories})
-    layout = arrange(views, camera, state_parts(labels), text=False)
+    shown = [
+        ShownTrajectory(name=name, trajectory=trajectory, style=styles[name])
+        for name, trajectory in trajectories.items()
+    ]
+    states = state_plots(model, labels, shown, limits_of_model(model))
+    robots = _robots(model, camera, {name: ("robots", name) for name in trajectories})
+    layout = arrange(robots, states.tabs(), text=False)
 
     with open_recording(path, model, "replay", layout) as rec:
-        for name, trajectory in trajectories.items():
-            root, style = ("robots", name), styles[name]
-            log_robot(rec, model, root, poses[name], style)
-            log_end_path(rec, model, root, poses[name], style)
-            _log_states(rec, model, trajectory, labels, name=name, style=style)
+        for plot in states.plots:
+            plot.log(rec)
+        for name in trajectories:
+            log_robot(rec, model, ("robots", name), poses[name], styles[name])
+            log_end_path(rec, model, ("robots", name), poses[name], styles[name])
 
 
 def _trajectory_styles(names: Sequence[str]) -> dict[str, RobotStyle]:
@@ -288,27 +380,16 @@ def _trajectory_styles(names: Sequence[str]) -> dict[str, RobotStyle]:
 # ---- parts of several recordings
 
 
+def _robots(
+    model: mujoco.MjModel, camera: Camera, titles: Mapping[str, tuple[str, ...]]
+) -> rrb.Container:
+    """Return the views of several robots: separate, and in another tab overlaid."""
+    views = robot_views(model, camera, titles)
+    overlay = robot_views(model, camera, {"overlay": ("robots",)})[0]
+    return separate_and_overlaid(views, camera, overlay)
+
+
 def _log_text(rec: rr.RecordingStream, markdown: str) -> None:
     """Log the text of the summary panel."""
     document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
     rec.log(entity_path(("summary",)), document, static=True, strict=True)
-
-
-def _log_states(
-    rec: rr.RecordingStream,
-    model: mujoco.MjModel,
-    trajectory: Trajectory,
-    labels: Labels,
-    *,
-    name: str,
-    style: RobotStyle,
-) -> None:
-    """Log positions, velocities and controls as series with the trajectory's name."""
-    t = trajectory.t
-    positions = dof_positions(model, trajectory.qpos)
-    for label, values in zip(labels.positions, positions.T, strict=True):
-        log_line(rec, ("positions", label, name), t, values, name=name, style=style)
-    for label, values in zip(labels.velocities, trajectory.qvel.T, strict=True):
-        log_line(rec, ("velocities", label, name), t, values, name=name, style=style)
-    for label, values in zip(labels.controls, trajectory.ctrl.T, strict=True):
-        log_steps(rec, ("controls", label, name), t[:-1], values, name=name, style=style)

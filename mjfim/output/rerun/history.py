@@ -1,25 +1,30 @@
-"""History of an optimisation in Rerun.
-
-Series are on the timeline `iteration`; static bars are visible on every timeline.
-"""
+"""History of a search in Rerun, as 2D plots that are visible on every timeline."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.output.rerun.panels import LINE_WIDTH, series_view
+from mjfim.output.rerun.panels import plot_size
 from mjfim.output.rerun.scene import entity_path
+from mjfim.output.rerun.series import padded
 from mjfim.output.rerun.shapes import RobotStyle
+from mjfim.output.rerun.strips import StripPlot
 from mjfim.records.design import HistoryRow
 
 # Numbers of iterations and values of one quantity, both (n,).
 Series = tuple[NDArray[np.int64], Array]
+
+# Colour (0..255) of the line at the iteration that is shown.
+NOW_COLOUR = (205, 205, 205)
+
+# How the title of a series begins whose values are logarithms.
+LOGARITHM = "log10 "
 
 
 def history_series(history: Sequence[HistoryRow]) -> dict[str, Series]:
@@ -47,7 +52,7 @@ def history_series(history: Sequence[HistoryRow]) -> dict[str, Series]:
     ):
         kept = values[usable]
         if len(kept) and bool(np.all(kept > 0.0)):
-            series[f"log10 {title}"] = (iterations[usable], np.log10(kept))
+            series[f"{LOGARITHM}{title}"] = (iterations[usable], np.log10(kept))
         else:
             series[title] = (iterations[usable], kept)
 
@@ -56,59 +61,62 @@ def history_series(history: Sequence[HistoryRow]) -> dict[str, Series]:
     return series
 
 
-def log_history(
-    rec: rr.RecordingStream, history: Sequence[HistoryRow], styles: Sequence[RobotStyle]
-) -> None:
-    """Log every series on the timeline `iteration`, and as static bars.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HistoryPlot:
+    """Plot of one quantity over the iterations, with a line at the iteration that is shown.
+
+    Attributes:
+        iterations: (n,) numbers of iterations.
+        values: (n,) values.
+        plot: The axes.
+        style: Style with the colour of the curve.
+    """
+
+    iterations: NDArray[np.int64]
+    values: Array
+    plot: StripPlot
+    style: RobotStyle
+
+    def log(self, rec: rr.RecordingStream) -> None:
+        """Log axes, curve and line.
+
+        Args:
+            rec: The recording.
+        """
+        self.plot.log_axes(rec)
+        curve = self.plot.curve(self.iterations.astype(np.float64), self.values, self.style.accent)
+        rec.log(entity_path((*self.plot.parts, "curve")), curve, static=True, strict=True)
+
+        path = entity_path((*self.plot.parts, "now"))
+        for iteration in self.iterations.tolist():
+            rec.set_time("iteration", sequence=iteration)
+            rec.log(path, self.plot.upright(iteration, NOW_COLOUR), strict=True)
+        rec.reset_time()
+
+
+def history_plots(
+    history: Sequence[HistoryRow], styles: Sequence[RobotStyle], start: str
+) -> list[HistoryPlot]:
+    """Return a plot of each quantity that has values.
 
     Args:
-        rec: The recording.
         history: The history.
-        styles: Style of each series.
+        styles: Style of each quantity.
+        start: Name of the initial control from which the search came.
     """
-    series = history_series(history)
-    for (title, (iterations, values)), style in zip(series.items(), styles, strict=False):
-        path = entity_path(("history", title))
-        line = rr.SeriesLines(colors=[style.accent], names=[title], widths=[LINE_WIDTH])
-        rec.log(path, line, static=True, strict=True)
-        if not len(iterations):
-            continue
-
-        columns = rr.Scalars.columns(scalars=values)
-        timeline = rr.TimeColumn("iteration", sequence=iterations)
-        rec.send_columns(path, [timeline], columns, strict=True)
-        bars = rr.BarChart(values, abscissa=iterations, color=style.accent)
-        rec.log(entity_path(("bars", title)), bars, static=True, strict=True)
-
-
-def history_bars(history: Sequence[HistoryRow]) -> rrb.Tabs:
-    """Return a tab with bars for each series; they are static and do not depend on the timeline.
-
-    Args:
-        history: The history.
-    """
-    views = []
-    for title in _filled_series(history):
-        view = rrb.BarChartView(
-            origin=entity_path(("bars", title)),
-            name=f"{title} by iteration",
-            plot_legend=rrb.PlotLegend(visible=False),
+    filled = {title: each for title, each in history_series(history).items() if len(each[0])}
+    last = max((row.iteration for row in history), default=0)
+    plots = []
+    for (title, (iterations, values)), style in zip(filled.items(), styles, strict=False):
+        name = title.removeprefix(LOGARITHM)
+        origin = f" (start: {start})" if name == "cost" else ""
+        plot = StripPlot(
+            parts=("history", title),
+            title=f"{name} over iterations{origin}",
+            x=(0.0, float(max(last, 1))),
+            y=padded(float(values.min()), float(values.max())),
+            size=plot_size(len(filled)),
+            logarithmic=title.startswith(LOGARITHM),
         )
-        views.append(view)
-    return rrb.Tabs(*views, active_tab=0, name="optimiser")
-
-
-def history_lines(history: Sequence[HistoryRow]) -> list[rrb.View]:
-    """Return a view of each series as a line; it is visible on the timeline `iteration` only.
-
-    Args:
-        history: The history.
-    """
-    titles = _filled_series(history)
-    return [series_view(("history", title), title, legend=False) for title in titles]
-
-
-def _filled_series(history: Sequence[HistoryRow]) -> list[str]:
-    """Return the titles of the series that have values."""
-    series = history_series(history)
-    return [title for title, (iterations, _) in series.items() if len(iterations)]
+        plots.append(HistoryPlot(iterations=iterations, values=values, plot=plot, style=style))
+    return plots

@@ -14,18 +14,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.atomic_io import replacing
-from mjfim.model.coordinates import output_label
 from mjfim.output.rerun.camera import Camera
-from mjfim.output.rerun.panels import (
-    LayoutPart,
-    grid_parts,
-    series_view,
-    series_views,
-    stack_parts,
-)
 from mjfim.output.rerun.scene import EntityParts, entity_path, has_floor
-from mjfim.records.labels import Labels
-from mjfim.records.recording import Recording
 
 # Colour of the background of the 3D views (0..255).
 BACKGROUND_COLOUR = (214, 219, 226)
@@ -36,13 +26,6 @@ ASPECT_WITH_TEXT, ASPECT_WITHOUT_TEXT = 1.35, 0.75
 # Heights of robots and text, and widths of the left and the right side, relative to each other.
 ROBOTS_TO_TEXT = [3, 2]
 LEFT_TO_RIGHT = [2, 3]
-
-# Largest number of positions and of controls of a model whose signals are all visible; those of
-# others are in tabs.
-MAX_VISIBLE_SIGNALS = 3
-
-# Columns, and largest number of views, of a grid of outputs or residuals.
-OUTPUT_COLUMNS, OUTPUTS_PER_PAGE = 2, 6
 
 
 @contextmanager
@@ -83,25 +66,23 @@ def open_recording(
 
 
 def arrange(
-    views: Sequence[rrb.View], camera: Camera, panels: Sequence[LayoutPart], *, text: bool = True
+    robots: rrb.Container | rrb.View, tabs: Sequence[rrb.Container], *, text: bool = True
 ) -> rrb.Horizontal:
-    """Arrange robots and text on the left, and signals on the right.
+    """Arrange robots and text on the left, and tabs of signals on the right.
 
     Args:
-        views: Views of the robots.
-        camera: Camera of these views.
-        panels: Signals.
+        robots: Views of the robots.
+        tabs: One group of signals each; the first one is open.
         text: False for a recording without text.
     """
-    robots = rrb.Vertical(*views) if camera.stacked else rrb.Horizontal(*views)
-    left: rrb.Container = robots
+    left = robots
     if text:
         document = rrb.TextDocumentView(origin=entity_path(("summary",)), name="summary")
         left = rrb.Vertical(robots, document, row_shares=ROBOTS_TO_TEXT)
 
-    if not panels:
+    if not tabs:
         return rrb.Horizontal(left)
-    return rrb.Horizontal(left, stack_parts(panels), column_shares=LEFT_TO_RIGHT)
+    return rrb.Horizontal(left, rrb.Tabs(*tabs, active_tab=0), column_shares=LEFT_TO_RIGHT)
 
 
 def robot_views(
@@ -129,46 +110,16 @@ def robot_views(
     return views
 
 
-def state_parts(labels: Labels) -> list[LayoutPart]:
-    """Return panels of positions, velocities and controls; those of large models are in tabs.
+def separate_and_overlaid(
+    views: Sequence[rrb.View], camera: Camera, overlay: rrb.View
+) -> rrb.Container:
+    """Return a tab with several robots beside each other, and one with all of them in one view.
 
     Args:
-        labels: Labels of the model's columns.
+        views: A view for each robot.
+        camera: Camera of these views.
+        overlay: View of all robots.
     """
-    positions = series_views(("positions",), labels.positions, legend=True)
-    velocities = series_views(("velocities",), labels.velocities)
-    controls = series_views(("controls",), labels.controls)
-    parts = [
-        *grid_parts("positions", positions),
-        *grid_parts("velocities", velocities),
-        *grid_parts("controls", controls),
-    ]
-
-    signals = max(len(labels.positions), len(labels.controls))
-    if not parts or signals <= MAX_VISIBLE_SIGNALS:
-        return parts
-    tabs = rrb.Tabs(*(part.content for part in parts), active_tab=0)
-    return [LayoutPart(content=tabs, rows=parts[0].rows)]
-
-
-def recording_page(model: mujoco.MjModel, index: int, recording: Recording) -> rrb.Vertical:
-    """Return outputs above residuals of one recording.
-
-    Args:
-        model: The model.
-        index: Number of the recording.
-        recording: The recording.
-    """
-    name = f"recording {index + 1}"
-    titles = [output_label(model, output) for output in recording.outputs]
-    outputs = series_views(("outputs", name), titles, legend=True)
-    residuals: list[rrb.View] = []
-    for title in titles:
-        parts = ("residuals", name, title)
-        residuals.append(series_view(parts, f"residual of {title}", legend=False))
-
-    grids = [
-        *grid_parts("outputs", outputs, columns=OUTPUT_COLUMNS, per_page=OUTPUTS_PER_PAGE),
-        *grid_parts("residuals", residuals, columns=OUTPUT_COLUMNS, per_page=OUTPUTS_PER_PAGE),
-    ]
-    return stack_parts(grids, name=f"{name}: {Path(recording.name).name}")
+    arranged = rrb.Vertical if camera.stacked else rrb.Horizontal
+    separate = arranged(*views, name="separate")
+    return separate if len(views) < 2 else rrb.Tabs(separate, overlay, active_tab=0)

@@ -19,7 +19,7 @@ from mjfim.records.design import Design
 from mjfim.records.labels import Labels
 
 # Largest number of phase plots.
-MAX_PHASE_PLOTS = 9
+MAX_PHASE_PLOTS = 8
 
 # Plot coordinates of the largest position and the largest velocity; Rerun's y axis points
 # downwards.
@@ -102,11 +102,10 @@ class PhasePlot:
         )
         rec.log(entity_path((*self.parts, "axes")), lines, static=True, strict=True)
 
-        names = (labels.positions[self.dof], labels.velocities[self.dof])
-        texts = []
-        for name, largest in zip(names, self.scale, strict=True):
-            _, unit = split_unit(name)
-            texts.append(f"{AXIS_FACTOR * largest:.3g} {unit}")
+        texts = [
+            f"{AXIS_FACTOR * largest:.3g} {unit}"
+            for unit, largest in zip(self._units(labels), self.scale, strict=True)
+        ]
         marks = rr.Points2D(
             ends * (0.8, 1.0),
             labels=texts,
@@ -152,11 +151,21 @@ class PhasePlot:
             labels: Labels of the degrees of freedom.
         """
         position, _ = split_unit(labels.positions[self.dof])
+        across, up = (unit.strip("[]") for unit in self._units(labels))
         return rrb.Spatial2DView(
             origin=entity_path(self.parts),
-            name=f"ψ of {self.parameter}: {position} →  velocity ↑",
+            name=f"ψ of {self.parameter}: {position} → [{across}], velocity ↑ [{up}]",
             visual_bounds=rrb.VisualBounds2D(x_range=[-1.9, 1.9], y_range=[-1.3, 1.3]),
         )
+
+    def _units(self, labels: Labels) -> tuple[str, str]:
+        """Units of position and velocity per unit of the parameter."""
+        units = labels.parameter_units
+        per = units[self.index] if self.index < len(units) else ""
+        names = (labels.positions[self.dof], labels.velocities[self.dof])
+        position, velocity = (split_unit(name)[1] for name in names)
+        divisor = f" / ({per})" if " " in per or "/" in per else f" / {per}"
+        return (f"{position}{divisor}", f"{velocity}{divisor}") if per else (position, velocity)
 
     def _points(self, sensitivity: Array) -> Array:
         """Return the (N+1, 2) curve in plot coordinates of a sensitivity (N+1, nx, p)."""

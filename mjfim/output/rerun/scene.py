@@ -13,18 +13,13 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.output.rerun.shapes import (
-    DEFAULT_RGBA,
-    GeomType,
-    RobotStyle,
-    drawn_geoms,
-    geom_rgba,
-    geom_shape,
-    stick_figure,
-)
+from mjfim.output.rerun.shapes import GeomType, RobotStyle, drawn_shapes
 
 # Parts of the path of an entity, not escaped.
 EntityParts = tuple[str, ...]
+
+# Thickness of the path of a robot's end [points].
+PATH_THICKNESS = 1.0
 
 
 # ---- poses
@@ -185,7 +180,7 @@ def log_end_path(
     poses: BodyPoses,
     style: RobotStyle,
 ) -> None:
-    """Log the path of a robot's end as a line.
+    """Log the path of a robot's end as a line, on all timelines.
 
     Args:
         rec: The recording.
@@ -194,11 +189,21 @@ def log_end_path(
         poses: Poses of its bodies.
         style: Style in which it is drawn.
     """
-    path = _end_path(model, poses)
-    if not len(path):
-        return
-    strips = rr.LineStrips3D([path], colors=[[*style.accent, 255]], radii=rr.Radius.ui_points(1.0))
-    rec.log(entity_path((*root, "path")), strips, static=True, strict=True)
+    point = end_point(model, poses)
+    if point is not None:
+        path = strip_of_path(point.path(poses), style)
+        rec.log(entity_path((*root, "path")), path, static=True, strict=True)
+
+
+def strip_of_path(path: Array, style: RobotStyle) -> rr.LineStrips3D:
+    """Return a path in the world as a line.
+
+    Args:
+        path: (n, 3) points [m].
+        style: Style with the colour.
+    """
+    radius = rr.Radius.ui_points(PATH_THICKNESS)
+    return rr.LineStrips3D([path], colors=[[*style.accent, 255]], radii=radius)
 
 
 def _log_fixed_pose(rec: rr.RecordingStream, path: str, poses: BodyPoses, body: int) -> None:
@@ -233,23 +238,13 @@ def _log_shapes(
     body: int,
     style: RobotStyle,
 ) -> None:
-    """Log the geoms of one body; a moving body without geoms is drawn as a stick figure."""
-    moving = is_moving(model, body)
-    geoms = drawn_geoms(model, body)
-    for geom in geoms:
-        colour = style.geom_colour(geom_rgba(model, geom), moving)
-        shape = geom_shape(model, geom, colour)
-        if shape is None:
-            continue
-        quaternion = rerun_quaternion(model.geom_quat[geom])
-        pose = rr.Transform3D(translation=model.geom_pos[geom], quaternion=quaternion)
-        name = model.geom(geom).name or f"geom{geom}"
-        rec.log(entity_path((*parts, name)), pose, shape, static=True, strict=True)
-
-    if moving and not geoms:
-        colour = style.geom_colour(DEFAULT_RGBA, moving)
-        figure = stick_figure(model, body, colour)
-        rec.log(entity_path((*parts, "sticks")), *figure, static=True, strict=True)
+    """Log the shapes of one body in its frame."""
+    for shape in drawn_shapes(model, body, style):
+        pose = rr.Transform3D(
+            translation=shape.position, quaternion=rerun_quaternion(shape.quaternion)
+        )
+        path = entity_path((*parts, shape.name))
+        rec.log(path, pose, shape.archetype, static=True, strict=True)
 
 
 # ---- points of moving bodies
@@ -280,17 +275,42 @@ def _moving_centres(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
     return bodies.astype(np.intp), points
 
 
-def _end_path(model: mujoco.MjModel, poses: BodyPoses) -> Array:
-    """Return the path of the robot's end.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EndPoint:
+    """The end of a robot, whose path is drawn.
+
+    Attributes:
+        body: Number of its body.
+        point: (3,) the point in the frame of the body [m].
+    """
+
+    body: int
+    point: Array
+
+    def path(self, poses: BodyPoses) -> Array:
+        """Return the (N+1, 3) path in the world [m].
+
+        Args:
+            poses: Poses of the bodies.
+        """
+        return poses.world_paths(np.array([self.body]), self.point[None])[:, 0]
+
+
+def end_point(model: mujoco.MjModel, poses: BodyPoses) -> EndPoint | None:
+    """Return the end of a robot.
 
     Of the points deepest in the tree, it is the one that travels farthest.
 
+    Args:
+        model: The model.
+        poses: Poses of its bodies.
+
     Returns:
-        (N+1, 3) world path [m]; (0, 3) where nothing moves.
+        The end; None where nothing moves.
     """
     bodies, points = _moving_centres(model)
     if not len(bodies):
-        return np.empty((0, 3))
+        return None
 
     depth = np.zeros(model.nbody, dtype=np.intp)
     for body in range(1, model.nbody):
@@ -300,4 +320,4 @@ def _end_path(model: mujoco.MjModel, poses: BodyPoses) -> Array:
     paths = poses.world_paths(bodies[deepest], points[deepest])
     steps = np.linalg.norm(np.diff(paths, axis=0), axis=2)
     farthest = int(np.argmax(steps.sum(axis=0)))
-    return np.asarray(paths[:, farthest])
+    return EndPoint(body=int(bodies[deepest][farthest]), point=points[deepest][farthest])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -10,10 +10,18 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from mjfim.arrays import Array
+
 GeomType = mujoco.mjtGeom
 
-# Surfaces are drawn filled, not as wire frames.
-SOLID = rr.components.FillMode.Solid
+# Surfaces are drawn filled, those of an outlined robot as wire frames.
+SOLID, OUTLINE = rr.components.FillMode.Solid, rr.components.FillMode.MajorWireframe
+
+# Opacity of the meshes of an outlined robot, which have no wire frame.
+OUTLINE_OPACITY = 0.3
+
+# Share of white in the colour of an outlined robot.
+OUTLINE_WHITE = 0.4
 
 # Colour (0..1) of a geom that sets none; MuJoCo then takes the colour of its material.
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
@@ -21,17 +29,18 @@ DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 # Weights of red, green and blue in the brightness of a colour.
 BRIGHTNESS_WEIGHTS = (0.30, 0.59, 0.11)
 
-# Share of the accent colour in geoms that no joint moves; the rest of their colour is grey.
-FIXED_ACCENT_SHARE = 0.1
-
 # Largest group of geoms that MuJoCo's viewer shows by default.
 LAST_SHOWN_GROUP = 2
 
 # Radius of the sticks of a stick figure, as a share of the model's extent.
 STICK_RADIUS = 0.02
 
-# Squares along each side of a ground plane.
-BOARD_SQUARES = 12
+# Side of the squares of a ground plane, and distance from the middle to the edges of an infinite
+# one, both as multiples of the model's extent.
+SQUARE_SIZE, INFINITE_REACH = 0.25, 8.0
+
+# Largest number of squares along each side of a ground plane.
+MAX_SQUARES = 64
 
 # Brightness of every second square of a ground plane.
 DARK_SQUARE = 0.8
@@ -43,30 +52,50 @@ class RobotStyle:
 
     Attributes:
         accent: Accent colour (0..255).
-        accent_share: Share of the accent colour in the moving geoms; the rest is grey of equal
-            brightness.
-        opacity: Opacity of the moving geoms (0..1).
+        tint: Share of the accent colour in the moving geoms; the rest is the model's own colour.
+        outline: True to draw the moving geoms as a pale outline in the accent colour.
     """
 
     accent: tuple[int, int, int]
-    accent_share: float = 0.9
-    opacity: float = 1.0
+    tint: float = 0.35
+    outline: bool = False
 
     def geom_colour(self, rgba: Iterable[float], moving: bool) -> list[int]:
         """Return the colour (0..255, with opacity) in which a geom is drawn.
 
         Args:
             rgba: Colour of the geom in the model (0..1).
-            moving: False for a geom that no joint moves; it is grey and opaque.
+            moving: False for a geom that no joint moves; it is grey.
         """
         model_rgba = np.fromiter(rgba, dtype=np.float64)
-        grey = np.full(3, 255.0 * float(model_rgba[:3] @ BRIGHTNESS_WEIGHTS))
-        share = self.accent_share if moving else FIXED_ACCENT_SHARE
-        opacity = self.opacity if moving else 1.0
+        alpha = 255.0 * model_rgba[3]
+        accent = np.array(self.accent, dtype=np.float64)
 
-        colour = share * np.array(self.accent) + (1.0 - share) * grey
-        alpha = 255.0 * model_rgba[3] * opacity
+        if not moving:
+            colour = np.full(3, 255.0 * float(model_rgba[:3] @ BRIGHTNESS_WEIGHTS))
+        elif self.outline:
+            colour = (1.0 - OUTLINE_WHITE) * accent + OUTLINE_WHITE * 255.0
+            alpha *= OUTLINE_OPACITY
+        else:
+            colour = self.tint * accent + (1.0 - self.tint) * 255.0 * model_rgba[:3]
         return [round(float(channel)) for channel in (*colour, alpha)]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnShape:
+    """A shape that is drawn in the frame of a body.
+
+    Attributes:
+        name: Name of its entity.
+        position: (3,) origin of the shape in the frame of the body [m].
+        quaternion: (4,) its orientation, wxyz.
+        archetype: The shape in its own frame.
+    """
+
+    name: str
+    position: Array
+    quaternion: Array
+    archetype: rr.AsComponents
 
 
 # ---- geoms of a body
@@ -104,13 +133,65 @@ def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
     return rgba
 
 
-def geom_shape(model: mujoco.MjModel, geom: int, rgba: list[int]) -> rr.AsComponents | None:
-    """Return the archetype of a geom in its own frame.
+def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterator[DrawnShape]:
+    """Find the shapes that show a body; a moving body without geoms is a stick figure.
+
+    Args:
+        model: The model.
+        body: Number of the body.
+        style: Style in which it is drawn.
+
+    Yields:
+        The shapes.
+    """
+    moving = int(model.body_weldid[body]) != 0
+    fill = OUTLINE if style.outline and moving else SOLID
+    geoms = drawn_geoms(model, body)
+    for geom in geoms:
+        rgba = style.geom_colour(geom_rgba(model, geom), moving)
+        archetype = geom_shape(model, geom, rgba, fill)
+        if archetype is None:
+            continue
+        yield DrawnShape(
+            name=model.geom(geom).name or f"geom{geom}",
+            position=geom_origin(model, geom),
+            quaternion=model.geom_quat[geom],
+            archetype=archetype,
+        )
+
+    if moving and not geoms:
+        yield from stick_figure(model, body, style.geom_colour(DEFAULT_RGBA, moving), fill)
+
+
+def geom_origin(model: mujoco.MjModel, geom: int) -> Array:
+    """Return the origin of the shape of a geom in the frame of its body, (3,) [m].
+
+    A capsule of Rerun begins at the origin of its frame; that of MuJoCo is centred on it.
+
+    Args:
+        model: The model.
+        geom: Number of the geom.
+    """
+    position = np.array(model.geom_pos[geom])
+    if int(model.geom_type[geom]) != int(GeomType.mjGEOM_CAPSULE):
+        return position
+
+    to_end = np.empty(3)
+    half_length = float(model.geom_size[geom, 1])
+    mujoco.mju_rotVecQuat(to_end, np.array([0.0, 0.0, -half_length]), model.geom_quat[geom])
+    return np.asarray(position + to_end)
+
+
+def geom_shape(
+    model: mujoco.MjModel, geom: int, rgba: list[int], fill: rr.components.FillMode = SOLID
+) -> rr.AsComponents | None:
+    """Return the archetype of a geom in its own frame, whose origin is `geom_origin`.
 
     Args:
         model: The model.
         geom: Number of the geom.
         rgba: Colour (0..255).
+        fill: How its surface is drawn; meshes are always filled.
 
     Returns:
         The archetype; None for types without a surface.
@@ -118,17 +199,18 @@ def geom_shape(model: mujoco.MjModel, geom: int, rgba: list[int]) -> rr.AsCompon
     kind = GeomType(int(model.geom_type[geom]))
     # Half sizes [m]; a radius and a half length for round types.
     a, b, c = (float(size) for size in model.geom_size[geom])
+    solid_rgba = rgba if fill is SOLID else [*rgba[:3], 255]
     match kind:
         case GeomType.mjGEOM_SPHERE:
-            return rr.Ellipsoids3D(half_sizes=[[a, a, a]], colors=[rgba], fill_mode=SOLID)
+            return rr.Ellipsoids3D(half_sizes=[[a, a, a]], colors=[solid_rgba], fill_mode=fill)
         case GeomType.mjGEOM_ELLIPSOID:
-            return rr.Ellipsoids3D(half_sizes=[[a, b, c]], colors=[rgba], fill_mode=SOLID)
+            return rr.Ellipsoids3D(half_sizes=[[a, b, c]], colors=[solid_rgba], fill_mode=fill)
         case GeomType.mjGEOM_BOX:
-            return rr.Boxes3D(half_sizes=[[a, b, c]], colors=[rgba], fill_mode=SOLID)
+            return rr.Boxes3D(half_sizes=[[a, b, c]], colors=[solid_rgba], fill_mode=fill)
         case GeomType.mjGEOM_CYLINDER:
-            return rr.Cylinders3D(lengths=[2 * b], radii=[a], colors=[rgba], fill_mode=SOLID)
+            return rr.Cylinders3D(lengths=[2 * b], radii=[a], colors=[solid_rgba], fill_mode=fill)
         case GeomType.mjGEOM_CAPSULE:
-            return _capsule(b, a, rgba)
+            return rr.Capsules3D(lengths=[2 * b], radii=[a], colors=[solid_rgba], fill_mode=fill)
         case GeomType.mjGEOM_PLANE:
             return _ground_plane(model, a, b, rgba)
         case GeomType.mjGEOM_HFIELD:
@@ -138,74 +220,68 @@ def geom_shape(model: mujoco.MjModel, geom: int, rgba: list[int]) -> rr.AsCompon
     return None
 
 
-def stick_figure(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.AsComponents, ...]:
+def stick_figure(
+    model: mujoco.MjModel, body: int, rgba: list[int], fill: rr.components.FillMode = SOLID
+) -> Iterator[DrawnShape]:
     """Return shapes for a body without geoms: a ball, and sticks to its children.
 
     Args:
         model: The model.
         body: Number of the body.
         rgba: Colour (0..255).
+        fill: How the surfaces are drawn.
+
+    Yields:
+        The shapes.
     """
     radius = STICK_RADIUS * float(model.stat.extent)
-    ball = rr.Ellipsoids3D(half_sizes=[[1.5 * radius] * 3], colors=[rgba], fill_mode=SOLID)
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    ball = rr.Ellipsoids3D(half_sizes=[[1.5 * radius] * 3], colors=[rgba], fill_mode=fill)
+    yield DrawnShape(name="ball", position=np.zeros(3), quaternion=upright, archetype=ball)
 
-    children = np.flatnonzero(model.body_parentid == body)
-    ends = [model.body_pos[child] for child in children]
-    ends = [end for end in ends if np.any(end != 0.0)]
-    if not ends:
-        return (ball,)
+    for child in np.flatnonzero(model.body_parentid == body):
+        end = np.array(model.body_pos[child])
+        length = float(np.linalg.norm(end))
+        if not length:
+            continue
 
-    # Capsules run along z: each is turned towards its end. MuJoCo writes quaternions as wxyz, Rerun
-    # as xyzw.
-    wxyz = np.empty((len(ends), 4))
-    for quaternion, end in zip(wxyz, ends, strict=True):
-        mujoco.mju_quatZ2Vec(quaternion, end / np.linalg.norm(end))
-    sticks = rr.Capsules3D(
-        lengths=np.linalg.norm(ends, axis=1),
-        radii=[radius] * len(ends),
-        quaternions=np.roll(wxyz, -1, axis=1),
-        colors=[rgba] * len(ends),
-        fill_mode=SOLID,
-    )
-    return ball, sticks
+        # Capsules run along z: each is turned towards its end.
+        turned = np.empty(4)
+        mujoco.mju_quatZ2Vec(turned, end / length)
+        stick = rr.Capsules3D(lengths=[length], radii=[radius], colors=[rgba], fill_mode=fill)
+        name = f"stick {child}"
+        yield DrawnShape(name=name, position=np.zeros(3), quaternion=turned, archetype=stick)
 
 
 # ---- single types
-
-
-def _capsule(half_length: float, radius: float, rgba: list[int]) -> rr.Capsules3D:
-    """Return a capsule along z, centred on its frame. half_length, radius: [m]."""
-    # A capsule of Rerun begins at the origin of its frame.
-    return rr.Capsules3D(
-        lengths=[2 * half_length],
-        radii=[radius],
-        translations=[np.array([0.0, 0.0, -half_length])],
-        colors=[rgba],
-        fill_mode=SOLID,
-    )
 
 
 def _ground_plane(
     model: mujoco.MjModel, half_x: float, half_y: float, rgba: list[int]
 ) -> rr.Mesh3D:
     """Return a plane as a board of finite size. Half sizes [m] of 0 mean an infinite plane."""
-    reach = 2.0 * float(model.stat.extent)
-    half_sizes = (min(half_x, reach) or reach, min(half_y, reach) or reach)
-    return _checkerboard(half_sizes, rgba)
+    extent = float(model.stat.extent)
+    reach = INFINITE_REACH * extent
+    half_sizes = np.array([half_x or reach, half_y or reach])
+
+    # The squares of a huge plane are larger.
+    side = max(SQUARE_SIZE * extent, 2.0 * float(half_sizes.max()) / MAX_SQUARES)
+    counts = np.maximum(np.rint(2.0 * half_sizes / side), 1.0).astype(np.intp)
+    return _checkerboard(half_sizes, counts, rgba)
 
 
-def _checkerboard(half_sizes: tuple[float, float], rgba: list[int]) -> rr.Mesh3D:
+def _checkerboard(half_sizes: Array, counts: NDArray[np.intp], rgba: list[int]) -> rr.Mesh3D:
     """Return the plane z = 0 as a board of squares in two tones, which shows depth.
 
-    `half_sizes` are along x and y [m].
+    `half_sizes` [m] and `counts` of squares are along x and y.
     """
     # (squares, 2) column and row of every square.
-    squares = np.indices((BOARD_SQUARES, BOARD_SQUARES)).reshape(2, -1).T
+    squares = np.indices(tuple(counts)).reshape(2, -1).T
 
     # (squares, 4, 2) corners of every square, counter-clockwise.
     shifts = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
     corners = squares[:, None, :] + shifts
-    xy = (2.0 * corners / BOARD_SQUARES - 1.0) * half_sizes
+    xy = (2.0 * corners / counts - 1.0) * half_sizes
 
     vertices = np.zeros((4 * len(squares), 3))
     vertices[:, :2] = xy.reshape(-1, 2)

@@ -4,19 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from mjfim.output import vocabulary
 from mjfim.output.summaries.design import describe_design
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summary_parts import Emphasis, Listing, Part, Summary, SummaryTable, capitalised
+from mjfim.output.vocabulary import Term
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 
+
+def _colours(*meanings: tuple[Term, str]) -> str:
+    """Return a sentence for each colour."""
+    return " ".join(f"{term.colour_name.capitalize()}: {meaning}." for term, meaning in meanings)
+
+
 # Sentences that explain the colours of the recordings.
 DESIGN_COLOURS = (
-    "Blue: the initial trajectory. Red: the designed trajectory. Space bar: play or pause. "
-    "The plots of ψ show sensitivities: how much a position (→) and its velocity (↑) change per "
-    "unit of a parameter."
+    _colours(
+        (vocabulary.INITIAL, "the initial trajectory"),
+        (vocabulary.DESIGNED, "the designed trajectory"),
+    )
+    + " Grey lines: limits. Space bar: play or pause. The timeline `iteration` shows the search: "
+    "its iterates in place of the designed trajectory. The plots of ψ show sensitivities: how much "
+    "a position (→) and its velocity (↑) change per unit of a parameter."
 )
-ESTIMATE_COLOURS = "Orange: the model with these parameters. Grey: the measurements."
+ESTIMATE_COLOURS = (
+    _colours(
+        (vocabulary.IDENTIFIED, "the identified model"),
+        (vocabulary.MEASURED, "the measurements"),
+        (vocabulary.NOMINAL, "the nominal model, for data that were not fitted"),
+    )
+    + " Grey lines: twice the standard deviation of the noise."
+)
 
 
 def design_text(design: Design, units: Sequence[str], addition: str = "") -> str:

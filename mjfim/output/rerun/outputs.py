@@ -1,0 +1,160 @@
+"""Plots of measured and predicted outputs, and of their differences, in Rerun."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import rerun.blueprint as rrb
+
+from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.model.coordinates import output_label
+from mjfim.output import vocabulary
+from mjfim.output.rerun.panels import PLOTS_PER_TAB
+from mjfim.output.rerun.series import LIMIT_COLOUR, Curve, SeriesPlot
+from mjfim.records.estimate import Estimate
+from mjfim.records.recording import Recording
+
+# Largest number of samples of a recording in a file.
+MAX_SAMPLES = 20_000
+
+# Half width of the band around a prediction [standard deviations of the noise].
+BAND = 2.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OutputPlots:
+    """Plots of one recording: each output beside its difference from the prediction.
+
+    Attributes:
+        name: Name of the tab.
+        pairs: Plot of the output and plot of the difference, for each output that was measured.
+    """
+
+    name: str
+    pairs: Sequence[tuple[SeriesPlot, SeriesPlot]]
+
+    @property
+    def plots(self) -> Iterator[SeriesPlot]:
+        """All plots."""
+        for pair in self.pairs:
+            yield from pair
+
+    def tabs(self) -> list[rrb.Grid]:
+        """Return the tabs with two columns: outputs, and differences."""
+        rows = PLOTS_PER_TAB // 2
+        pages = [self.pairs[k : k + rows] for k in range(0, len(self.pairs), rows)]
+        tabs = []
+        for number, page in enumerate(pages, start=1):
+            views = [plot.view(legend=not k) for k, pair in enumerate(page) for plot in pair]
+            name = self.name if len(pages) == 1 else f"{self.name} ({number})"
+            tabs.append(rrb.Grid(*views, grid_columns=2, name=name))
+        return tabs
+
+
+def output_plots(model: mujoco.MjModel, estimate: Estimate) -> list[OutputPlots]:
+    """Return the plots of every fitted recording.
+
+    Args:
+        model: The model.
+        estimate: The estimate.
+    """
+    found = []
+    for k, (recording, predicted) in enumerate(
+        zip(estimate.recordings, estimate.predicted, strict=True), start=1
+    ):
+        name = f"{k}: {Path(recording.name).name}"
+        pairs = _pairs(
+            model, f"recording {k}", recording, {"identified": predicted}, estimate.sigma
+        )
+        found.append(OutputPlots(name=name, pairs=pairs))
+    return found
+
+
+def held_out_plots(model: mujoco.MjModel, estimate: Estimate) -> list[OutputPlots]:
+    """Return the plots of every held-out recording, with the nominal model as well.
+
+    Args:
+        model: The model.
+        estimate: The estimate.
+    """
+    found = []
+    held_out = [shown for shown in estimate.predictions if shown.recording is not None]
+    for k, prediction in enumerate(held_out, start=1):
+        if prediction.recording is None:
+            continue
+        predicted = {
+            "identified": prediction.identified_outputs,
+            "nominal": prediction.nominal_outputs,
+        }
+        pairs = _pairs(model, f"held out {k}", prediction.recording, predicted, estimate.sigma)
+        name = f"held out: {Path(prediction.recording.name).name}"
+        found.append(OutputPlots(name=name, pairs=pairs))
+    return found
+
+
+def _pairs(
+    model: mujoco.MjModel,
+    name: str,
+    recording: Recording,
+    predicted: Mapping[str, Array],
+    sigma: Mapping[str, float],
+) -> list[tuple[SeriesPlot, SeriesPlot]]:
+    """Plots of each measured output and of its difference from the identified model.
+
+    Args:
+        model: The model.
+        name: Entity of the recording.
+        recording: The recording.
+        predicted: (M, ny) outputs of each model.
+        sigma: Noise of each output [unit of the output].
+    """
+    rows = evenly_spread_indices(len(recording.t), MAX_SAMPLES)
+    t = recording.t[rows]
+    pairs = []
+    for column, output in enumerate(recording.outputs):
+        measured = recording.y[rows, column]
+        if not np.isfinite(measured).any():
+            continue
+
+        label = output_label(model, output)
+        models = {word: values[rows, column] for word, values in predicted.items()}
+        band = BAND * sigma.get(output, np.nan)
+        shown = SeriesPlot(
+            parts=("outputs", name, label),
+            title=label,
+            curves=[_measured("measured", t, measured), *_predicted(t, models, band)],
+        )
+        difference = SeriesPlot(
+            parts=("residuals", name, label),
+            title=f"measured − identified, {label}",
+            curves=[
+                _measured("difference", t, measured - models["identified"]),
+                _edges(t, np.zeros(len(t)), band, LIMIT_COLOUR),
+            ],
+        )
+        pairs.append((shown, difference))
+    return pairs
+
+
+def _measured(name: str, t: Array, values: Array) -> Curve:
+    """Measured samples, or differences from them, as dots."""
+    return Curve(name=name, t=t, values=values, colour=vocabulary.MEASURED.rgb, look="dots")
+
+
+def _predicted(t: Array, models: Mapping[str, Array], band: float) -> Iterator[Curve]:
+    """Outputs of the models as lines, with the noise around those of the identified one."""
+    terms = {term.word: term for term in vocabulary.TERMS}
+    for word, values in models.items():
+        yield Curve(name=word, t=t, values=values, colour=terms[word].rgb)
+    yield _edges(t, models["identified"], band, LIMIT_COLOUR)
+
+
+def _edges(t: Array, middle: Array, band: float, colour: tuple[int, int, int]) -> Curve:
+    """The edges of a band of a half width around values; nothing where the width is unknown."""
+    edges = np.column_stack([middle - band, middle + band])
+    words = (f"−{BAND:.0f} σ of the noise", f"+{BAND:.0f} σ of the noise")
+    return Curve(name="band", t=t, values=edges, colour=colour, look="edges", legend=words)
