@@ -24,15 +24,21 @@ from mjfim.model.coordinates import output_label
 from mjfim.output.rerun import log_design, log_estimate, log_trajectories, show
 from mjfim.output.rerun.camera import place_camera
 from mjfim.output.rerun.history import history_series
+from mjfim.output.rerun.iterates import POSES
 from mjfim.output.rerun.panels import dof_positions
 from mjfim.output.rerun.scene import body_poses, entity_path
-from mjfim.records.design import Design, Evaluation, HistoryRow, StartResult, Status
-from mjfim.records.estimate import Estimate
+from mjfim.output.rerun.series import LARGEST_ZOOM, Curve, SeriesPlot, padded
+from mjfim.output.rerun.shapes import INFINITE_REACH, OUTLINE, SOLID
+from mjfim.output.rerun.strips import round_logarithms, round_numbers
+from mjfim.records.design import Design, Evaluation, HistoryRow, LimitUsage, StartResult, Status
+from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
+from mjfim.records.iterates import MOTION_SAMPLES, IterateMotion, IterateMotions
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
 MODELS = {
     "cart": ROOT / "models" / "cart_pendulum.xml",
+    "quadrotor": ROOT / "models" / "quadrotor.xml",
     "acrobot": SHARED_MODELS / "dmc_acrobot" / "acrobot.xml",
     "panda": SHARED_MODELS / "menagerie_panda" / "panda_nomesh.xml",
     "panda without geoms": SHARED_MODELS / "menagerie_panda" / "panda_nohand_nomesh.xml",
@@ -125,12 +131,25 @@ def designed(model: mujoco.MjModel) -> Design:
         )
         for k in range(3)
     )
+    initial, final = simulated(model, 0.5), simulated(model, 2.0)
+    iterates = [(k, IterateMotion.of(simulated(model, 0.5 + 0.75 * k))) for k in range(3)]
     return Design(
+        motions=IterateMotions.of([(k, motion) for k, motion in iterates if motion]),
+        usage=(
+            LimitUsage(
+                kind="position",
+                name="slide",
+                t=final.t,
+                share=final.qpos[:, 0] / 1.5,
+                lower=-1.5,
+                upper=1.5,
+            ),
+        ),
         status=Status.MAX_ITERATIONS,
         parameters=("mass", "gear/ratio"),
         theta=np.array([2.0, 1.0]),
-        initial=evaluated(model, simulated(model, 0.5), 1.0),
-        final=evaluated(model, simulated(model, 2.0), 16.0),
+        initial=evaluated(model, initial, 1.0),
+        final=evaluated(model, final, 16.0),
         history=history,
         slope=0.01,
         steps=200,
@@ -198,6 +217,97 @@ def column(
     return np.array(times)[order], np.array(values)[order]
 
 
+def blueprint_column(path: Path, component: str) -> dict[str, Any]:
+    """Return one component of the blueprint by entity."""
+    reader = RrdReader(path)
+    found = {}
+    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names:
+            found[str(chunk.entity_path)] = batch.column(component).to_pylist()[0]
+    return found
+
+
+def origins_of_views(path: Path) -> list[tuple[str, str]]:
+    """Return the class and the origin of each view."""
+    origins = blueprint_column(path, "ViewBlueprint:space_origin")
+    classes = blueprint_column(path, "ViewBlueprint:class_identifier")
+    return [(classes[view][0], origin[0]) for view, origin in origins.items()]
+
+
+def ranges_of_views(path: Path) -> dict[str, tuple[float, float]]:
+    """Return the range of values of each plot of series, by its origin."""
+    origins = blueprint_column(path, "ViewBlueprint:space_origin")
+    ranges = blueprint_column(path, "ScalarAxis:range")
+    return {
+        origins[axis.removesuffix("/ScalarAxis")][0]: tuple(limits[0])
+        for axis, limits in ranges.items()
+    }
+
+
+def shown_on_timelines(path: Path) -> dict[str, set[str]]:
+    """Return the timelines on which each entity has data that can be drawn, or "static"."""
+    drawn = ("Scalars:scalars", "LineStrips", "Points2D:positions", "half_sizes", "Mesh3D")
+    shown: dict[str, set[str]] = {}
+    for chunk in RrdReader(path).stream().to_chunks():
+        names = chunk.to_record_batch().schema.names
+        if any(word in name for word in drawn for name in names) or "TextDocument:text" in names:
+            timelines = {"static"} if chunk.is_static else {"sim_time", "iteration"} & set(names)
+            shown.setdefault(str(chunk.entity_path), set()).update(timelines)
+    return shown
+
+
+def series_of(path: Path) -> dict[str, Array]:
+    """Return the values of every series on `sim_time`, by entity."""
+    series: dict[str, list[Any]] = {}
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        if {"Scalars:scalars", "sim_time"} <= set(batch.schema.names):
+            rows = batch.column("Scalars:scalars").to_pylist()
+            series.setdefault(str(chunk.entity_path), []).extend(rows)
+    return {entity: np.array(rows) for entity, rows in series.items()}
+
+
+def assert_series_show(path: Path, sources: dict[tuple[str, ...], Array]) -> None:
+    """Check that each logged series is finite and varies where its source does.
+
+    Args:
+        path: The recording.
+        sources: (n,) values of the sources by entity; a source without finite values has no series.
+    """
+    logged = series_of(path)
+    assert logged
+    for entity, values in logged.items():
+        assert np.isfinite(values).all(), entity
+
+    for parts, source in sources.items():
+        known = source[np.isfinite(source)]
+        found = logged.get(entity_path(parts))
+        if not len(known):
+            assert found is None, parts
+            continue
+        assert found is not None, parts
+        assert (np.ptp(found) > 0.0) == (np.ptp(known) > 0.0), parts
+        assert (found.min(), found.max()) == (known.min(), known.max()), parts
+
+
+def state_sources(
+    model: mujoco.MjModel, name: str, trajectory: Trajectory
+) -> dict[tuple[str, ...], Array]:
+    """Return the columns of a trajectory by the entities of its series."""
+    labels = labels_of_model(model)
+    columns = {
+        "positions": (labels.positions, dof_positions(model, trajectory.qpos)),
+        "velocities": (labels.velocities, trajectory.qvel),
+        "controls": (labels.controls, trajectory.ctrl),
+    }
+    return {
+        (group, label, name): values[:, k]
+        for group, (titles, values) in columns.items()
+        for k, label in enumerate(titles)
+    }
+
+
 @pytest.fixture(scope="module")
 def cart() -> mujoco.MjModel:
     """The paper's model."""
@@ -225,8 +335,10 @@ class TestDesign:
         expected = [
             ("summary",),
             ("phase", "gear/ratio", "axes"),
-            ("bars", "log10 cost"),
-            ("history", "step length"),
+            ("history", "log10 cost", "curve"),
+            ("history", "step length", "now"),
+            ("iterates", "slide [m]", "iterate"),
+            ("limits", "position", "slide"),
         ]
         for key in ("initial", "designed"):
             expected += [
@@ -251,13 +363,7 @@ class TestDesign:
         assert len(RrdReader(file).blueprints()) == 1
 
     def test_every_view_shows_an_entity_with_data(self, file: Path) -> None:
-        reader = RrdReader(file)
-        chunks = reader.stream(store=reader.blueprints()[0]).to_chunks()
-        batches = [chunk.to_record_batch() for chunk in chunks]
-        name = "ViewBlueprint:space_origin"
-        origins = {
-            v[0] for b in batches if name in b.schema.names for v in b.column(name).to_pylist() if v
-        }
+        origins = {origin for _, origin in origins_of_views(file)}
         logged = entities(file)
         assert len(origins) >= 16
         for origin in origins:
@@ -301,18 +407,100 @@ class TestDesign:
         strip = column(file, ("robots", "initial", "path"), None, "LineStrips3D:strips")[1][0, 0]
         np.testing.assert_allclose(strip, translation[:, 0], atol=1e-6)
 
-    def test_moving_bodies_have_no_static_pose_and_show_on_both_timelines(self, file: Path) -> None:
-        path = ("robots", "initial", "bodies", "cart")
-        assert len(column(file, path, None, "Transform3D:translation")[1]) == 0
-        assert list(column(file, path, "iteration", "Transform3D:translation")[0]) == [0]
+    def test_moving_bodies_have_no_static_pose_and_show_on_both_timelines(
+        self, file: Path, design: Design
+    ) -> None:
+        for name, iterations in (("initial", [0]), ("designed", [0, 1, 2])):
+            path = ("robots", name, "bodies", "cart")
+            assert len(column(file, path, None, "Transform3D:translation")[1]) == 0
+            shown, _ = column(file, path, "iteration", "Transform3D:translation")
+            assert list(shown) == iterations
 
-    def test_history_has_a_separate_timeline_and_bars(self, file: Path, design: Design) -> None:
-        iterations, cost = column(file, ("history", "log10 cost"), "iteration", "Scalars:scalars")
+    def test_iterates_repeat_the_robot_along_their_motion(
+        self, file: Path, cart: mujoco.MjModel, design: Design
+    ) -> None:
+        """Poses of the bob at each iterate, in its frame at the begin of the motion."""
+        assert design.motions is not None
+        bob = ("robots", "designed", "bodies", "bob")
+        _, begin = column(file, bob, "iteration", "Transform3D:translation")
+        _, turned = column(file, bob, "iteration", "Transform3D:quaternion")
+        at = (*bob, "bob")
+        _, place = column(file, at, None, "Transform3D:translation")
+        iterations, shifts = column(file, at, "iteration", "InstancePoses3D:translations")
         assert list(iterations) == [0, 1, 2]
-        np.testing.assert_allclose(
-            cost[:, 0], np.log10([row.cost for row in design.history]), rtol=0, atol=0
-        )
-        assert len(column(file, ("bars", "log10 λ_min"), None, "BarChart:values")[1]) == 1
+        assert shifts.shape[1] == POSES
+
+        data = mujoco.MjData(cart)
+        geom = cart.geom("bob").id
+        rows = np.linspace(0, MOTION_SAMPLES - 1, POSES).round().astype(int)
+        for k in range(3):
+            for shift, q in zip(shifts[k], design.motions.qpos[k, rows], strict=True):
+                data.qpos[:] = q
+                mujoco.mj_kinematics(cart, data)
+                end = np.empty(3)
+                wxyz = np.roll(turned[k, 0], 1).astype(np.float64)
+                mujoco.mju_rotVecQuat(end, np.asarray(place[0, 0] + shift, dtype=float), wxyz)
+                np.testing.assert_allclose(begin[k, 0] + end, data.geom_xpos[geom], atol=1e-5)
+
+    def test_path_and_curves_morph_with_the_iteration(self, file: Path) -> None:
+        path = ("robots", "designed", "path")
+        iterations, strips = column(file, path, "iteration", "LineStrips3D:strips")
+        assert list(iterations) == [0, 1, 2]
+        lengths = [np.ptp(np.array(strip[0]), axis=0).max() for strip in strips]
+        assert lengths[0] < 0.5 * lengths[2]
+
+        curve = ("iterates", "slide [m]", "iterate")
+        heights = [
+            np.ptp(np.array(strip[0])[:, 1])
+            for strip in column(file, curve, "iteration", "LineStrips2D:strips")[1]
+        ]
+        assert heights[0] < 0.5 * heights[2]
+
+        # On the other timeline, the last iterate is drawn.
+        shown = column(file, curve, "sim_time", "LineStrips2D:strips")[1]
+        assert np.ptp(np.array(shown[0][0])[:, 1]) == pytest.approx(heights[2])
+
+    def test_history_is_static_with_a_line_at_the_iteration(
+        self, file: Path, design: Design
+    ) -> None:
+        at = ("history", "log10 cost")
+        curve = np.array(column(file, (*at, "curve"), None, "LineStrips2D:strips")[1][0, 0])
+        costs = np.log10([row.cost for row in design.history])
+        shares = (curve[:, 1] - curve[0, 1]) / (curve[-1, 1] - curve[0, 1])
+        expected = (costs - costs[0]) / (costs[-1] - costs[0])
+        np.testing.assert_allclose(shares, expected, atol=1e-6)
+
+        iterations, lines = column(file, (*at, "now"), "iteration", "LineStrips2D:strips")
+        assert list(iterations) == [0, 1, 2]
+        assert [np.array(line[0])[0, 0] for line in lines] == pytest.approx(curve[:, 0].tolist())
+
+    def test_limits_are_lines_on_both_timelines(self, file: Path) -> None:
+        for timeline in ("sim_time", "iteration"):
+            at = ("positions", "slide [m]", "upper limit")
+            values = column(file, at, timeline, "Scalars:scalars")[1]
+            np.testing.assert_array_equal(values[:, 0], [1.5, 1.5])
+        at = ("controls", "force [N]", "lower limit")
+        assert entity_path(at) not in entities(file)
+
+    def test_every_panel_has_something_to_show_on_each_timeline(self, file: Path) -> None:
+        shown = shown_on_timelines(file)
+        for view, origin in origins_of_views(file):
+            for timeline in ("sim_time", "iteration"):
+                found = {
+                    path
+                    for path, timelines in shown.items()
+                    if (path == origin or path.startswith(f"{origin}/"))
+                    and (timeline in timelines or (view != "TimeSeries" and "static" in timelines))
+                }
+                assert found, (view, origin, timeline)
+
+    def test_every_plot_of_series_has_a_range(self, file: Path, design: Design) -> None:
+        ranges = ranges_of_views(file)
+        assert len(ranges) >= 7
+        low, high = ranges[entity_path(("positions", "hinge [rad]"))]
+        for evaluation in (design.initial, design.final):
+            assert low < evaluation.trajectory.qpos[:, 1].min()
+            assert high > evaluation.trajectory.qpos[:, 1].max()
 
     def test_summary_holds_outcome_accuracy_warnings_and_starts(self, file: Path) -> None:
         text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
@@ -358,6 +546,40 @@ class TestDesign:
         path = tmp_path / "design.rrd"
         log_design(path, cart, replace(design, initial=blind, history=()), labels_of_model(cart))
         assert entity_path(("information", "initial")) in entities(path)
+
+
+def flight(model: mujoco.MjModel) -> Trajectory:
+    """Simulate a quadrotor that moves 20 m besides."""
+    trajectory = simulated(model, 0.5, samples=100)
+    qpos = np.array(trajectory.qpos)
+    qpos[:, 0] += np.linspace(0.0, 20.0, len(qpos))
+    return replace(trajectory, qpos=qpos)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[mujoco.MjModel, Path]:
+    """Replay of the flight of a quadrotor."""
+    model = load("quadrotor")
+    path = tmp_path_factory.mktemp("free") / "replay.rrd"
+    log_trajectories(path, model, {"final": flight(model)}, labels_of_model(model))
+    return model, path
+
+
+class TestFreeBody:
+    """A body that flies away."""
+
+    def test_series_vary_where_their_sources_do(self, flown: tuple[mujoco.MjModel, Path]) -> None:
+        model, path = flown
+        assert_series_show(path, state_sources(model, "designed", flight(model)))
+
+    def test_the_camera_follows_a_shape_of_the_body(
+        self, flown: tuple[mujoco.MjModel, Path]
+    ) -> None:
+        _, path = flown
+        tracked = blueprint_column(path, "EyeControls3D:tracking_entity")
+        (entity,) = {names[0] for names in tracked.values()}
+        assert entity in entities(path)
+        assert entity.startswith(entity_path(("robots", "designed", "bodies", "quadrotor")) + "/")
 
 
 @pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo"])
@@ -436,12 +658,17 @@ class TestShapes:
 
     def test_capsule_is_centred_on_its_frame(self, zoo_file: Path) -> None:
         assert self.geom(zoo_file, "a/b c", "limb", "Capsules3D:lengths")[0] == pytest.approx(0.5)
-        np.testing.assert_allclose(
-            self.geom(zoo_file, "a/b c", "limb", "Capsules3D:translations")[0], [0, 0, -0.25]
-        )
+        model = load("zoo")
+        limb = model.geom("limb").id
+
+        # The capsule of Rerun begins at its origin and runs along z.
+        to_middle = np.empty(3)
+        mujoco.mju_rotVecQuat(to_middle, np.array([0.0, 0.0, 0.25]), model.geom_quat[limb])
+        begin = self.geom(zoo_file, "a/b c", "limb", "Transform3D:translation")[0]
+        np.testing.assert_allclose(begin + to_middle, model.geom_pos[limb], atol=1e-7)
 
     def test_bodies_without_geoms_become_sticks(self, zoo_file: Path) -> None:
-        assert self.geom(zoo_file, "bare", "sticks", "Capsules3D:lengths")[0] == pytest.approx(
+        assert self.geom(zoo_file, "bare", "stick 6", "Capsules3D:lengths")[0] == pytest.approx(
             np.hypot(0.3, 0.5)
         )
 
@@ -451,9 +678,10 @@ class TestShapes:
             column(zoo_file, path, None, "Transform3D:translation")[1][0, 0], [0, -1, 0]
         )
 
-    def test_infinite_planes_get_a_finite_board(self, zoo_file: Path) -> None:
+    def test_planes_are_large_boards(self, zoo_file: Path) -> None:
         vertices = self.geom(zoo_file, "world", "floor", "Mesh3D:vertex_positions")
-        assert np.abs(vertices).max() == pytest.approx(2.0 * load("zoo").stat.extent, rel=1e-6)
+        extent = load("zoo").stat.extent
+        assert np.abs(vertices).max() == pytest.approx(INFINITE_REACH * extent, rel=1e-6)
 
 
 class TestEstimate:
@@ -470,10 +698,12 @@ class TestEstimate:
         kept = np.isfinite(estimate.recordings[0].y[:, 0])
         assert len(times) == 40
         np.testing.assert_array_equal(values[:, 0], estimate.recordings[0].y[kept, 0])
-        residual = column(path, ("residuals", *at), "sim_time", "Scalars:scalars")[1][:, 0]
+        residual = column(path, ("residuals", *at, "difference"), "sim_time", "Scalars:scalars")[1][
+            :, 0
+        ]
         np.testing.assert_allclose(residual, 0.01, atol=1e-12)
         assert entity_path(
-            ("outputs", "recording 2", "hinge_angle [rad]", "predicted")
+            ("outputs", "recording 2", "hinge_angle [rad]", "identified")
         ) in entities(path)
 
     def test_a_velocity_that_was_not_measured_has_no_series(
@@ -489,21 +719,73 @@ class TestEstimate:
 
         slide, hinge = (("velocities", label) for label in labels.velocities)
         assert entity_path((*slide, "measured")) not in entities(path)
-        assert entity_path((*slide, "predicted")) in entities(path)
+        assert entity_path((*slide, "identified")) in entities(path)
         _, values = column(path, (*hinge, "measured"), "sim_time", "Scalars:scalars")
         np.testing.assert_array_equal(values[:, 0], qvel[:, 1])
 
-    def test_measured_robot_is_transparent(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
+    def test_measured_robot_is_an_outline(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
         log_estimate(
             path, cart, estimated(cart, trajectory), trajectory, trajectory, labels_of_model(cart)
         )
-        alpha = {}
-        for key in ("measured", "predicted"):
+        fill = {}
+        for key in ("measured", "identified"):
             at = ("robots", key, "bodies", "bob", "bob")
-            alpha[key] = int(column(path, at, None, "Ellipsoids3D:colors")[1][0, 0]) & 0xFF
-        assert alpha["measured"] < 128
-        assert alpha["predicted"] == 255
+            fill[key] = int(column(path, at, None, "Ellipsoids3D:fill_mode")[1][0, 0])
+        assert fill["measured"] == OUTLINE.value
+        assert fill["identified"] == SOLID.value
+
+    def test_held_out_recordings_and_the_band_of_the_noise_are_shown(
+        self, cart: mujoco.MjModel, tmp_path: Path
+    ) -> None:
+        path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
+        estimate = estimated(cart, trajectory)
+        recording = replace(estimate.recordings[1], name="apart/run 7")
+        errors = PredictionErrors(
+            name=recording.name, outputs=recording.outputs, rms=np.ones(2), mae=np.ones(2)
+        )
+        prediction = Prediction(
+            name=recording.name,
+            identified=errors,
+            nominal=errors,
+            held_out=True,
+            recording=recording,
+            identified_outputs=estimate.predicted[1] + 0.001,
+            nominal_outputs=1.5 * estimate.predicted[1],
+        )
+        shown = replace(estimate, predictions=(prediction,), sigma={"qpos:slide": 0.02})
+        log_estimate(path, cart, shown, None, trajectory, labels_of_model(cart))
+
+        sources = {}
+        for column_of, output in enumerate(("qpos:slide [m]", "hinge_angle [rad]")):
+            at = ("outputs", "held out 1", output)
+            sources[*at, "measured"] = recording.y[:, column_of]
+            sources[*at, "identified"] = prediction.identified_outputs[:, column_of]
+            sources[*at, "nominal"] = prediction.nominal_outputs[:, column_of]
+        assert_series_show(path, sources)
+
+        band = series_of(path)[entity_path(("outputs", "held out 1", "qpos:slide [m]", "band"))]
+        expected = prediction.identified_outputs[:, :1] + [[-0.04, 0.04]]
+        np.testing.assert_allclose(band, expected, rtol=0, atol=1e-12)
+        assert not [entry for entry in entities(path) if "hinge_angle" in entry and "band" in entry]
+        names = blueprint_column(path, "ContainerBlueprint:display_name")
+        assert ["held out: run 7"] in names.values()
+
+    @pytest.mark.parametrize("speed", ["measured", "partly measured", "not measured"])
+    def test_series_vary_where_their_sources_do(
+        self, cart: mujoco.MjModel, tmp_path: Path, speed: str
+    ) -> None:
+        path, identified = tmp_path / "estimate.rrd", simulated(cart, 2.0)
+        qvel = np.array(identified.qvel)
+        qvel[:, {"measured": [], "partly measured": [0], "not measured": [0, 1]}[speed]] = np.nan
+        measured = replace(identified, qvel=qvel)
+        labels = labels_of_model(cart)
+        log_estimate(path, cart, estimated(cart, identified), measured, identified, labels)
+        sources = {
+            **state_sources(cart, "identified", identified),
+            **state_sources(cart, "measured", measured),
+        }
+        assert_series_show(path, sources)
 
     def test_without_measured_positions_there_is_no_measured_robot(
         self, cart: mujoco.MjModel, tmp_path: Path
@@ -537,6 +819,31 @@ class TestLabels:
         assert output_label(cart, "qvel:hinge") == "qvel:hinge [rad/s]"
         assert output_label(cart, "slide_velocity") == "slide_velocity [m/s]"
         assert output_label(cart, "something else") == "something else"
+
+    def test_a_constant_and_a_limit_have_a_range(self) -> None:
+        assert padded(2.0, 2.0) == (1.0, 3.0)
+        assert padded(0.0, 0.0) == (-1.0, 1.0)
+        assert padded(np.inf, -np.inf) == (-1.0, 1.0)
+        low, high = padded(0.0, 1e-12)
+        assert low < 0.0 and 1e-12 < high < 2e-12
+
+    def test_a_limit_far_away_stands_in_the_title(self) -> None:
+        curve = Curve(
+            name="slide", t=np.array([0.0, 1.0]), values=np.array([0.0, 1.0]), colour=(0, 0, 0)
+        )
+        far = 2.0 * LARGEST_ZOOM
+        plots = [
+            SeriesPlot(parts=("a",), title="slide [m]", curves=[curve], limits=(-np.inf, limit))
+            for limit in (2.0, far)
+        ]
+        assert plots[0].range[1] > 2.0 and plots[0].full_title == "slide [m]"
+        assert plots[1].range[1] < 2.0 and plots[1].full_title == f"slide [m], limits {far:.3g}"
+
+    def test_numbers_beside_axes_are_round(self) -> None:
+        np.testing.assert_allclose(round_numbers(-0.1, 4.2, 4), [0.0, 2.0, 4.0])
+        np.testing.assert_allclose(round_numbers(2.41, 2.63, 4), [2.5, 2.6])
+        np.testing.assert_allclose(10.0 ** round_logarithms(-0.1, 1.1, 3), [1.0, 2.0, 5.0, 10.0])
+        np.testing.assert_allclose(10.0 ** round_logarithms(-5.2, 0.1, 3), [1e-4, 1e-2, 1.0])
 
     def test_rotations_become_rotation_vectors(self) -> None:
         model = load("zoo")

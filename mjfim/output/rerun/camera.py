@@ -29,6 +29,10 @@ PLANAR_RATIO = 0.2
 # Height of the unit vector towards the camera below which the ground is seen edge-on.
 EDGE_ON = 0.3
 
+# A free body is followed if it travels farther than this multiple of the size of the robot around
+# it; the followed robot is then seen with free space around it, as a multiple of its size.
+FOLLOW_RATIO, FOLLOW_ROOM = 2.0, 2.0
+
 # Vectors from the scene towards the camera: for a motion in the x-z plane, in the y-z plane, and in
 # space.
 TOWARDS_CAMERA_XZ = (0.0, -1.0, 0.15)
@@ -45,17 +49,26 @@ class Camera:
         target: Point that it looks at [m].
         stacked: True where several views show the scene larger if they are above each other.
         edge_on: True where the ground is seen edge-on.
+        followed: Number of the free body that it follows; None where it stands still.
     """
 
     position: tuple[float, ...]
     target: tuple[float, ...]
     stacked: bool
     edge_on: bool
+    followed: int | None = None
 
-    def controls(self) -> rrb.EyeControls3D:
-        """Return the camera for the blueprint of a 3D view."""
+    def controls(self, tracked: str | None = None) -> rrb.EyeControls3D:
+        """Return the camera for the blueprint of a 3D view.
+
+        Args:
+            tracked: Path of the entity that it follows; None where it stands still.
+        """
         return rrb.EyeControls3D(
-            position=self.position, look_target=self.target, eye_up=(0.0, 0.0, 1.0)
+            position=self.position,
+            look_target=self.target,
+            eye_up=(0.0, 0.0, 1.0),
+            tracking_entity=tracked,
         )
 
 
@@ -64,7 +77,7 @@ def place_camera(
 ) -> Camera:
     """Place a camera that has all moving geoms of every motion in view.
 
-    If nothing moves, the whole model is in view.
+    If nothing moves, the whole model is in view. A free body that travels far is followed.
 
     Args:
         model: The model.
@@ -75,8 +88,13 @@ def place_camera(
     clouds = moving_points(model, motions)
     towards_camera = view_direction(extents(clouds))
     axes = camera_axes(towards_camera)
+    followed = followed_body(model, motions, clouds)
+    if followed is not None:
+        clouds = _around_begin(clouds, motions, followed)
+
     low, high = _bounding_box(model, clouds, axes)
-    width, height, depth = np.maximum(high - low, 1e-6)
+    room = 1.0 if followed is None else FOLLOW_ROOM
+    width, height, depth = room * np.maximum(high - low, 1e-6)
 
     # Views are stacked if this draws the scene larger.
     stacked_scale = min(1.0 / (views * height), aspect / width)
@@ -93,7 +111,40 @@ def place_camera(
         target=tuple(map(float, target)),
         stacked=stacked,
         edge_on=bool(towards_camera[2] < EDGE_ON),
+        followed=followed,
     )
+
+
+def followed_body(
+    model: mujoco.MjModel, motions: Sequence[BodyPoses], clouds: Sequence[Array]
+) -> int | None:
+    """Return the first free body if it travels far compared with the size of the robot around it.
+
+    Args:
+        model: The model.
+        motions: Poses along each trajectory.
+        clouds: (samples, n, 3) world paths of the corners of all moving geoms, by motion [m].
+    """
+    free = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE))
+    if not len(free):
+        return None
+
+    body = int(model.jnt_bodyid[free[0]])
+    travelled = max(float(np.ptp(poses.positions[:, body], axis=0).max()) for poses in motions)
+    around = _around_begin(clouds, motions, body)
+    size = max(float(np.ptp(cloud.reshape(-1, 3), axis=0).max()) for cloud in around)
+    return body if travelled > FOLLOW_RATIO * size else None
+
+
+def _around_begin(clouds: Sequence[Array], motions: Sequence[BodyPoses], body: int) -> list[Array]:
+    """Move every sample of each cloud so that a body stays where the first motion begins."""
+    begin = motions[0].positions[0, body]
+    moved = []
+    for cloud, poses in zip(clouds, motions, strict=True):
+        every = max(1, len(poses.t) // CAMERA_SAMPLES)
+        place = poses.positions[::every, body]
+        moved.append(cloud - place[:, None] + begin)
+    return moved
 
 
 def moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[Array]:

@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 
 from mjfim.arrays import evenly_spread_indices
 from mjfim.output import vocabulary
-from mjfim.output.rerun.camera import Camera, place_camera
+from mjfim.output.rerun.camera import place_camera
 from mjfim.output.rerun.history import HistoryPlot, history_plots
 from mjfim.output.rerun.iterates import (
     IterateCurves,
@@ -73,6 +73,9 @@ INITIAL_ROOT = ("robots", vocabulary.INITIAL.word)
 DESIGNED_ROOT = ("robots", vocabulary.DESIGNED.word)
 HISTORY_STYLES = (DESIGNED,) * 4
 
+# Title of the view with several robots.
+OVERLAY = "overlay"
+
 # Largest number of samples of a motion in a file.
 MAX_SAMPLES = 20_000
 
@@ -93,13 +96,12 @@ def log_design(
         addition: Markdown to append to the summary.
     """
     content = _DesignContent.of(model, design, labels)
-    poses = content.poses
-    camera = place_camera(model, list(poses.values()), views=2, aspect=ASPECT_WITH_TEXT)
     titles = {
-        f"{term.word} trajectory ({term.colour_name})": ("robots", term.word)
+        f"{term.word} ({term.colour_name})": ("robots", term.word)
         for term in (vocabulary.INITIAL, vocabulary.DESIGNED)
     }
-    layout = arrange(_robots(model, camera, titles), content.tabs(labels))
+    robots = _robots(model, list(content.poses.values()), titles, ASPECT_WITH_TEXT)
+    layout = arrange(robots, content.tabs(labels))
 
     units = labels.parameter_units or ("",) * len(design.parameters)
     with open_recording(path, model, "design", layout) as rec:
@@ -301,7 +303,8 @@ def log_estimate(
     recordings = [*output_plots(model, estimate), *held_out_plots(model, estimate)]
     states = state_plots(model, labels, shown, limits_of_model(model))
     tabs = [tab for recording in recordings for tab in recording.tabs()]
-    view = robot_views(model, camera, {title: ("robots",)})[0]
+    followed = ("robots", vocabulary.IDENTIFIED.word)
+    view = robot_views(model, camera, {title: ("robots",)}, followed=followed)[0]
     layout = arrange(view, [*tabs, *states.tabs()])
 
     with open_recording(path, model, "estimate", layout) as rec:
@@ -346,14 +349,13 @@ def log_trajectories(
         name: body_poses(model, trajectory.t, trajectory.qpos)
         for name, trajectory in trajectories.items()
     }
-    motions = list(poses.values())
-    camera = place_camera(model, motions, views=len(motions), aspect=ASPECT_WITHOUT_TEXT)
     shown = [
         ShownTrajectory(name=name, trajectory=trajectory, style=styles[name])
         for name, trajectory in trajectories.items()
     ]
     states = state_plots(model, labels, shown, limits_of_model(model))
-    robots = _robots(model, camera, {name: ("robots", name) for name in trajectories})
+    titles = {name: ("robots", name) for name in trajectories}
+    robots = _robots(model, list(poses.values()), titles, ASPECT_WITHOUT_TEXT)
     layout = arrange(robots, states.tabs(), text=False)
 
     with open_recording(path, model, "replay", layout) as rec:
@@ -381,11 +383,24 @@ def _trajectory_styles(names: Sequence[str]) -> dict[str, RobotStyle]:
 
 
 def _robots(
-    model: mujoco.MjModel, camera: Camera, titles: Mapping[str, tuple[str, ...]]
+    model: mujoco.MjModel,
+    motions: Sequence[BodyPoses],
+    titles: Mapping[str, tuple[str, ...]],
+    aspect: float,
 ) -> rrb.Container:
-    """Return the views of several robots: separate, and in another tab overlaid."""
+    """Return the views of several robots: separate, and in another tab overlaid.
+
+    Args:
+        model: The model.
+        motions: Poses along each trajectory.
+        titles: Entity of each robot, by the title of its view.
+        aspect: Width over height of the region of the robots.
+    """
+    camera = place_camera(model, motions, views=len(motions), aspect=aspect)
     views = robot_views(model, camera, titles)
-    overlay = robot_views(model, camera, {"overlay": ("robots",)})[0]
+    near = place_camera(model, motions, views=1, aspect=aspect)
+    last = list(titles.values())[-1]
+    overlay = robot_views(model, near, {OVERLAY: ("robots",)}, followed=last)[0]
     return separate_and_overlaid(views, camera, overlay)
 
 

@@ -28,7 +28,7 @@ from mjfim.output.rerun.scene import (
     strip_of_path,
 )
 from mjfim.output.rerun.series import Curve, Range, padded
-from mjfim.output.rerun.shapes import RobotStyle, drawn_shapes
+from mjfim.output.rerun.shapes import SOLID, DrawnShape, RobotStyle, drawn_shapes
 from mjfim.output.rerun.strips import StripPlot
 from mjfim.records.design import Design
 from mjfim.records.iterates import IterateMotion, IterateMotions
@@ -36,6 +36,9 @@ from mjfim.records.trajectory import Trajectory
 
 # Number of poses in which the robot is drawn at an iterate, evenly spread over its motion.
 POSES = 4
+
+# Entity below a capsule that holds its poses.
+CAPSULES = "poses"
 
 # Thickness of the curve of the initial trajectory relative to that of an iterate.
 INITIAL_WIDTH = 0.6
@@ -184,14 +187,41 @@ def log_poses_of_iterates(
         for shape in drawn_shapes(model, body, style):
             offset = Rotation.from_quat(np.roll(shape.quaternion, -1))
             translations, quaternions = _repeated(place, turn, shape.position, offset, rows)
-            instances = rr.InstancePoses3D.columns(
-                translations=translations, quaternions=quaternions
-            ).partition([POSES] * m)
-            path = entity_path((*parts, shape.name))
-            rec.send_columns(path, [iterations], instances, strict=True)
+            _send_instances(rec, parts, shape, iterations, translations, quaternions)
 
     if end is not None:
         _log_paths(rec, root, end.path(poses).reshape(m, n, 3), curves.iterations, style, now)
+
+
+def _send_instances(
+    rec: rr.RecordingStream,
+    parts: EntityParts,
+    shape: DrawnShape,
+    iterations: rr.TimeColumn,
+    translations: Array,
+    quaternions: Array,
+) -> None:
+    """Log poses of a shape in its own frame, `POSES` of them for each iteration."""
+    count = len(translations)
+    path = entity_path((*parts, shape.name))
+    if not isinstance(shape.archetype, rr.Capsules3D):
+        instances = rr.InstancePoses3D.columns(translations=translations, quaternions=quaternions)
+        partition = instances.partition([POSES] * (count // POSES))
+        rec.send_columns(path, [iterations], partition, strict=True)
+        return
+
+    # The viewer does not repeat capsules at instance poses, so that there are several of them.
+    path = f"{path}/{entity_path((CAPSULES,)).lstrip('/')}"
+    still = rr.Capsules3D.from_fields(colors=[shape.rgba], fill_mode=SOLID)
+    rec.log(path, still, static=True, strict=True)
+    columns = rr.Capsules3D.columns(
+        lengths=[shape.length] * count,
+        radii=[shape.radius] * count,
+        translations=translations,
+        quaternions=quaternions,
+    )
+    partition = columns.partition([POSES] * (count // POSES))
+    rec.send_columns(path, [iterations], partition, strict=True)
 
 
 def _repeated(
@@ -310,8 +340,13 @@ def iterate_plots(
         plots.append(_iterate_plot(label, limits, known, times, values, count))
     for i, (label, limits) in enumerate(controls):
         known, values = (initial.t[:-1], initial.ctrl[:, i]), ctrl[:, :, i]
-        plots.append(_iterate_plot(f"control {label}", limits, known, times, values, count))
+        plots.append(_iterate_plot(_control_title(label), limits, known, times, values, count))
     return plots
+
+
+def _control_title(label: str) -> str:
+    """Title of the plot of a control, whose label may be that of a position."""
+    return label if "(control)" in label else f"control {label}"
 
 
 def _iterate_plot(

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from mjfim.atomic_io import replacing
 from mjfim.output.rerun.camera import Camera
-from mjfim.output.rerun.scene import EntityParts, entity_path, has_floor
+from mjfim.output.rerun.scene import EntityParts, entity_path, first_shape_parts, has_floor
 
 # Colour of the background of the 3D views (0..255).
 BACKGROUND_COLOUR = (214, 219, 226)
@@ -86,7 +86,10 @@ def arrange(
 
 
 def robot_views(
-    model: mujoco.MjModel, camera: Camera, roots: Mapping[str, EntityParts]
+    model: mujoco.MjModel,
+    camera: Camera,
+    roots: Mapping[str, EntityParts],
+    followed: EntityParts | None = None,
 ) -> list[rrb.View]:
     """Return 3D views of robots, all seen from the same camera.
 
@@ -94,15 +97,20 @@ def robot_views(
         model: The model.
         camera: The camera.
         roots: Entity of each view, by its title.
+        followed: Entity of the robot that the camera follows, where it follows one; by default
+            that of the view.
     """
     grid_helps = not has_floor(model) and not camera.edge_on
     ground = rrb.LineGrid3D(visible=grid_helps)
     views: list[rrb.View] = []
     for title, root in roots.items():
+        tracked = None
+        if camera.followed is not None:
+            tracked = entity_path(first_shape_parts(model, followed or root, camera.followed))
         view = rrb.Spatial3DView(
             origin=entity_path(root),
             name=title,
-            eye_controls=camera.controls(),
+            eye_controls=camera.controls(tracked),
             line_grid=ground,
             background=BACKGROUND_COLOUR,
         )

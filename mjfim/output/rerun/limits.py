@@ -97,6 +97,7 @@ def usage_plots(usage: Sequence[LimitUsage], history: Sequence[HistoryRow]) -> l
             title=f"{kind.replace('_', ' ')}: share of the limit [%]",
             curves=[*curves, worst],
             limits=(-np.inf if kind == "clearance" else -100.0, 100.0),
+            largest_zoom=np.inf,
         )
         plots.append(plot)
     return plots

@@ -21,6 +21,10 @@ from mjfim.records.recording import Recording
 # Largest number of samples of a recording in a file.
 MAX_SAMPLES = 20_000
 
+# Width of the curve of the identified model relative to others, so that it is visible below the
+# measured dots.
+IDENTIFIED_WIDTH = 2.0
+
 # Half width of the band around a prediction [standard deviations of the noise].
 BAND = 2.0
 
@@ -49,7 +53,9 @@ class OutputPlots:
         pages = [self.pairs[k : k + rows] for k in range(0, len(self.pairs), rows)]
         tabs = []
         for number, page in enumerate(pages, start=1):
-            views = [plot.view(legend=not k) for k, pair in enumerate(page) for plot in pair]
+            views = []
+            for k, (shown, difference) in enumerate(page):
+                views += [shown.view(legend=not k), difference.view()]
             name = self.name if len(pages) == 1 else f"{self.name} ({number})"
             tabs.append(rrb.Grid(*views, grid_columns=2, name=name))
         return tabs
@@ -149,7 +155,8 @@ def _predicted(t: Array, models: Mapping[str, Array], band: float) -> Iterator[C
     """Outputs of the models as lines, with the noise around those of the identified one."""
     terms = {term.word: term for term in vocabulary.TERMS}
     for word, values in models.items():
-        yield Curve(name=word, t=t, values=values, colour=terms[word].rgb)
+        width = IDENTIFIED_WIDTH if word == vocabulary.IDENTIFIED.word else 1.0
+        yield Curve(name=word, t=t, values=values, colour=terms[word].rgb, width=width)
     yield _edges(t, models["identified"], band, LIMIT_COLOUR)
 
 

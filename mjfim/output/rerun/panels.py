@@ -65,16 +65,13 @@ def grid_tabs(name: str, views: Sequence[rrb.View]) -> list[rrb.Grid]:
     Returns:
         A grid for each tab; none without views.
     """
-    pages = [views[k : k + PLOTS_PER_TAB] for k in range(0, len(views), PLOTS_PER_TAB)]
-    columns = _columns(len(views))
-    return [
-        rrb.Grid(
-            *page,
-            grid_columns=columns,
-            name=name if len(pages) == 1 else f"{name} {number}",
-        )
-        for number, page in enumerate(pages, start=1)
-    ]
+    pages = np.array_split(np.arange(len(views)), _page_count(len(views)))
+    tabs = []
+    for number, page in enumerate(pages, start=1):
+        label = name if len(pages) == 1 else f"{name} {number}"
+        shown = [views[k] for k in page.tolist()]
+        tabs.append(rrb.Grid(*shown, grid_columns=_columns(len(shown)), name=label))
+    return tabs if len(views) else []
 
 
 def plot_size(count: int) -> tuple[float, float]:
@@ -83,11 +80,17 @@ def plot_size(count: int) -> tuple[float, float]:
     Args:
         count: Number of plots of its group.
     """
-    columns = _columns(count)
-    rows = -(-min(count, PLOTS_PER_TAB) // columns)
-    return TAB_WIDTH / columns, TAB_HEIGHT / max(rows, 1) - TITLE_HEIGHT
+    shown = -(-count // _page_count(count))
+    columns = _columns(shown)
+    rows = max(-(-shown // columns), 1)
+    return TAB_WIDTH / columns, TAB_HEIGHT / rows - TITLE_HEIGHT
+
+
+def _page_count(count: int) -> int:
+    """Number of tabs that the plots of a group need."""
+    return max(-(-count // PLOTS_PER_TAB), 1)
 
 
 def _columns(count: int) -> int:
-    """Number of columns in which the plots of a group are arranged."""
+    """Number of columns in which the plots of a tab are arranged."""
     return 1 if count <= MAX_SINGLE_COLUMN else 2

@@ -151,10 +151,9 @@ class PhasePlot:
             labels: Labels of the degrees of freedom.
         """
         position, _ = split_unit(labels.positions[self.dof])
-        across, up = (unit.strip("[]") for unit in self._units(labels))
         return rrb.Spatial2DView(
             origin=entity_path(self.parts),
-            name=f"ψ of {self.parameter}: {position} → [{across}], velocity ↑ [{up}]",
+            name=f"ψ of {self.parameter}: {position} →, its velocity ↑",
             visual_bounds=rrb.VisualBounds2D(x_range=[-1.9, 1.9], y_range=[-1.3, 1.3]),
         )
 

@@ -18,13 +18,13 @@ from mjfim.arrays import Array
 from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
 
 # Width of curves, and size of dots [points].
-LINE_WIDTH, DOT_SIZE = 2.0, 1.5
+LINE_WIDTH, DOT_SIZE = 2.0, 1.0
 
 # Share of the range of values that is left free above and below the curves.
 MARGIN = 0.08
 
-# The range of a plot reaches to a limit if it is then at most this many times as large.
-LARGEST_ZOOM = 4.0
+# The range of a plot reaches to the limits if it is then at most this many times as large.
+LARGEST_ZOOM = 8.0
 
 # Width and colour (0..255) of lines of limits.
 LIMIT_WIDTH, LIMIT_COLOUR = 1.2, (150, 150, 150)
@@ -52,6 +52,7 @@ class Curve:
             a band.
         timeline: The timeline of `t`.
         legend: Names of the m series in the legend; by default `name`.
+        width: Width of its lines relative to that of others.
     """
 
     name: str
@@ -61,11 +62,12 @@ class Curve:
     look: Literal["line", "steps", "dots", "edges"] = "line"
     timeline: Timeline = "sim_time"
     legend: tuple[str, ...] = ()
+    width: float = 1.0
 
     @property
     def rows(self) -> Array:
         """(n, m) values, also of a single series."""
-        return self.values.reshape(len(self.values), -1)
+        return self.values[:, None] if self.values.ndim == 1 else self.values
 
     @property
     def finite(self) -> Array:
@@ -98,7 +100,7 @@ class Curve:
         if self.look == "dots":
             return rr.SeriesPoints(colors=colours, names=names, marker_sizes=[DOT_SIZE] * count)
 
-        width = LINE_WIDTH * (EDGE_WIDTH if self.look == "edges" else 1.0)
+        width = LINE_WIDTH * self.width * (EDGE_WIDTH if self.look == "edges" else 1.0)
         held = rr.components.InterpolationMode.StepAfter if self.look == "steps" else None
         return rr.SeriesLines(
             colors=colours, names=names, widths=[width] * count, interpolation_mode=held
@@ -114,12 +116,15 @@ class SeriesPlot:
         title: Title with the unit.
         curves: The curves.
         limits: Lower and upper limit of the plotted quantity, infinite without one.
+        largest_zoom: The plot reaches to the limits if its range is then at most this many times as
+            large.
     """
 
     parts: EntityParts
     title: str
     curves: Sequence[Curve]
     limits: Range = NO_LIMITS
+    largest_zoom: float = LARGEST_ZOOM
 
     @property
     def is_empty(self) -> bool:
@@ -135,7 +140,7 @@ class SeriesPlot:
 
         finite_limits = [limit for limit in self.limits if np.isfinite(limit)]
         whole_low, whole_high = min([low, *finite_limits]), max([high, *finite_limits])
-        if not high > low or whole_high - whole_low <= LARGEST_ZOOM * (high - low):
+        if not high > low or whole_high - whole_low <= self.largest_zoom * (high - low):
             low, high = whole_low, whole_high
         return padded(low, high)
 
@@ -144,11 +149,11 @@ class SeriesPlot:
         """The title; it names the limits that are outside the plot."""
         low, high = self.range
         outside = [
-            f"{word} {limit:.4g}"
-            for word, limit in zip(("lower", "upper"), self.limits, strict=True)
+            f"{limit:.3g}"
+            for limit in self.limits
             if np.isfinite(limit) and not low <= limit <= high
         ]
-        return f"{self.title}, limits outside: {', '.join(outside)}" if outside else self.title
+        return f"{self.title}, limits {', '.join(outside)}" if outside else self.title
 
     def log(self, rec: rr.RecordingStream) -> None:
         """Log all curves, and the limits from the first to the last time of each timeline.
@@ -184,10 +189,10 @@ class SeriesPlot:
 
         timelines: tuple[Timeline, ...] = ("sim_time", "iteration")
         for timeline in timelines:
-            times = [curve.t for curve in self.curves if curve.timeline == timeline]
-            if not times:
+            times = [np.asarray(c.t) for c in self.curves if c.timeline == timeline]
+            every = np.concatenate([np.zeros(0), *times])
+            if not len(every):
                 continue
-            every = np.concatenate(times)
             ends = times_on(timeline, np.array([every.min(), every.max()]))
             columns = rr.Scalars.columns(scalars=[limit, limit])
             rec.send_columns(path, [ends], columns, strict=True)

@@ -35,9 +35,9 @@ LAST_SHOWN_GROUP = 2
 # Radius of the sticks of a stick figure, as a share of the model's extent.
 STICK_RADIUS = 0.02
 
-# Side of the squares of a ground plane, and distance from the middle to the edges of an infinite
-# one, both as multiples of the model's extent.
-SQUARE_SIZE, INFINITE_REACH = 0.25, 8.0
+# Side of the squares of a ground plane, and smallest distance from its middle to its edges, both as
+# multiples of the extent of the model.
+SQUARE_SIZE, INFINITE_REACH = 0.25, 20.0
 
 # Largest number of squares along each side of a ground plane.
 MAX_SQUARES = 64
@@ -90,12 +90,18 @@ class DrawnShape:
         position: (3,) origin of the shape in the frame of the body [m].
         quaternion: (4,) its orientation, wxyz.
         archetype: The shape in its own frame.
+        rgba: Its colour (0..255, with opacity).
+        length: Length of the straight part, for a capsule [m].
+        radius: Radius, for a capsule [m].
     """
 
     name: str
     position: Array
     quaternion: Array
     archetype: rr.AsComponents
+    rgba: list[int]
+    length: float = 0.0
+    radius: float = 0.0
 
 
 # ---- geoms of a body
@@ -157,6 +163,9 @@ def drawn_shapes(model: mujoco.MjModel, body: int, style: RobotStyle) -> Iterato
             position=geom_origin(model, geom),
             quaternion=model.geom_quat[geom],
             archetype=archetype,
+            rgba=rgba,
+            length=2.0 * float(model.geom_size[geom, 1]),
+            radius=float(model.geom_size[geom, 0]),
         )
 
     if moving and not geoms:
@@ -237,7 +246,9 @@ def stick_figure(
     radius = STICK_RADIUS * float(model.stat.extent)
     upright = np.array([1.0, 0.0, 0.0, 0.0])
     ball = rr.Ellipsoids3D(half_sizes=[[1.5 * radius] * 3], colors=[rgba], fill_mode=fill)
-    yield DrawnShape(name="ball", position=np.zeros(3), quaternion=upright, archetype=ball)
+    yield DrawnShape(
+        name="ball", position=np.zeros(3), quaternion=upright, archetype=ball, rgba=rgba
+    )
 
     for child in np.flatnonzero(model.body_parentid == body):
         end = np.array(model.body_pos[child])
@@ -250,7 +261,15 @@ def stick_figure(
         mujoco.mju_quatZ2Vec(turned, end / length)
         stick = rr.Capsules3D(lengths=[length], radii=[radius], colors=[rgba], fill_mode=fill)
         name = f"stick {child}"
-        yield DrawnShape(name=name, position=np.zeros(3), quaternion=turned, archetype=stick)
+        yield DrawnShape(
+            name=name,
+            position=np.zeros(3),
+            quaternion=turned,
+            archetype=stick,
+            rgba=rgba,
+            length=length,
+            radius=radius,
+        )
 
 
 # ---- single types
@@ -259,10 +278,13 @@ def stick_figure(
 def _ground_plane(
     model: mujoco.MjModel, half_x: float, half_y: float, rgba: list[int]
 ) -> rr.Mesh3D:
-    """Return a plane as a board of finite size. Half sizes [m] of 0 mean an infinite plane."""
+    """Return a plane, which is infinite for MuJoCo, as a large board.
+
+    Half sizes [m] larger than that are kept.
+    """
     extent = float(model.stat.extent)
     reach = INFINITE_REACH * extent
-    half_sizes = np.array([half_x or reach, half_y or reach])
+    half_sizes = np.maximum((half_x, half_y), reach)
 
     # The squares of a huge plane are larger.
     side = max(SQUARE_SIZE * extent, 2.0 * float(half_sizes.max()) / MAX_SQUARES)

@@ -149,7 +149,7 @@ class StripPlot:
     def _log_numbers(self, rec: rr.RecordingStream) -> None:
         """Log the numbers beside the axes."""
         across = round_numbers(*self.x, INTERVALS_X)
-        up = round_numbers(*self.y, INTERVALS_Y)
+        up = (round_logarithms if self.logarithmic else round_numbers)(*self.y, INTERVALS_Y)
         below = self.points(across, np.full(len(across), self.y[0]))
         beside = self.points(np.full(len(up), self.x[0]), up)
 
@@ -190,3 +190,25 @@ def round_numbers(low: float, high: float, intervals: int) -> Array:
 
     # Round-off at zero is not shown.
     return np.where(np.abs(numbers) < 1e-9 * step, 0.0, numbers)
+
+
+def round_logarithms(low: float, high: float, intervals: int) -> Array:
+    """Return logarithms to base 10 of round numbers in a range of logarithms.
+
+    Args:
+        low: Lower end of the range.
+        high: Upper end of the range.
+        intervals: Largest number of intervals between them.
+    """
+    decades = np.arange(np.floor(low), np.ceil(high) + 1.0)
+    for sizes in ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,)):
+        numbers = np.add.outer(decades, np.log10(sizes)).ravel()
+        numbers = numbers[(numbers >= low) & (numbers <= high)]
+        if 2 <= len(numbers) <= intervals + 1:
+            return np.asarray(numbers)
+
+    # Over many decades only some have a number; within a small part of one, any number has.
+    steps = np.unique(np.rint(round_numbers(low, high, intervals)))
+    if len(steps) >= 2:
+        return np.asarray(steps[(steps >= low) & (steps <= high)])
+    return round_numbers(low, high, intervals)
