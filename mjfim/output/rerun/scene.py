@@ -162,8 +162,6 @@ def log_robot(
     root: EntityParts,
     poses: BodyPoses,
     style: RobotStyle,
-    *,
-    on_iteration: bool = False,
 ) -> None:
     """Log the shapes of one robot, and its poses on `sim_time`.
 
@@ -173,8 +171,6 @@ def log_robot(
         root: Entity of the robot.
         poses: Poses of its bodies.
         style: Style in which it is drawn.
-        on_iteration: True to log the first pose also on the timeline `iteration`, so that the robot
-            is visible on it.
     """
     for body in range(model.nbody):
         parts = body_parts(model, root, body)
@@ -184,7 +180,7 @@ def log_robot(
         if body == 0:
             continue
         if is_moving(model, body):
-            _log_motion(rec, entity_path(parts), poses, body, on_iteration=on_iteration)
+            _log_motion(rec, entity_path(parts), poses, body)
         else:
             _log_fixed_pose(rec, entity_path(parts), poses, body)
 
@@ -230,9 +226,7 @@ def _log_fixed_pose(rec: rr.RecordingStream, path: str, poses: BodyPoses, body: 
     rec.log(path, pose, static=True, strict=True)
 
 
-def _log_motion(
-    rec: rr.RecordingStream, path: str, poses: BodyPoses, body: int, *, on_iteration: bool
-) -> None:
+def _log_motion(rec: rr.RecordingStream, path: str, poses: BodyPoses, body: int) -> None:
     """Log the poses of a moving body, a row per sample.
 
     No pose is static, because static data would override the others.
@@ -241,10 +235,6 @@ def _log_motion(
     xyzw = np.roll(poses.quaternions[:, body], -1, axis=1)
     rows = rr.Transform3D.columns(translation=xyz, quaternion=xyzw)
     rec.send_columns(path, [time_column(poses.t)], rows, strict=True)
-
-    if on_iteration:
-        first = rr.Transform3D.columns(translation=xyz[:1], quaternion=xyzw[:1])
-        rec.send_columns(path, [rr.TimeColumn("iteration", sequence=[0])], first, strict=True)
 
 
 def _log_shapes(
