@@ -203,7 +203,8 @@ def test_a_rough_design_asks_for_another_motion_not_for_more_time() -> None:
     [
         ({}, Level.GOOD, "explains the recordings"),
         ({"misfit": True, "chi2": 800.0}, Level.DOUBTFUL, "2.01 times the noise"),
-        ({"success": False, "at_bound": ("mass",)}, Level.BAD, "mass ended at a bound"),
+        ({"success": False, "status": "stopped early"}, Level.BAD, "reliable: stopped early."),
+        ({"success": False, "combinations": ("a b",)}, Level.BAD, "in combination only"),
     ],
 )
 def test_the_verdict_on_an_estimate(changes: dict[str, Any], level: Level, words: str) -> None:

@@ -183,9 +183,7 @@ def _why_not_reliable(estimate: Estimate) -> str:
     """Why an estimate is not reliable, in words."""
     if estimate.combinations:
         return "the recordings determine some parameters in combination only"
-    if estimate.at_bound:
-        return f"{first_ones(estimate.at_bound)} ended at a bound"
-    return estimate.status
+    return estimate.status.removesuffix(".")
 
 
 def _worst_estimate(estimate: Estimate) -> str:
