@@ -22,6 +22,7 @@ ONLY_IN_PYTHON = ("function",)  # Keys of a parameter that a file cannot state.
 RESERVED = ("directory", "source")  # Attributes of an experiment that are no keys of the file.
 MAX_FILE_SIZE = 64 * 2**20  # Largest size of an experiment file [characters].
 DIALECT = "https://json-schema.org/draft/2020-12/schema"  # Dialect of the JSON schema.
+MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")  # Endings of model files, which are no experiments.
 
 
 class Experiment(Section):
@@ -162,6 +163,11 @@ class Experiment(Section):
                 f"{path}: cannot read the experiment file: {error.strerror}"
             ) from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            if path.suffix.lower() in MODEL_ENDINGS:
+                raise ExperimentError(
+                    f"{path}: a model, but an experiment file (TOML) is needed, which states the "
+                    f"model; `mjfim init {path}` writes a first one"
+                ) from None
             raise ExperimentError(f"{path}: not valid TOML: {error}") from None
         except RecursionError:
             raise ExperimentError(

@@ -24,11 +24,16 @@ def load_spec(path: Path) -> Any:
         path: The file.
 
     Raises:
-        ModelError: The file is absent, holds NaN, expands to a model that would fill the memory, or
-            MuJoCo cannot read it; then the message is MuJoCo's.
+        ModelError: The file is absent or no model, holds NaN, expands to a model that would fill
+            the memory, or MuJoCo cannot read it; then the message is MuJoCo's.
     """
     if not path.is_file():
         raise ModelError(f"{path}: no such model file")
+    if path.suffix.lower() == ".toml":
+        raise ModelError(
+            f"{path}: an experiment file, but a model (MJCF or URDF) is needed, such as the one "
+            "that this file states"
+        )
     check_file_numbers(path)
     check_expanded_size(path)
     try:

@@ -52,6 +52,27 @@ def test_init_writes_nothing_for_a_wrong_group(tmp_path: Path) -> None:
     assert names(tmp_path) == set()
 
 
+def test_a_model_and_an_experiment_in_the_place_of_the_other(tmp_path: Path) -> None:
+    model, experiment = MODELS / "cart_pendulum.xml", MODELS / "cart_pendulum.toml"
+    for verb in ("validate", "check", "design"):
+        result = run(verb, model, *(["-o", tmp_path / "out"] if verb == "design" else []))
+        assert result.exit_code == 2
+        assert f"`mjfim init {model}` writes a first one" in result.stderr
+
+    for verb in ("init", "list"):
+        result = run(verb, experiment)
+        assert result.exit_code == 2
+        assert f"{experiment}: an experiment file, but a model" in result.stderr
+
+
+def test_a_model_without_joints_is_refused(tmp_path: Path) -> None:
+    model = tmp_path / "rigid.xml"
+    model.write_text("<mujoco/>", encoding="utf-8")
+    result = run("init", model, "-o", tmp_path / "a.toml")
+    assert result.exit_code == 2
+    assert "rigid.xml: the model has no joint" in result.stderr
+
+
 def asked(file: Path, *answers: str) -> Result:
     """`mjfim init --ask` for a slide with a pendulum, with these answers."""
     words = ["init", str(MODELS / "cart_pendulum.xml"), "-o", str(file), "--ask"]

@@ -52,6 +52,22 @@ URDF = """
 </robot>
 """
 
+# An arm on a base that does not move.
+BOLTED = """
+<mujoco>
+  <worldbody>
+    <body name="base">
+      <geom size="0.1" mass="1"/>
+      <body name="arm">
+        <joint name="hinge" axis="0 1 0" damping="0.1"/>
+        <geom type="capsule" size="0.02" fromto="0.2 0 0 0.5 0 0" mass="0.4"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" ctrlrange="-3 3"/></actuator>
+</mujoco>
+"""
+
 FREE_BODY = """
 <mujoco>
   <worldbody>
@@ -186,6 +202,15 @@ def test_a_payload_is_the_difference_from_the_body_that_carries_it(tmp_path: Pat
     assert spec.guess == 0.0
     assert spec.targets[0].offset == pytest.approx(0.7)
     assert set(experiment.parameters) <= {"payload", *(f"payload_moment_{a}" for a in "xyz")}
+
+
+def test_a_payload_that_nothing_moves_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "bolted.xml"
+    path.write_text(BOLTED, encoding="utf-8")
+    for body, told in (("base", True), ("arm", False)):
+        found = propose_experiment(path, tmp_path, Wishes(payload=body, groups=("friction",)))
+        said = f"the first motion does not show the payload at {body}"
+        assert any(said in remark for remark in found.remarks) == told
 
 
 def test_faults_are_named(tmp_path: Path) -> None:

@@ -187,6 +187,8 @@ def propose_experiment(
     """
     urdf, source = _model(path)
     model = source.model
+    if not model.njnt:
+        raise ExperimentError(f"{path}: the model has no joint, so that nothing in it can move")
     found = candidates(model, wishes.groups, wishes.payload)[:MOST_CANDIDATES]
     if not found:
         raise ExperimentError(
@@ -361,15 +363,7 @@ class _Refinement:
             remarks.append(
                 "Note: the motion amplifies small disturbances, so the horizon is short."
             )
-        remarks += _unnamed(self.source.model)
-        chosen = self._identified(moved)
-        return replace(
-            moved,
-            rest=rest,
-            remarks=remarks,
-            chosen=[draft.chosen[i] for i in chosen],
-            others=[each for i, each in enumerate(draft.chosen) if i not in chosen],
-        )
+        return self._with_parameters(replace(moved, rest=rest), remarks)
 
     def released(self, draft: Proposal, length: float) -> Proposal:
         """The draft of a model without actuators, with a release that keeps all limits.
@@ -396,14 +390,22 @@ class _Refinement:
         share = float(kept[0])
         release = propose_release(self.source.model, draft.start.qpos, length, share)
         moved = replace(draft, release=release)
-        remarks += _unnamed(self.source.model)
-        chosen = self._identified(moved)
-        return replace(
-            moved,
-            remarks=remarks,
-            chosen=[draft.chosen[i] for i in chosen],
-            others=[each for i, each in enumerate(draft.chosen) if i not in chosen],
-        )
+        return self._with_parameters(moved, remarks)
+
+    def _with_parameters(self, draft: Proposal, remarks: Sequence[str]) -> Proposal:
+        """The draft with the parameters that its motion identifies, and with all remarks."""
+        chosen = self._identified(draft)
+        proposed = [draft.chosen[i] for i in chosen]
+        others = [each for i, each in enumerate(draft.chosen) if i not in chosen]
+
+        remarks = [*remarks, *_unnamed(self.source.model)]
+        payload = self.wishes.payload
+        if payload is not None and not any(each.group == "payload" for each in proposed):
+            remarks.append(
+                f"Warning: the first motion does not show the payload at {payload}, which stands "
+                "in comments only; name a body that moves, or choose another start."
+            )
+        return replace(draft, remarks=remarks, chosen=proposed, others=others)
 
     def _experiment(self, draft: Proposal, **tables: Any) -> Experiment:
         """The experiment that a draft states, with other tables."""
