@@ -16,10 +16,12 @@ from mjfim.arrays import Array
 # A picture or a frame: (height, width, 3) bytes.
 Image = NDArray[np.uint8]
 
-# Background of models without a sky of their own (0..1). It shines by itself: `BACKGROUND_EMISSION`
-# times its colour, to which the lights of the model add little.
-BACKGROUND = (0.0885, 0.0905, 0.0935, 1.0)
-BACKGROUND_EMISSION = 10.0
+# Background of models without a sky of their own (0..1).
+BACKGROUND = np.array([0.885, 0.905, 0.935, 1.0])
+
+# How much stronger than its colour a thing is that shines by itself. Its colour is divided by this
+# number, so that the lights of the model add little.
+EMISSION = 10.0
 
 # Distance of the background, as a share of that of the far clipping plane.
 BACKGROUND_DISTANCE = 0.7
@@ -27,6 +29,11 @@ BACKGROUND_DISTANCE = 0.7
 # Colour of the lines of a floor (0..1), and their number to each side of the camera's target.
 FLOOR_COLOUR = np.array([0.70, 0.74, 0.79, 1.0], dtype=np.float32)
 FLOOR_LINES = 16
+
+# Radius of the sticks of bodies without geoms, as a share of the model's extent, and their colour
+# (0..1).
+STICK_RADIUS = 0.015
+STICK_COLOUR = np.array([0.55, 0.55, 0.55, 1.0], dtype=np.float32)
 
 # Width of lines [pixels].
 LINE_WIDTH = 1.5
@@ -122,6 +129,7 @@ class Painter:
         self._data = mujoco.MjData(model)
         self._pert = mujoco.MjvPerturb()
         self._is_moving = model.body_weldid[model.geom_bodyid] != 0
+        self._bare_bodies = _bare_bodies(model)
         self._option = _options(model, self._is_moving)
         self._camera = _camera(offset)
         self._floor = None if job["floor"] is None else float(job["floor"])
@@ -168,6 +176,7 @@ class Painter:
                     self._model, self._data, self._option, self._pert, int(dynamic), scene
                 )
             self._paint(scene, first, robot)
+            self._add_sticks(scene, robot)
 
         colour = np.array([*robots[0].colour, 1.0], dtype=np.float32)
         for begin, end in pairwise(trail):
@@ -185,6 +194,27 @@ class Painter:
             is_geom = geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)
             if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
                 robot.paint(geom)
+
+    def _add_sticks(self, scene: mujoco.MjvScene, robot: PaintedRobot) -> None:
+        """Add a ball and sticks to the children for each moving body without geoms."""
+        radius = STICK_RADIUS * float(self._model.stat.extent)
+        for body in self._bare_bodies:
+            place = self._data.xpos[body]
+            ball = scene.geoms[scene.ngeom]
+            size = np.full(3, 1.5 * radius)
+            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+            mujoco.mjv_initGeom(ball, sphere, size, place, np.eye(3).ravel(), STICK_COLOUR)
+            robot.paint(ball)
+            scene.ngeom += 1
+
+            for child in np.flatnonzero(self._model.body_parentid == body):
+                stick = scene.geoms[scene.ngeom]
+                kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+                nothing = np.zeros(3)
+                mujoco.mjv_initGeom(stick, kind, nothing, nothing, np.eye(3).ravel(), STICK_COLOUR)
+                mujoco.mjv_connector(stick, kind, radius, place, self._data.xpos[child])
+                robot.paint(stick)
+                scene.ngeom += 1
 
     def _add_floor(self, scene: mujoco.MjvScene, target: Array, height: float) -> None:
         """Add the lines of a floor around the point at which the camera looks."""
@@ -213,8 +243,8 @@ class Painter:
         size = np.array([2.0 * distance, 2.0 * distance, 1e-3 * distance])
         wall = scene.geoms[scene.ngeom]
         box = mujoco.mjtGeom.mjGEOM_BOX
-        mujoco.mjv_initGeom(wall, box, size, place, rotation.ravel(), np.array(BACKGROUND))
-        wall.emission, wall.specular, wall.shininess = BACKGROUND_EMISSION, 0.0, 0.0
+        mujoco.mjv_initGeom(wall, box, size, place, rotation.ravel(), BACKGROUND)
+        _let_shine(wall)
         wall.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
         scene.ngeom += 1
 
@@ -228,7 +258,14 @@ def _add_line(
     nothing = np.zeros(3)
     mujoco.mjv_initGeom(line, kind, nothing, nothing, np.eye(3).ravel(), colour)
     mujoco.mjv_connector(line, kind, LINE_WIDTH, begin, end)
+    _let_shine(line)
     scene.ngeom += 1
+
+
+def _let_shine(geom: mujoco.MjvGeom) -> None:
+    """Give a geom its own colour whatever the lights are."""
+    geom.rgba[:3] /= EMISSION
+    geom.emission, geom.specular, geom.shininess = EMISSION, 0.0, 0.0
 
 
 def _set_visual(model: mujoco.MjModel, width: int, height: int, field_of_view: float) -> None:
@@ -244,13 +281,17 @@ def _set_visual(model: mujoco.MjModel, width: int, height: int, field_of_view: f
 
 
 def _options(model: mujoco.MjModel, is_moving: NDArray[np.bool_]) -> mujoco.MjvOption:
-    """Show what MuJoCo's viewer shows; where that leaves nothing, hidden parts or inertias."""
+    """Show what MuJoCo's viewer shows; where no moving part is among it, hidden groups as well."""
     option = mujoco.MjvOption()
-    if not np.any(is_moving):
-        option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
-    elif not np.any(model.geom_group[is_moving] < SHOWN_GROUPS):
+    if not np.any(model.geom_group[is_moving] < SHOWN_GROUPS):
         option.geomgroup[:] = 1
     return option
+
+
+def _bare_bodies(model: mujoco.MjModel) -> list[int]:
+    """Moving bodies without geoms."""
+    is_bare = (model.body_geomnum == 0) & (model.body_weldid != 0)
+    return np.flatnonzero(is_bare).tolist()
 
 
 def _camera(offset: Array) -> mujoco.MjvCamera:
