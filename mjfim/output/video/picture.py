@@ -23,6 +23,9 @@ BACKGROUND = np.array([0.885, 0.905, 0.935, 1.0])
 # number, so that the lights of the model add little.
 EMISSION = 10.0
 
+# Opacity that cannot be told from 1, but with which MuJoCo draws no shadow.
+NEARLY_OPAQUE = 0.999
+
 # Distance of the background, as a share of that of the far clipping plane.
 BACKGROUND_DISTANCE = 0.7
 
@@ -35,8 +38,10 @@ FLOOR_LINES = 16
 STICK_RADIUS = 0.015
 STICK_COLOUR = np.array([0.55, 0.55, 0.55, 1.0], dtype=np.float32)
 
-# Width of lines [pixels].
-LINE_WIDTH = 1.5
+# Width of the lines of a floor as a share of the distance between them, and of other lines as a
+# share of the distance of the camera.
+FLOOR_WIDTH = 0.02
+LINE_WIDTH = 0.0025
 
 # Share of its colour by which the tint of a part is smaller, where this colour is pure.
 KEPT_COLOUR = 0.85
@@ -134,6 +139,7 @@ class Painter:
         self._camera = _camera(offset)
         self._floor = None if job["floor"] is None else float(job["floor"])
         self._spacing = float(job["spacing"])
+        self._line_width = LINE_WIDTH * self._camera.distance
         self._has_sky = bool(np.any(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)))
 
         model.vis.quality.offsamples = quality.samples
@@ -180,7 +186,7 @@ class Painter:
 
         colour = np.array([*robots[0].colour, 1.0], dtype=np.float32)
         for begin, end in pairwise(trail):
-            _add_line(scene, begin, end, colour)
+            _add_line(scene, begin, end, self._line_width, colour)
         if self._floor is not None:
             self._add_floor(scene, target, self._floor)
         if not self._has_sky:
@@ -228,7 +234,7 @@ class Painter:
                 end = begin.copy()
                 begin[1 - axis] -= reach
                 end[1 - axis] += reach
-                _add_line(scene, begin, end, FLOOR_COLOUR)
+                _add_line(scene, begin, end, FLOOR_WIDTH * spacing, FLOOR_COLOUR)
 
     def _add_background(self, scene: mujoco.MjvScene) -> None:
         """Add a bright wall behind everything, because MuJoCo's background is black."""
@@ -250,21 +256,35 @@ class Painter:
 
 
 def _add_line(
-    scene: mujoco.MjvScene, begin: Array, end: Array, colour: NDArray[np.float32]
+    scene: mujoco.MjvScene,
+    begin: Array,
+    end: Array,
+    width: float,
+    colour: NDArray[np.float32],
 ) -> None:
-    """Add a line of a colour (4,) between two points (3,) [m]."""
+    """Add a line as a thin box between two points (3,), of a width [m] and a colour (4,).
+
+    MuJoCo's own lines have other colours under other lights.
+    """
+    length = float(np.linalg.norm(end - begin))
+    if length == 0.0:
+        return
+
+    quaternion, rotation = np.empty(4), np.empty(9)
+    mujoco.mju_quatZ2Vec(quaternion, (end - begin) / length)
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    size = np.array([width / 2.0, width / 2.0, length / 2.0])
     line = scene.geoms[scene.ngeom]
-    kind = mujoco.mjtGeom.mjGEOM_LINE
-    nothing = np.zeros(3)
-    mujoco.mjv_initGeom(line, kind, nothing, nothing, np.eye(3).ravel(), colour)
-    mujoco.mjv_connector(line, kind, LINE_WIDTH, begin, end)
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    mujoco.mjv_initGeom(line, box, size, (begin + end) / 2.0, rotation, colour)
     _let_shine(line)
     scene.ngeom += 1
 
 
 def _let_shine(geom: mujoco.MjvGeom) -> None:
-    """Give a geom its own colour whatever the lights are."""
+    """Give a geom its own colour whatever the lights are, and no shadow, as transparent ones."""
     geom.rgba[:3] /= EMISSION
+    geom.rgba[3] = NEARLY_OPAQUE
     geom.emission, geom.specular, geom.shininess = EMISSION, 0.0, 0.0
 
 
