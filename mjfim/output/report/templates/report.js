@@ -136,5 +136,10 @@
     drawAll(plots);
   });
 
+  // The video plays by itself, without sound, unless the reader prefers a page that stands still.
+  if (!window.matchMedia("(prefers-reduced-motion: reduce)").matches) {
+    document.querySelectorAll("video").forEach((video) => { video.play().catch(() => {}); });
+  }
+
   drawAll(plots).then(() => { document.body.dataset.ready = "yes"; });
 })();
