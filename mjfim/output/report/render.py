@@ -10,8 +10,9 @@ import base64
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from html import unescape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjfim.output.html import escape
 from mjfim.output.report.curves import is_line, packed_trace, points_per_curve
@@ -20,6 +21,9 @@ from mjfim.output.report.palette import palettes
 from mjfim.output.summary_parts import Emphasis, SummaryTable, capitalised
 from mjfim.output.video import Video
 from mjfim.output.vocabulary import shown_word
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 # Folder of the templates, beside this module.
 PACKAGE, TEMPLATES = "mjfim.output.report", "templates"
@@ -63,23 +67,50 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
         no_video: Sentence that says why there is no video; may be empty.
     """
     # These libraries are slow to import, and only reports need them.
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs
 
-    loader = PackageLoader(PACKAGE, TEMPLATES)
+    library = get_plotlyjs()
+    panels = list(_panels(page))
+    limit = _limit_of(panels, len(library), video)
+    number_of = {id(panel): i for i, panel in enumerate(panels)}
+
+    colours = palettes()
+    data = {"palettes": colours, "panels": [_as_json(panel, limit) for panel in panels]}
+    html: str = _template("report.html.j2").render(
+        page=page,
+        name=name,
+        video=video,
+        no_video=no_video,
+        palettes=colours,
+        panel_number=lambda panel: number_of[id(panel)],
+        is_thinned=lambda group: _is_thinned(group, limit),
+        data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
+        css=Markup(_template("report.css").render()),
+        js=Markup(_template("report.js").render()),
+        plotly=Markup(library),
+    )
+    return html
+
+
+@cache
+def _template(file: str) -> Template:
+    """Return a template of this package; to compile one takes longer than to fill it.
+
+    Args:
+        file: Its name. Style and script hold no expressions.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
     environment = Environment(
-        loader=loader,
+        loader=PackageLoader(PACKAGE, TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         keep_trailing_newline=True,
     )
-    library = get_plotlyjs()
-    panels = list(_panels(page))
-    limit = _limit_of(panels, len(library), video)
-    number_of = {id(panel): i for i, panel in enumerate(panels)}
     environment.filters.update(
         base64=lambda content: base64.b64encode(content).decode("ascii"),
         capital=capitalised,
@@ -87,30 +118,11 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
         emphasis_class=CLASSES.__getitem__,
         group_heads=lambda table: list(_group_heads(table)),
         kind_of=lambda part: type(part).__name__,
-        panel_number=lambda panel: number_of[id(panel)],
         prose=lambda text: Markup(UNIT_SPACE.sub("\u00a0", escape(text))),
         sentence=_as_sentence,
-        thinned=lambda group: _is_thinned(group, limit),
         without_bullet=lambda text: text.removeprefix("• "),
     )
-
-    def own_file(file: str) -> Markup:
-        """Return a file of this package, which needs no escaping."""
-        return Markup(loader.get_source(environment, file)[0])
-
-    colours = palettes()
-    data = {"palettes": colours, "panels": [_as_json(panel, limit) for panel in panels]}
-    return environment.get_template("report.html.j2").render(
-        page=page,
-        name=name,
-        video=video,
-        no_video=no_video,
-        palettes=colours,
-        data=htmlsafe_json_dumps(data, separators=(",", ":"), allow_nan=False),
-        css=own_file("report.css"),
-        js=own_file("report.js"),
-        plotly=Markup(library),
-    )
+    return environment.get_template(file)
 
 
 def video_in(html: str) -> Video | None:
