@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from mjfim.arrays import Array
-from mjfim.cli.common import errors
+from mjfim.cli.common import Duration, errors
 from mjfim.duration import in_words
 from mjfim.errors import ExperimentError
 from mjfim.excitation.duration import iteration_seconds
@@ -40,7 +40,7 @@ def announce_design(
     is_default: bool,
     longest_iteration: float = LONGEST_ITERATION,
     work: str = "the design",
-) -> None:
+) -> Duration | None:
     """Say how long a design takes, if it is long.
 
     Args:
@@ -49,6 +49,9 @@ def announce_design(
         longest_iteration: Time of one iteration from which the design is refused [s].
         work: The work that takes this time, in words.
 
+    Returns:
+        The time; None if it is short or not known.
+
     Raises:
         ExperimentError: A single iteration would take hours, and no such time is stated.
     """
@@ -56,7 +59,7 @@ def announce_design(
     most = max(descent.max_iterations, 1)
     iteration = iteration_seconds(system, negligible=ANNOUNCED_SECONDS / most)
     if iteration is None:
-        return
+        return None
 
     # A single iteration that takes hours is a mistyped horizon or rate, as a rule.
     stated = 0.0 if is_default else (descent.seconds or 0.0)
@@ -66,15 +69,17 @@ def announce_design(
     starts = number_of_starts(system)
     longest = most * -(-starts // min(cores(), starts)) * iteration
     if longest < ANNOUNCED_SECONDS:
-        return
+        return None
 
     # The time of the design ends it, but not before the first iteration.
+    end = longest
     duration = f"at most about {in_words(longest)}"
     if descent.seconds is not None and descent.seconds < longest:
         end = max(descent.seconds, iteration)
         key = "default of descent.seconds" if is_default else "descent.seconds"
         duration = f"at most about {in_words(end)} ({key}: {descent.seconds:g} s)"
     _say(f"one iteration takes about {in_words(iteration)}, and {work} {duration}; {BEST_IS_KEPT}")
+    return Duration(seconds=end, word="at most")
 
 
 def refusal_of_design(system: System, longest_iteration: float = LONGEST_ITERATION) -> str | None:
@@ -111,39 +116,50 @@ def number_of_starts(system: System) -> int:
     return descent.starts + further
 
 
-def announce_check(system: System, control: Array) -> None:
+def announce_check(system: System, control: Array) -> Duration | None:
     """Say how long a check of a control takes, if it is long.
 
     Args:
         system: The system.
         control: (N, nu) control [unit of the actuator].
+
+    Returns:
+        The time; None if it is short or not known.
     """
     seconds = check_seconds(system, control, negligible=ANNOUNCED_SECONDS)
-    if seconds is not None and seconds >= ANNOUNCED_SECONDS:
-        _say(f"the check takes about {in_words(seconds)}; {QUICKER}")
+    if seconds is None or seconds < ANNOUNCED_SECONDS:
+        return None
+    _say(f"the check takes about {in_words(seconds)}; {QUICKER}")
+    return Duration(seconds=seconds)
 
 
-def announce_recordings(system: System, recordings: Sequence[Recording], *, fit: bool) -> None:
+def announce_recordings(
+    system: System, recordings: Sequence[Recording], *, fit: bool
+) -> Duration | None:
     """Say how long the work on recordings takes, if it is long.
 
     Args:
         system: The system.
         recordings: The recordings.
         fit: True for a fit, False for a check.
+
+    Returns:
+        The time; None if it is short or not known.
     """
     each = pass_seconds(system, recordings)
     if each is None:
-        return
+        return None
 
     total = (USUAL_PASSES if fit else 2) * each
     if total < ANNOUNCED_SECONDS:
-        return
+        return None
     rows = sum(len(recording.t) for recording in recordings)
     begin = f"{rows:,} rows: one pass over the data takes about {in_words(each)}"
     if fit:
         _say(f"{begin}, and the fit usually about {in_words(total)}; {BEST_IS_KEPT}")
     else:
         _say(f"{begin}, and the check about {in_words(total)}")
+    return Duration(seconds=total)
 
 
 def announce_trials(system: System, trajectories: Mapping[str, Trajectory], trials: int) -> None:

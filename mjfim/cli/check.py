@@ -73,19 +73,20 @@ def check(
         inputs = input_files(stated, [*(recordings or []), design_file])
         claim_folder(output, pictures.files(CHECK_FILES), inputs, force=force)
 
-    if loaded:
-        announce_recordings(system, loaded, fit=False)
-    elif trajectory is not None:
-        announce_check(system, trajectory.ctrl)
-    else:
+    if not loaded and trajectory is None:
         require_design_keys(system, "check without recordings")
-        announce_check(system, _stated_control(system))
+    with progress("estimating how long it takes"):
+        if loaded:
+            expected = announce_recordings(system, loaded, fit=False)
+        else:
+            given = _stated_control(system) if trajectory is None else trajectory.ctrl
+            expected = announce_check(system, given)
 
-    # A design whose iterations take hours is refused, which depends on the machine.
-    refused = None
-    if not loaded and trajectory is None and system.controls:
-        refused = refusal_of_design(system)
-    with progress("checking"):
+        # A design whose iterations take hours is refused, which depends on the machine.
+        refused = None
+        if not loaded and trajectory is None and system.controls:
+            refused = refusal_of_design(system)
+    with progress("checking", expected=expected):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
 
     print_result(as_json, result.summary(), describe(result), verbose=verbose)

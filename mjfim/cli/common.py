@@ -10,14 +10,18 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from textwrap import wrap
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
+from rich.progress_bar import ProgressBar
+from rich.text import Text
 from typer.core import TyperCommand
 
 import mjfim
@@ -37,13 +41,14 @@ from mjfim.interruption import (
     run_optional,
 )
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.progress_text import design_text, fit_text, part_text
+from mjfim.output.progress_text import design_stage, design_text, fit_text, part_text
 from mjfim.output.report import REPORT
 from mjfim.output.summary_parts import Summary
 from mjfim.output.text import render
 from mjfim.output.video.record import NoVideoError, format_of, require_encoder
 from mjfim.parallel import LOST_SENTENCE, MAX_THREADS, Pool
 from mjfim.records.events import Callback, DesignEvent, Event, FitEvent, StudyEvent
+from mjfim.records.progress import stages_observed_by
 from mjfim.records.serialization import as_json as records_as_json
 
 if TYPE_CHECKING:
@@ -73,8 +78,19 @@ class MessageConsole(Console):
             **options: Options of `rich.console.Console.print`.
         """
         if self.is_terminal:
-            options = {"soft_wrap": False, "overflow": "ignore", "crop": False, **options}
+            objects = tuple(self._folded(each) for each in objects)
         super().print(*objects, **options)
+
+    def _folded(self, printed: Any) -> Any:
+        """Break the lines of a text between words."""
+        if not isinstance(printed, str):
+            return printed
+
+        lines = []
+        for line in printed.split("\n"):
+            folded = wrap(line, self.width, break_long_words=False, break_on_hyphens=False)
+            lines += folded or [""]
+        return "\n".join(lines)
 
 
 # Console for messages and progress. Brackets and colons in file names are no markup and no emoji.
@@ -99,6 +115,9 @@ _names: list[str] = []
 # if stderr is not a terminal.
 DESIGN_LINES = 10
 FIT_LINES = 5
+
+# Width of bars of progress [characters].
+BAR_WIDTH = 10
 
 # Time after which a line of progress is due, if stderr is not a terminal [s].
 LINE_SECONDS = 10.0
@@ -332,7 +351,7 @@ def writing(folder: Path) -> Iterator[ModuleType]:
     """
     keep_result()
     _written.clear()
-    with progress("writing files and drawing pictures") as show, observed_by(show.count_file):
+    with progress("writing files and pictures") as show, observed_by(show.count_file):
         from mjfim.output import folders as results  # imports matplotlib and rerun, which is slow
 
         folder.mkdir(parents=True, exist_ok=True)
@@ -529,6 +548,19 @@ def watched(address: str | None, system: System, display: Callback) -> Iterator[
         yield both
 
 
+@dataclass(frozen=True, kw_only=True)
+class Duration:
+    """How long some work takes.
+
+    Attributes:
+        seconds: The time [s].
+        word: How certain it is: "about" or "at most".
+    """
+
+    seconds: float
+    word: str = "about"
+
+
 class ProgressDisplay:
     """Display of progress on stderr: a bar on a terminal, otherwise a line from time to time."""
 
@@ -540,22 +572,33 @@ class ProgressDisplay:
             description: Text until the first event.
         """
         self._bar = bar
-        self._task = bar.add_task(description, total=None)
+        self._task = bar.add_task(description, total=None, part_began=time.monotonic())
         self._announced_part = ""
+        self._stage = ""
         self._latest = description
         self._begun = self._told = time.monotonic()
 
     def count_file(self, path: Path) -> None:
         """Show how many of the files that may be written are written."""
+        if path.name.startswith("."):
+            return
+
         _written.append(path)
-        self._latest = f"writing files and drawing pictures: {path.name}"
+        self._latest = f"written: {path.name}"
         total = max(len(_names), len(_written))
         self._bar.update(self._task, description=self._latest, total=total, completed=len(_written))
+
+    def begin_stage(self, name: str, index: int, count: int) -> None:
+        """Show which work begins, and its number among those of its kind if that is known."""
+        self._latest = name
+        self._bar.update(self._task, description=name, total=count or None, completed=index)
+        if index == 0:
+            self._bar.update(self._task, part_began=time.monotonic())
 
     def describe(self, description: str) -> None:
         """Show what is done until the next event."""
         self._latest = description
-        self._bar.update(self._task, description=description)
+        self._bar.update(self._task, description=description, total=None, completed=0)
 
     def tell_if_silent(self, seconds: float) -> None:
         """Without a terminal, print what is done if nothing was printed for some seconds."""
@@ -582,7 +625,14 @@ class ProgressDisplay:
             self._show_study(event)
 
     def _show_design(self, event: DesignEvent) -> None:
-        """Show an iterate of a design."""
+        """Show an iterate of a design; its stage is named where it changes."""
+        stage = design_stage(event)
+        if stage != self._stage and not errors.is_terminal and event.row.mu:
+            self._print(f"{stage}:")
+        self._stage = stage
+        if event.row.mu and errors.is_terminal:
+            self.describe(f"{stage}\n{design_text(event)}")
+            return
         self._show_iterate(design_text(event), event.row.iteration, DESIGN_LINES)
 
     def _show_fit(self, event: FitEvent) -> None:
@@ -624,22 +674,76 @@ class ProgressDisplay:
 
 
 @contextmanager
-def progress(description: str, line_seconds: float = LINE_SECONDS) -> Iterator[ProgressDisplay]:
-    """Show the progress of a long computation on stderr.
+def progress(
+    description: str, line_seconds: float = LINE_SECONDS, *, expected: Duration | None = None
+) -> Iterator[ProgressDisplay]:
+    """Show the progress of a long computation on stderr, with the time that is left.
 
     Args:
         description: Text until the first event.
         line_seconds: Silent time after which a line is printed, if stderr is not a terminal [s].
+        expected: Time that the whole takes; None if it is not known.
 
     Yields:
         The display, which is called with every event.
     """
-    description_column = TextColumn("{task.description}", markup=False)
-    columns = (SpinnerColumn(), description_column, BarColumn(), TimeElapsedColumn())
+    text = TextColumn("{task.description}", markup=False)
+    columns = (SpinnerColumn(), text, _Bar(bar_width=BAR_WIDTH), _TimeColumn(expected))
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         display = ProgressDisplay(bar, description)
-        with _repeatedly(partial(display.tell_if_silent, line_seconds), 0.1 * line_seconds):
+        with (
+            stages_observed_by(display.begin_stage),
+            _repeatedly(partial(display.tell_if_silent, line_seconds), 0.1 * line_seconds),
+        ):
             yield display
+
+
+class _Bar(BarColumn):
+    """A bar where the number of parts is known, and nothing elsewhere."""
+
+    def render(self, task: Task) -> ProgressBar:
+        """Draw the bar of a task."""
+        bar = super().render(task)
+        if task.total is None:
+            bar.width = 0
+        return bar
+
+
+class _TimeColumn(ProgressColumn):
+    """The time since the work began, and the time that it takes."""
+
+    def __init__(self, expected: Duration | None) -> None:
+        """Show how long some work takes.
+
+        Args:
+            expected: Time that the whole takes; None if it is not known.
+        """
+        super().__init__()
+        self._expected = expected
+
+    def render(self, task: Task) -> Text:
+        """Write the times of a task."""
+        elapsed = task.elapsed or 0.0
+        text = clock(elapsed)
+        expected = self._expected
+        if expected is not None and expected.seconds > elapsed:
+            text += f" of {expected.word} {clock(expected.seconds)}"
+        elif task.total and 0.0 < task.completed < task.total:
+            of_parts = time.monotonic() - task.fields["part_began"]
+            left = of_parts * (task.total / task.completed - 1.0)
+            text += f", about {clock(left)} left"
+        return Text(text, style="progress.elapsed", no_wrap=True)
+
+
+def clock(seconds: float) -> str:
+    """Return a time as minutes and seconds, or as hours, minutes and seconds.
+
+    Args:
+        seconds: The time [s].
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.cli.announcements import announce_design, number_of_starts
 from mjfim.cli.common import (
     AsJson,
+    Duration,
     ExperimentFile,
     Folder,
     Force,
@@ -103,14 +104,16 @@ def design(
 
     # A design that states no time ends all the same. The shortest horizon takes many designs.
     has_default = stated.descent.seconds is None and not shortest
-    task = DesignTask.of(_announced(system, has_default))
+    with progress("estimating how long it takes"):
+        system, expected = _announced(system, has_default)
+        task = DesignTask.of(system)
     names = (*DESIGN_FILES, *(SHORTEST_FILES if shortest else ()))
     claim_video(video, input_files(stated), force=force)
     claim_folder(output, pictures.files(names), input_files(stated), force=force)
 
     with (
         several(task) as executor,
-        progress("designing") as display,
+        progress("designing", expected=expected) as display,
         watched(live, system, display) as show,
         stop_on_interrupt() as stop,
     ):
@@ -162,8 +165,8 @@ def _inseparable(result: Design) -> str:
     )
 
 
-def _announced(system: System, has_default: bool) -> System:
-    """The system with the default time where none is stated, after a sentence about its duration.
+def _announced(system: System, has_default: bool) -> tuple[System, Duration | None]:
+    """The system with the default time where none is stated, and the time that a design takes.
 
     Args:
         system: The system, whose experiment states the design.
@@ -172,8 +175,7 @@ def _announced(system: System, has_default: bool) -> System:
     if has_default:
         limited = system.experiment.replace(descent={"seconds": DEFAULT_SECONDS})
         system = replace(system, experiment=limited)
-    announce_design(system, is_default=has_default)
-    return system
+    return system, announce_design(system, is_default=has_default)
 
 
 def _say_if_default_ended(result: Design, has_default: bool) -> None:

@@ -84,14 +84,14 @@ def identify(
     claim_video(video, inputs, force=force)
     claim_folder(output, pictures.files(names), inputs, force=force)
 
-    with (
-        progress("reading") as display,
-        watched(live, system, display) as show,
-    ):
+    with progress("reading"):
         fitted = [read_log(path, system.channels) for path in logs]
         predicted = [read_log(path, system.channels) for path in held_out_logs]
-        announce_recordings(system, [log.recording for log in fitted], fit=True)
-        display.describe("fitting")
+        expected = announce_recordings(system, [log.recording for log in fitted], fit=True)
+    with (
+        progress("fitting", expected=expected) as display,
+        watched(live, system, display) as show,
+    ):
         result = identify_system(
             system,
             [log.recording for log in fitted],

@@ -19,6 +19,7 @@ from mjfim.identification.residuals import FitProblem
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Prediction, PredictionErrors
+from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
 
 # Largest number of groups of recordings that are left out in turn.
@@ -94,6 +95,7 @@ def predict_unfitted(
     for i in range(len(held_out.recordings)):
         if budget.exhausted is not None:
             break
+        begin_stage("predicting held-out recordings", i, len(held_out.recordings))
         part = _Part(recordings=(i,), masks=_masks_of(held_out.masks, [i]))
         predictions.append(_prediction(held_out, at.theta, part, True, budget))
     return tuple(predictions)
@@ -123,7 +125,9 @@ def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> I
         at = replace(at, private=at.private[subset])
 
     guess = problem.system.parameters.guess
-    for part in _parts(problem):
+    parts = list(_parts(problem))
+    for k, part in enumerate(parts):
+        begin_stage("predicting each part from the others", k, len(parts))
         others = problem.masked([~mask for mask in part.masks])
         segments = others.segments_with_values
         if not len(segments):

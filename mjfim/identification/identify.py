@@ -35,7 +35,7 @@ from mjfim.parallel import one_blas_thread
 from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
-from mjfim.records.progress import shown_progress
+from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
 
 Callback = Callable[[FitEvent], None]
@@ -146,9 +146,12 @@ def identify_task(
         search = FitSearch(task=task, budget=Budget(stop=token), callback=callback)
 
         # With much data, the search begins on a subset of the segments.
+        begin_stage("simulating the segments from the initial guess")
         subset = quick_subset(problem)
         begin = problem.begin(task.start)
         _require_finite_cost(task, problem, subset, begin)
+
+        begin_stage("testing what the recordings determine")
 
         # Combinations of parameters that no recording determines are held at their start values.
         null_space = _unseen_directions(task, problem.of_segments(subset))

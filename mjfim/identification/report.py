@@ -34,6 +34,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import Estimate, MissingTerm, Prediction, Restart
+from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
 
 # Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
@@ -131,12 +132,14 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
     task, problem, quality = result.task, result.problem, result.quality
 
     # Optional parts, each of which takes about as long as a search.
+    begin_stage("looking for terms that the model lacks")
     missing = _missing_terms(result, quality, budget)
     predictions = _predictions(result, budget)
 
     reasons = misfit_reasons(
         quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, missing
     )
+    begin_stage("computing the intervals")
     accuracy = accuracy_of(
         problem,
         result.solution,

@@ -48,9 +48,26 @@ def design_text(event: DesignEvent) -> str:
     """
     row = event.row
     text = f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}"
+    if math.isinf(row.cost):
+        text = f"iteration {row.iteration:3d}  outside the limits"
 
     # The search for a release has no slope.
     return text if math.isnan(row.slope) else f"{text}  slope {row.slope:.1e}"
+
+
+def design_stage(event: DesignEvent) -> str:
+    """Name the stage of a design; J of two stages cannot be compared.
+
+    Args:
+        event: The event.
+    """
+    row = event.row
+    at_rate = f"at {row.rate:.4g} Hz"
+    if not row.mu:
+        return f"searching {at_rate}"
+    if math.isinf(row.mu):
+        return f"steering into the limits {at_rate}"
+    return f"searching inside the limits {at_rate}, barrier {row.mu:.1g}"
 
 
 def fit_text(event: FitEvent) -> str:
@@ -59,10 +76,8 @@ def fit_text(event: FitEvent) -> str:
     Args:
         event: The event.
     """
-    return (
-        f"{event.phase}: iteration {event.iteration}, half the sum of squares "
-        f"{event.cost:.6g}, step {event.step:.2g} σ"
-    )
+    iteration = f"{event.phase}: iteration {event.iteration}"
+    return f"{iteration}, cost {event.cost:.6g}, step {event.step:.2g} σ"
 
 
 def part_text(event: StudyEvent) -> str:

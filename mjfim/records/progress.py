@@ -12,6 +12,12 @@ from contextvars import ContextVar
 from importlib import import_module
 from typing import TypeVar
 
+# What is called with the name of the work that begins, its number and the number of all such works;
+# or None.
+_observer: ContextVar[Callable[[str, int, int], None] | None] = ContextVar(
+    "stage_observer", default=None
+)
+
 # Module that shows progress in a notebook.
 NOTEBOOK_PROGRESS = "mjfim.output.notebook_progress"
 
@@ -20,6 +26,33 @@ AnyEvent = TypeVar("AnyEvent")
 
 # True inside a verb whose progress is shown; the verbs that it calls show none.
 _is_shown: ContextVar[bool] = ContextVar("is_shown", default=False)
+
+
+def begin_stage(name: str, index: int = 0, count: int = 0) -> None:
+    """Tell the display of progress, if there is one, which work begins.
+
+    Args:
+        name: The work, in words.
+        index: Its number among works of the same kind, from 0.
+        count: Number of these works; 0 if it is not known.
+    """
+    observer = _observer.get()
+    if observer is not None:
+        observer(name, index, count)
+
+
+@contextmanager
+def stages_observed_by(observer: Callable[[str, int, int], None]) -> Iterator[None]:
+    """Call a function with the name of every work that begins in the context.
+
+    Args:
+        observer: The function; see `begin_stage` for its arguments.
+    """
+    token = _observer.set(observer)
+    try:
+        yield
+    finally:
+        _observer.reset(token)
 
 
 def in_notebook() -> bool:

@@ -39,7 +39,7 @@ from mjfim.records.check import (
 )
 from mjfim.records.combinations import ParameterGroup, groups_in_words, join_names
 from mjfim.records.design import CombinationAccuracy
-from mjfim.records.progress import shown_progress
+from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.derivative_test import self_test
@@ -108,6 +108,7 @@ def check_task(
         curve, source = task.plant.simulate(task.theta, trajectory.ctrl), "the given trajectory"
 
     # A start that diverges is refused in the words of a design.
+    begin_stage("simulating the motion and its sensitivities")
     problem, point = _evaluate(task, curve)
     if trajectory is None:
         require_evaluated(task, point)
@@ -145,6 +146,7 @@ def check_recordings(
     """
     refuse_same_data(recordings, ())
     require_memory_for_recordings(system, recordings, fit=False)
+    begin_stage("simulating the recordings")
     fit = FitProblem.of(system, recordings, data_only=True)
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     task = _task_along(recorded_release(system, longest), system, longest.ctrl[:MAX_TESTED_SAMPLES])
@@ -227,6 +229,7 @@ class _Stages:
             test: The test, which asks before every random control whether it has to stop.
             *arguments: Its arguments.
         """
+        begin_stage("testing which parameters can be told apart")
         found = test(*arguments, self._is_stopped)
         if found.along_trajectory.count and self._is_stopped():
             self.missing.append("what other controls would show")

@@ -23,6 +23,7 @@ from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.records.check import SelfTest
+from mjfim.records.progress import begin_stage
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 # Steps along the tested curve, in units of the plant's difference steps. The smaller error of the
@@ -58,15 +59,18 @@ def self_test(
     tested = SelfTest(roughness=None, recursion=np.nan, slope=np.nan, finished=False)
     if stop():
         return tested
+    begin_stage("testing the derivatives: two step sizes", 0, 3)
     rough = roughness(
         task.plant, task.system.noise, model, task.theta, trajectory, point.sensitivity
     )
     tested = replace(tested, roughness=rough)
     if stop():
         return tested
+    begin_stage("testing the derivatives: recursion", 1, 3)
     tested = replace(tested, recursion=recursion_error(task, trajectory, point.sensitivity))
     if stop():
         return tested
+    begin_stage("testing the derivatives: slope", 2, 3)
     try:
         slope = slope_error(task, problem, point)
     except np.linalg.LinAlgError:

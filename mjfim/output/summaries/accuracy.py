@@ -18,6 +18,9 @@ BEST_CASE = (
 # Heading of the relative standard deviation before a design.
 RELATIVE_INITIAL = "relative σ initial"
 
+# Largest number of digits of a share in percent.
+MAX_DIGITS = 6
+
 # Cell of a standard deviation that is infinite, because others absorb the parameter's effect.
 NOT_ALONE = "not alone"
 
@@ -90,7 +93,11 @@ def relative(std: float, size: float) -> Quantity:
     """
     if not size or not np.isfinite(std):
         return Quantity(value=float("nan"))
-    return Quantity(value=100.0 * std / size, digits=2, suffix=" %")
+    percent = 100.0 * std / size
+
+    # Shares above 100 % are whole numbers, not powers of ten.
+    digits = int(np.clip(np.ceil(np.log10(max(percent, 1.0))), 2, MAX_DIGITS))
+    return Quantity(value=percent, digits=digits, suffix=" %")
 
 
 def size_sentence(values: Sequence[float] | Array, sizes: Sequence[float] | Array) -> str:

@@ -1,0 +1,116 @@
+"""Percentages and σ of one run agree in terminal, notebook, report, figures and JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+import mjfim
+from mjfim.excitation.task import DesignTask
+from mjfim.output import archive
+from mjfim.output.presentation import describe
+from mjfim.output.report import REPORT
+from mjfim.output.report.build import write_report
+from mjfim.output.summaries.accuracy import relative
+from mjfim.output.summary_parts import Quantity
+from mjfim.output.text import render
+from mjfim.records.check import Check
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
+from mjfim.records.shown import ShownRecord
+from tests.support.paths import MODELS
+
+
+@pytest.fixture(scope="module")
+def task() -> DesignTask:
+    """The cart-pendulum for 2 s."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return DesignTask.resolve(experiment.replace(horizon=2.0, descent={"max_iterations": 2}))
+
+
+@pytest.fixture(scope="module")
+def design(task: DesignTask) -> Design:
+    """A design after one iteration."""
+    return mjfim.design(task.experiment)
+
+
+@pytest.fixture(scope="module")
+def check(task: DesignTask, design: Design) -> Check:
+    """A check of this design."""
+    return mjfim.check(task.experiment, trajectory=design.trajectory)
+
+
+@pytest.fixture(scope="module")
+def estimate(task: DesignTask, design: Design) -> Estimate:
+    """An estimate from one recording of this design."""
+    recording = mjfim.simulate(task.experiment, design.trajectory, seed=0)
+    found = mjfim.identify(task.experiment, [recording])
+    return replace(found, success=True, misfit=False)
+
+
+def in_terminal(record: ShownRecord) -> str:
+    """The long form in a wide terminal."""
+    return "\n".join(line for line, _ in render(describe(record), verbose=True).lines(200))
+
+
+def texts_of(figure: Figure) -> str:
+    """All texts of a figure."""
+    texts = figure.findobj(Text)
+    return "\n".join(text.get_text() for text in texts if isinstance(text, Text))
+
+
+def missing(numbers: list[str], text: str) -> list[str]:
+    """The numbers that a text does not contain as whole words."""
+    shown = unescape(text)
+    return [n for n in numbers if not re.search(rf"(?<![\d.]){re.escape(n)}(?![\d])", shown)]
+
+
+def test_a_design_and_its_check_state_the_same_accuracy(
+    task: DesignTask, design: Design, check: Check, tmp_path: Path
+) -> None:
+    archive.write_design(tmp_path, design, task.system)
+    write_report(tmp_path, Design)
+    stored = json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
+    std = stored["final"]["std"]
+    sigmas = [str(Quantity(value=value)) for value in std]
+    shares = [str(relative(*pair)) for pair in zip(std, design.sizes.tolist(), strict=True)]
+
+    report = (tmp_path / REPORT).read_text(encoding="utf-8")
+    notebook = design._repr_html_()
+    for text in (in_terminal(design), notebook, report, in_terminal(check), check._repr_html_()):
+        assert missing([*sigmas, *shares], text) == []
+    assert missing(shares, texts_of(design.plot("standard_deviations"))) == []
+
+    # The verdict names the largest of these shares.
+    worst = shares[int(np.argmax(np.array(std) / design.sizes))]
+    assert f"a σ of {worst} or less" in " ".join(in_terminal(design).split())
+    assert missing([f"a σ of {worst}"], report) == []
+
+
+def test_an_estimate_states_the_same_accuracy_everywhere(
+    estimate: Estimate, tmp_path: Path
+) -> None:
+    estimate.save(tmp_path)
+    write_report(tmp_path, Estimate)
+    stored = json.loads((tmp_path / "estimate.json").read_text(encoding="utf-8"))
+    honest = [0.25 * (high - low) for low, high in stored["interval"]]
+    sigmas = [str(Quantity(value=value, digits=2)) for value in (*honest, *stored["std"])]
+
+    report = (tmp_path / REPORT).read_text(encoding="utf-8")
+    for text in (in_terminal(estimate), estimate._repr_html_(), report):
+        assert missing(sigmas, text) == []
+
+    # The verdict is one sentence with one percentage.
+    verdict = describe(estimate).outcome
+    (share,) = re.findall(r"± (\S+ %)", verdict)
+    half = 2.0 * np.array(honest) / np.abs(stored["theta"])
+    assert share == str(relative(float(half.max()), 1.0))
+    assert f"± {share}" in unescape(report)
