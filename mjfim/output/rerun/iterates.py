@@ -27,7 +27,7 @@ from mjfim.output.rerun.scene import (
     is_moving,
     strip_of_path,
 )
-from mjfim.output.rerun.series import Curve, Range, padded
+from mjfim.output.rerun.series import Curve, Range, range_with_limits
 from mjfim.output.rerun.shapes import SOLID, DrawnShape, RobotStyle, drawn_shapes
 from mjfim.output.rerun.strips import StripPlot
 from mjfim.records.design import Design
@@ -36,6 +36,10 @@ from mjfim.records.trajectory import Trajectory
 
 # Number of poses in which the robot is drawn at an iterate, evenly spread over its motion.
 POSES = 4
+
+# A plot reaches to the limits if its range is then at most this many times as large: less than in
+# plots that show no change of the curves.
+LARGEST_ZOOM = 3.0
 
 # Entity below a capsule that holds its poses.
 CAPSULES = "poses"
@@ -364,7 +368,7 @@ def _iterate_plot(
         parts=("iterates", label),
         title=f"{label} over time [s]",
         x=(0.0, float(times.max())),
-        y=padded(low, high),
+        y=range_with_limits(low, high, limits, LARGEST_ZOOM),
         size=plot_size(count),
     )
     return IteratePlot(plot=plot, limits=limits, initial=initial, times=times, values=values)

@@ -30,8 +30,12 @@ PLOT_SCALE = (1.5, -1.0)
 AXIS_ENDS = ((1.65, 0.0), (0.0, -1.1))
 AXIS_FACTOR = 1.1
 
-# Colour of the axes (0..255).
-AXIS_COLOUR = [150, 150, 150]
+# Places of the values at the ends of the axes, and what is visible, in plot coordinates.
+LABEL_PLACES = ((2.45, -0.15), (0.0, -1.65))
+VISIBLE_X, VISIBLE_Y = (-1.7, 3.3), (-1.75, 1.2)
+
+# Colours of the axes and of the values at their ends (0..255).
+AXIS_COLOUR, LABEL_COLOUR = [150, 150, 150], [205, 205, 205]
 
 # Thickness of axes and curves, and radius of the dots at the ends of the axes and on the curves
 # [points].
@@ -107,9 +111,9 @@ class PhasePlot:
             for unit, largest in zip(self._units(labels), self.scale, strict=True)
         ]
         marks = rr.Points2D(
-            ends * (0.8, 1.0),
+            LABEL_PLACES,
             labels=texts,
-            colors=[AXIS_COLOUR] * 2,
+            colors=[LABEL_COLOUR] * 2,
             radii=rr.Radius.ui_points(END_DOT),
             show_labels=True,
         )
@@ -145,7 +149,7 @@ class PhasePlot:
         rec.send_columns(path, [time_column(t)], rr.Points2D.columns(positions=points), strict=True)
 
     def view(self, labels: Labels) -> rrb.Spatial2DView:
-        """Return the view of the plot, with a title that names both axes.
+        """Return the view of the plot, with a title that names parameter and position.
 
         Args:
             labels: Labels of the degrees of freedom.
@@ -153,8 +157,8 @@ class PhasePlot:
         position, _ = split_unit(labels.positions[self.dof])
         return rrb.Spatial2DView(
             origin=entity_path(self.parts),
-            name=f"ψ of {self.parameter}: {position} →, its velocity ↑",
-            visual_bounds=rrb.VisualBounds2D(x_range=[-1.9, 1.9], y_range=[-1.3, 1.3]),
+            name=f"ψ of {self.parameter}: {position}",
+            visual_bounds=rrb.VisualBounds2D(x_range=VISIBLE_X, y_range=VISIBLE_Y),
         )
 
     def _units(self, labels: Labels) -> tuple[str, str]:

@@ -24,7 +24,7 @@ LINE_WIDTH, DOT_SIZE = 2.0, 1.0
 MARGIN = 0.08
 
 # The range of a plot reaches to the limits if it is then at most this many times as large.
-LARGEST_ZOOM = 8.0
+LARGEST_ZOOM = 6.0
 
 # Width and colour (0..255) of lines of limits.
 LIMIT_WIDTH, LIMIT_COLOUR = 1.2, (150, 150, 150)
@@ -138,11 +138,7 @@ class SeriesPlot:
         data = np.concatenate(values) if values else np.zeros(0)
         low, high = (float(data.min()), float(data.max())) if len(data) else (np.inf, -np.inf)
 
-        finite_limits = [limit for limit in self.limits if np.isfinite(limit)]
-        whole_low, whole_high = min([low, *finite_limits]), max([high, *finite_limits])
-        if not high > low or whole_high - whole_low <= self.largest_zoom * (high - low):
-            low, high = whole_low, whole_high
-        return padded(low, high)
+        return range_with_limits(low, high, self.limits, self.largest_zoom)
 
     @property
     def full_title(self) -> str:
@@ -208,6 +204,24 @@ def times_on(timeline: Timeline, t: Array) -> rr.TimeColumn:
     if timeline == "sim_time":
         return time_column(t)
     return rr.TimeColumn("iteration", sequence=np.rint(t).astype(np.int64))
+
+
+def range_with_limits(
+    low: float, high: float, limits: Range, largest_zoom: float = LARGEST_ZOOM
+) -> Range:
+    """Return the range of a plot, which includes the limits if they are near enough.
+
+    Args:
+        low: Smallest value; infinite without any.
+        high: Largest value.
+        limits: Lower and upper limit, infinite without one.
+        largest_zoom: See `SeriesPlot`.
+    """
+    finite_limits = [limit for limit in limits if np.isfinite(limit)]
+    whole_low, whole_high = min([low, *finite_limits]), max([high, *finite_limits])
+    if not high > low or whole_high - whole_low <= largest_zoom * (high - low):
+        return padded(whole_low, whole_high)
+    return padded(low, high)
 
 
 def padded(low: float, high: float) -> Range:
