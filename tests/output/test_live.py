@@ -70,6 +70,10 @@ class Received:
         found.sort(key=lambda row: row[0])
         return [number for number, _ in found], [value for _, value in found]
 
+    def has_static(self, entity: str) -> bool:
+        """Whether an entity has data without a time, which hide the others."""
+        return any(each.is_static for each in self._chunks if str(each.entity_path) == entity)
+
     def series(self, entity: str) -> list[float]:
         """Values of a curve."""
         return [value for (value,) in self.rows(entity, "Scalars:scalars")[1]]
@@ -112,6 +116,10 @@ class TestShown:
         assert numbers == list(range(len(events)))
         assert all(np.isfinite(path).all() for path in paths)
         assert not np.allclose(paths[0], paths[-1])
+        numbers, texts = received.rows("/progress", "TextDocument:text")
+        assert len(texts) == len(events) + 1, "one before the first event"
+        assert "J " in texts[-1][0]
+        assert not received.has_static("/progress")
         _, places = received.rows("/robot/bodies/bob", "Transform3D:translation")
         assert len(places) == len(events)
 

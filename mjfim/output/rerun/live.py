@@ -11,7 +11,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.arrays import evenly_spread_indices
 from mjfim.output import vocabulary
 from mjfim.output.progress_text import progress_line
 from mjfim.output.rerun.camera import Camera, place_camera
@@ -21,10 +21,12 @@ from mjfim.output.rerun.scene import (
     EntityParts,
     body_parts,
     body_poses,
+    end_point,
     entity_path,
     is_moving,
     log_robot,
     rerun_quaternion,
+    strip_of_path,
 )
 from mjfim.output.rerun.shapes import RobotStyle
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
@@ -37,7 +39,7 @@ UPDATE_SECONDS = 0.3
 MAX_POINTS = 500
 
 # Samples of a motion from which its path is drawn.
-PATH_SAMPLES = 60
+PATH_SAMPLES = 120
 
 # Transmissions in which the robot passes through its motion once.
 UPDATES_PER_MOTION = 12
@@ -142,9 +144,12 @@ class LiveShow:
         self._camera: Camera | None = None
         self._arranged: tuple[object, ...] = ()
 
-        # The viewer shows something from the beginning.
+        # The viewer shows something from the beginning. A text without a time would be static and
+        # hide those that follow.
         rec.set_log_time_enabled(False)
+        self._rec.set_time(TIMELINE, sequence=0)
         self._show_text(WAITING)
+        self._rec.reset_time()
         self._arrange()
 
     @classmethod
@@ -255,12 +260,10 @@ class LiveShow:
             )
             self._rec.log(entity_path(body_parts(self._model, ROBOT, body)), pose, strict=True)
 
-        path = rr.LineStrips3D(
-            [_path_of_end(self._model, poses)],
-            colors=[STYLE.accent],
-            radii=rr.Radius.ui_points(1.5),
-        )
-        self._rec.log(entity_path((*ROBOT, "path")), path, strict=True)
+        end = end_point(self._model, poses)
+        if end is not None:
+            path = strip_of_path(end.path(poses), STYLE)
+            self._rec.log(entity_path((*ROBOT, "path")), path, strict=True)
 
     def _see(self, poses: BodyPoses) -> None:
         """Place the camera so that a motion is in view; at the first one, log the shapes."""
@@ -314,16 +317,3 @@ def _logarithm(value: float) -> float:
 def _distance(camera: Camera) -> float:
     """Distance of a camera from the point at which it looks [m]."""
     return float(np.linalg.norm(np.subtract(camera.position, camera.target)))
-
-
-def _path_of_end(model: mujoco.MjModel, poses: BodyPoses) -> Array:
-    """Return the (n, 3) path of the body at the end of the robot that travels farthest [m]."""
-    depth = np.zeros(model.nbody, dtype=np.intp)
-    for body in range(1, model.nbody):
-        depth[body] = depth[model.body_parentid[body]] + 1
-
-    travelled = np.linalg.norm(np.diff(poses.positions, axis=0), axis=2).sum(axis=0)
-    moving = travelled > 0.0
-    deepest = np.where(moving, depth, 0).max()
-    end = int(np.argmax(np.where(depth == deepest, travelled, -1.0)))
-    return poses.positions[:, end]

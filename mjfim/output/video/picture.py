@@ -23,9 +23,6 @@ BACKGROUND = np.array([0.885, 0.905, 0.935, 1.0])
 # number, so that the lights of the model add little.
 EMISSION = 10.0
 
-# Opacity that cannot be told from 1, but with which MuJoCo draws no shadow.
-NEARLY_OPAQUE = 0.999
-
 # Distance of the background, as a share of that of the far clipping plane.
 BACKGROUND_DISTANCE = 0.7
 
@@ -282,9 +279,8 @@ def _add_line(
 
 
 def _let_shine(geom: mujoco.MjvGeom) -> None:
-    """Give a geom its own colour whatever the lights are, and no shadow, as transparent ones."""
+    """Give a geom its own colour whatever the lights are."""
     geom.rgba[:3] /= EMISSION
-    geom.rgba[3] = NEARLY_OPAQUE
     geom.emission, geom.specular, geom.shininess = EMISSION, 0.0, 0.0
 
 
