@@ -291,8 +291,8 @@ def _signal_panel(signals: _Signals, j: int, labels: Labels, linked: str) -> Pan
 
     # With many segments, lines would hide the curves.
     begins = signals.begins[1:] if len(signals.begins) <= MAX_SEGMENTS else ()
-    shapes = [level(float(begin), "grid", across="y", dash="dot") for begin in begins]
-    layout = {"xaxis": axis("time [s]"), "shapes": shapes}
+    shapes = [level(float(begin), "muted", across="y", dash="dot") for begin in begins]
+    layout = {"xaxis": axis("time [s]"), "shapes": shapes, **_vertical_range(signals, j)}
     title = labels.output(recording.outputs[j])
     return Panel(title=title, traces=traces, layout=layout, linked=linked)
 
@@ -304,6 +304,23 @@ def _shown_outputs(estimate: Estimate) -> list[int]:
     sizes = {j: rms[j][1] / max(estimate.sigma.get(rms[j][0], 1.0), 1e-300) for j in measured}
     largest = sorted(measured, key=lambda j: -sizes[j])
     return sorted(largest[:MAX_OUTPUTS])
+
+
+def _vertical_range(signals: _Signals, j: int) -> Plotly:
+    """Return the axis of one output where a nominal model far away would flatten the others."""
+    if not signals.has_nominal:
+        return {}
+
+    near = np.concatenate([signals.recording.y[:, j], signals.identified[:, j]])
+    near, far = near[np.isfinite(near)], signals.nominal[:, j]
+    if not near.size or not np.isfinite(far).any():
+        return {}
+
+    low, high = float(near.min()), float(near.max())
+    room = 0.5 * (high - low)
+    if np.nanmin(far) >= low - room and np.nanmax(far) <= high + room:
+        return {}
+    return {"yaxis": axis(range=[low - room, high + room])}
 
 
 def _fit_plots(estimate: Estimate, labels: Labels, columns: Sequence[int]) -> Iterator[PlotGroup]:
