@@ -36,6 +36,9 @@ MEASURE_PLOTS = """nodes => nodes.map(node => {
   return [box.width, box.height, shapes.length];
 })"""
 
+# Width of each plot [CSS pixels].
+WIDTHS = "plots => plots.map(plot => Math.round(plot.getBoundingClientRect().width))"
+
 # Width of the part of the page that is outside the window [CSS pixels].
 FIND_WIDE = "document.documentElement.scrollWidth - window.innerWidth"
 
@@ -158,9 +161,18 @@ def test_a_hostile_name_does_not_run(browser: Any, tmp_path: Path) -> None:
     assert page.locator("img").count() == 0
 
 
-def test_a_printed_report_is_light_and_complete(browser: Any, tmp_path: Path) -> None:
-    """The PDF of a report in the dark theme has several pages."""
+def test_a_printed_report_fits_the_paper_and_the_window_again(browser: Any, tmp_path: Path) -> None:
+    """Plots have the width of the paper while it is printed; nothing is folded then."""
     view = Viewed(browser, report_file(tmp_path, results.design()), WINDOWS[0], "dark")
+    before = view.page.eval_on_selector_all(".plot .main-svg", WIDTHS)
+    view.page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    assert max(view.page.eval_on_selector_all(".plot .main-svg", WIDTHS)) <= 690
+    assert view.page.locator("details:not([open])").count() == 0
+    view.page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    view.page.wait_for_selector("body:not([data-busy])", timeout=PATIENCE)
+    assert view.page.eval_on_selector_all(".plot .main-svg", WIDTHS) == before
+    assert view.page.locator("details[open]").count() == 0
+
     content = view.page.pdf()
     assert content.startswith(b"%PDF")
     assert len(content) > 50_000

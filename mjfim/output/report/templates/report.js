@@ -5,6 +5,7 @@
   const touch = window.matchMedia("(pointer: coarse)");
   const plots = Array.from(document.querySelectorAll(".plot"));
   let printing = false;
+  let unfolded = [];
 
   // Colours by role, in the theme of the page; paper is always light.
   function palette() {
@@ -78,6 +79,11 @@
     const panel = data.panels[Number(node.dataset.panel)];
     const colours = palette();
     const layout = layoutOf(panel, colours);
+    // A sheet of paper is narrower than the window, and does not resize what is drawn on it.
+    if (printing) {
+      layout.autosize = false;
+      layout.width = node.closest("figure").classList.contains("wide") ? 690 : 335;
+    }
     const before = node._fullLayout;
     // A zoom survives a change of the theme.
     if (before) {
@@ -116,24 +122,25 @@
     });
   }
 
-  // A folded plot has no size; it is drawn when it is unfolded for the first time.
+  // A folded plot has no size; it is drawn when it is unfolded.
   for (const fold of document.querySelectorAll("details")) {
     fold.addEventListener("toggle", () => {
-      if (fold.open) fold.querySelectorAll(".plot").forEach((node) => (node._fullLayout ? Plotly.Plots.resize(node) : draw(node)));
+      if (fold.open) fold.querySelectorAll(".plot").forEach(draw);
     });
   }
 
   dark.addEventListener("change", () => drawAll(plots.filter((node) => node._fullLayout)));
   window.addEventListener("beforeprint", () => {
     printing = true;
-    document.documentElement.classList.add("on-paper");
-    document.querySelectorAll("details").forEach((fold) => { fold.open = true; });
+    unfolded = Array.from(document.querySelectorAll("details:not([open])"));
+    unfolded.forEach((fold) => { fold.open = true; });
     plots.forEach(draw);
   });
   window.addEventListener("afterprint", () => {
     printing = false;
-    document.documentElement.classList.remove("on-paper");
-    drawAll(plots);
+    unfolded.forEach((fold) => { fold.open = false; });
+    document.body.dataset.busy = "yes";
+    drawAll(plots.filter((node) => node._fullLayout)).then(() => { delete document.body.dataset.busy; });
   });
 
   // The video plays by itself, without sound, unless the reader prefers a page that stands still.
