@@ -12,7 +12,7 @@ from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import measured_trajectory
-from mjfim.interruption import run_optional
+from mjfim.interruption import current_interruption, run_optional
 from mjfim.output import archive, latex, markdown, plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.mjcf.edited_files import copies_of_included_files
@@ -207,7 +207,14 @@ def write_design_folder(
 
 
 def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
-    """Write the report once more, with a video or with the sentence why there is none."""
+    """Write the report once more, with a video or with the sentence why there is none.
+
+    Who has pressed Ctrl-C does not wait for a video.
+    """
+    interruption = current_interruption()
+    if interruption is not None and interruption.presses:
+        return
+
     video, sentence = video_for_report(system, result)
     write_report(folder, type(result), video, sentence)
 

@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.output import vocabulary
-from mjfim.output.video import NoVideoError
+from mjfim.output.video import NoVideoError, rendering
 from mjfim.output.video.film import (
     Film,
     film_of_estimate,
@@ -179,6 +179,25 @@ class TestVideo:
         assert back_ends() == ("egl",)
         monkeypatch.delenv("MUJOCO_GL")
         assert len(back_ends()) >= 1
+
+    @pytest.mark.slow
+    def test_a_context_that_cannot_be_opened_gives_a_sentence(
+        self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("MUJOCO_GL", "nonsense")
+        with pytest.raises(NoVideoError, match="nothing with the variable MUJOCO_GL=nonsense"):
+            render(film_of_estimate(swing, swinging(1.0), None), "gif")
+
+    @pytest.mark.slow
+    @pytest.mark.usefixtures("drawing")
+    def test_a_driver_that_hangs_is_ended(
+        self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(rendering, "PROGRAM", "import time; time.sleep(600.0)")
+        monkeypatch.setattr(rendering, "START_SECONDS", 0.1)
+        quick = Effort(seconds=0.1)
+        with pytest.raises(NoVideoError, match=r"did not end within|took too long"):
+            render(film_of_estimate(swing, swinging(1.0), None), "gif", quick)
 
     @pytest.mark.slow
     @pytest.mark.usefixtures("drawing")

@@ -45,10 +45,8 @@ START_SECONDS = 20.0
 TURNED_OFF = ("disable", "disabled", "off", "false", "0")
 
 # Reasons why there is no video. They are complete parts of a sentence.
-NO_RENDERER = (
-    "MuJoCo can draw nothing here; on a computer without a display it needs EGL (package libegl1) "
-    "or OSMesa (package libosmesa6)"
-)
+NO_RENDERER = "MuJoCo can draw nothing on this computer, because it has no usable OpenGL"
+NO_RENDERER_ON_LINUX = f"{NO_RENDERER}; the packages libegl1 and libgl1-mesa-dri are enough"
 IS_TURNED_OFF = "the variable MUJOCO_GL turns drawing off"
 
 
@@ -158,7 +156,10 @@ def _drawn(folder: Path, effort: Effort) -> dict[str, Any]:
                 raise NoVideoError(result["reason"])
             return result
 
-    raise NoVideoError(NO_RENDERER)
+    stated = os.environ.get("MUJOCO_GL")
+    if stated:
+        raise NoVideoError(f"MuJoCo can draw nothing with the variable MUJOCO_GL={stated}")
+    raise NoVideoError(NO_RENDERER_ON_LINUX if platform.system() == "Linux" else NO_RENDERER)
 
 
 def back_ends() -> tuple[str, ...]:
