@@ -83,7 +83,7 @@ NOTE = (
 )
 
 # Names of the two trajectories in the tables.
-TITLES = {"initial": "initial", "final": "optimized"}
+TITLES = {"initial": "initial", "final": "designed"}
 
 # Places of the entries of a symmetric matrix: its upper triangle.
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))

@@ -93,7 +93,7 @@ def growth_warning(growth: float) -> str | None:
 
     return (
         f"a small disturbance grows up to {growth:.1e}-fold along this trajectory when its control "
-        "is played open loop; the predicted sigma assumes that there is no disturbance. Play it "
+        "is played open loop; the predicted σ assumes that there is no disturbance. Play it "
         "with the gains of design.npz, or raise cost.control"
     )
 

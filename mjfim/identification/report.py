@@ -407,7 +407,7 @@ def _warnings_of_misfit(findings: _Findings) -> Iterator[str]:
         )
     elif noise_is_stated and is_smaller_than_noise(quality.chi2, quality.dof):
         ratio = np.sqrt(quality.chi2 / quality.dof)
-        yield f"residuals are only {ratio:.2f} x the stated noise: sigma is overstated"
+        yield f"residuals are only {ratio:.2f} times the stated noise: the stated σ is too large"
 
 
 def _warnings_of_recordings(findings: _Findings) -> Iterator[str]:

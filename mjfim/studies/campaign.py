@@ -299,7 +299,7 @@ class _CampaignRun:
             index=current.number - 1,
             count=self.count,
             share=1.0,
-            message=f"largest ratio of sigma to target: {ratio:.3g} ({name})",
+            message=f"largest ratio of σ to target: {ratio:.3g} ({name})",
             result=current,
         )
         self._callback(event)

@@ -127,7 +127,7 @@ def test_chi_square_and_misfit(
 
 def test_overstated_noise_is_a_warning(task: DesignTask, recording: Recording) -> None:
     estimate = identify_system(task.system, [noiseless(task, recording)])
-    assert any("overstated" in sentence for sentence in estimate.warnings)
+    assert any("stated σ is too large" in sentence for sentence in estimate.warnings)
 
 
 def test_two_recordings_carry_twice_the_information(
@@ -357,7 +357,7 @@ def test_a_robust_fit_tests_the_size_of_its_residuals(
     right = identify_system(robust.system, [recording])
     assert right.chi2 / right.dof == pytest.approx(1.0, abs=0.15)
     assert not right.misfit
-    assert not any("overstated" in sentence for sentence in right.warnings)
+    assert not any("stated σ is too large" in sentence for sentence in right.warnings)
     truth = noiseless(task, recording).y
     loud = Recording(
         t=recording.t,

@@ -31,6 +31,7 @@ from mjfim.output.plots.style import (
     shorten_label,
 )
 from mjfim.output.summaries.accuracy import BEST_CASE
+from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
@@ -399,8 +400,10 @@ def _interval_handles() -> list[Line2D]:
     )
     colour = IDENTIFIED_COLOUR
     return [
-        Line2D([], [], color=NOMINAL_COLOUR, label="guess", linewidth=1.6),
-        Line2D([], [], color=colour, marker="o", alpha=0.9, label="estimate, 95 % interval"),
+        Line2D([], [], color=NOMINAL_COLOUR, label=NOMINAL.word, linewidth=1.6),
+        Line2D(
+            [], [], color=colour, marker="o", alpha=0.9, label=f"{IDENTIFIED.word}, 95 % interval"
+        ),
         Line2D([], [], color=colour, linewidth=5.0, alpha=0.3, label="formal 95 %"),
         at_bound,
     ]

@@ -214,7 +214,7 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
         "the identified model, and its ratio to that of the nominal model."
     )
     if not all(prediction.held_out for prediction in found):
-        note += " *: also part of the final fit; predicted here by a fit to the other recordings."
+        note += " *: also part of the last fit; predicted here by a fit to the other recordings."
     add_title(figure, "Predictions of recordings that were not fitted", handles, note)
     return figure
 
@@ -245,7 +245,7 @@ def _draw_errors(axes: Axes, found: tuple[Prediction, ...], j: int) -> None:
 
 
 def _recording_name(prediction: Prediction) -> str:
-    """Return the short name of a predicted recording; one that the final fit holds has a star."""
+    """Return the short name of a predicted recording; one that the last fit holds has a star."""
     file_name = prediction.name.rsplit("/", 1)[-1]
     name = shorten(file_name, RECORDING_NAME_WIDTH)
     return name if prediction.held_out else f"{name} *"

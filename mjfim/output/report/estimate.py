@@ -107,8 +107,8 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
     if len(names) > 1 and np.isfinite(correlation).any():
         panels.append(correlation_panel(correlation, names, "correlation of the estimates [–]"))
     keys = [
-        Key(name="guess", role=NOMINAL.word),
-        Key(name="estimate, 95 % interval", role=IDENTIFIED.word),
+        Key(name=NOMINAL.word, role=NOMINAL.word),
+        Key(name=f"{IDENTIFIED.word}, 95 % interval", role=IDENTIFIED.word),
     ]
     note = (
         "The interval allows for residuals that are not white noise and for recordings that "
