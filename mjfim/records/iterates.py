@@ -52,9 +52,9 @@ class IterateMotion:
             trajectory: The trajectory; None for an iterate whose simulation diverged.
 
         Returns:
-            The motion; None without a trajectory.
+            The motion; None without a trajectory, and where it is not finite.
         """
-        if trajectory is None:
+        if trajectory is None or not np.isfinite(trajectory.qpos).all():
             return None
 
         # A trajectory with fewer samples repeats some, so that all motions have the same size.

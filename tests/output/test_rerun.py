@@ -561,7 +561,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[mujoco.MjModel, Pat
     """Replay of the flight of a quadrotor."""
     model = load("quadrotor")
     path = tmp_path_factory.mktemp("free") / "replay.rrd"
-    log_trajectories(path, model, {"final": flight(model)}, labels_of_model(model))
+    still = simulated(model, 0.5, samples=100)
+    trajectories = {"initial": still, "final": flight(model)}
+    log_trajectories(path, model, trajectories, labels_of_model(model))
     return model, path
 
 
@@ -577,9 +579,19 @@ class TestFreeBody:
     ) -> None:
         _, path = flown
         tracked = blueprint_column(path, "EyeControls3D:tracking_entity")
-        (entity,) = {names[0] for names in tracked.values()}
-        assert entity in entities(path)
-        assert entity.startswith(entity_path(("robots", "designed", "bodies", "quadrotor")) + "/")
+        followed = {names[0] for names in tracked.values()}
+        assert len(followed) == len(tracked) == 2
+        for name in ("initial", "designed"):
+            body = entity_path(("robots", name, "bodies", "quadrotor"))
+            (shape,) = (entity for entity in followed if entity.startswith(f"{body}/"))
+            assert shape in entities(path)
+
+    def test_the_view_of_both_robots_stands_still(self, flown: tuple[mujoco.MjModel, Path]) -> None:
+        """A view that is opened while a body flies would begin in a wrong place."""
+        _, path = flown
+        places = blueprint_column(path, "EyeControls3D:position")
+        tracked = blueprint_column(path, "EyeControls3D:tracking_entity")
+        assert len(places) == 3 and len(set(places) - set(tracked)) == 1
 
 
 @pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo"])

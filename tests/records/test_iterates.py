@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mjfim.records.design import HistoryRow, extended, without_motions
@@ -47,6 +49,8 @@ def test_short_and_diverged_iterates_are_taken() -> None:
         float(np.float32(value)) for value in (0.0, 0.01, 0.02, 0.03)
     }
     assert IterateMotion.of(None) is None
+    diverged = replace(moved(3), qpos=np.full((4, 1), np.inf))
+    assert IterateMotion.of(diverged) is None
 
 
 def test_many_iterates_keep_few_motions_evenly_spread() -> None:

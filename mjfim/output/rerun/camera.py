@@ -73,22 +73,28 @@ class Camera:
 
 
 def place_camera(
-    model: mujoco.MjModel, motions: Sequence[BodyPoses], views: int, aspect: float
+    model: mujoco.MjModel,
+    motions: Sequence[BodyPoses],
+    views: int,
+    aspect: float,
+    *,
+    follow: bool = True,
 ) -> Camera:
     """Place a camera that has all moving geoms of every motion in view.
 
-    If nothing moves, the whole model is in view. A free body that travels far is followed.
+    If nothing moves, the whole model is in view. A free body that travels far may be followed.
 
     Args:
         model: The model.
         motions: Poses along each trajectory.
         views: Number of views that share a region of the layout.
         aspect: Width of that region over its height.
+        follow: False for a camera that never follows a body.
     """
     clouds = moving_points(model, motions)
     towards_camera = view_direction(extents(clouds))
     axes = camera_axes(towards_camera)
-    followed = followed_body(model, motions, clouds)
+    followed = followed_body(model, motions, clouds) if follow else None
     if followed is not None:
         clouds = _around_begin(clouds, motions, followed)
 

@@ -398,9 +398,10 @@ def _robots(
     """
     camera = place_camera(model, motions, views=len(motions), aspect=aspect)
     views = robot_views(model, camera, titles)
-    near = place_camera(model, motions, views=1, aspect=aspect)
-    last = list(titles.values())[-1]
-    overlay = robot_views(model, near, {OVERLAY: ("robots",)}, followed=last)[0]
+
+    # The camera of a view that is opened later, while a body flies, would begin in a wrong place.
+    still = place_camera(model, motions, views=1, aspect=aspect, follow=False)
+    overlay = robot_views(model, still, {OVERLAY: ("robots",)})[0]
     return separate_and_overlaid(views, camera, overlay)
 
 
