@@ -267,7 +267,8 @@ class LiveShow:
 
     def _see(self, poses: BodyPoses) -> None:
         """Place the camera so that a motion is in view; at the first one, log the shapes."""
-        camera = place_camera(self._model, [poses], 1, ASPECT_WITHOUT_TEXT)
+        # The view begins while the robot moves, from where a camera cannot follow a body.
+        camera = place_camera(self._model, [poses], 1, ASPECT_WITHOUT_TEXT, follow=False)
         if self._camera is None:
             first = BodyPoses(
                 t=poses.t[:1], positions=poses.positions[:1], quaternions=poses.quaternions[:1]
