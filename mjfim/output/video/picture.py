@@ -35,6 +35,9 @@ FLOOR_LINES = 16
 STICK_RADIUS = 0.015
 STICK_COLOUR = np.array([0.55, 0.55, 0.55, 1.0], dtype=np.float32)
 
+# Shift of a ghost towards the camera, as a share of its distance.
+GHOST_SHIFT = 0.002
+
 # Width of the lines of a floor as a share of the distance between them, and of other lines as a
 # share of the distance of the camera.
 FLOOR_WIDTH = 0.02
@@ -134,6 +137,7 @@ class Painter:
         self._bare_bodies = _bare_bodies(model)
         self._option = _options(model, self._is_moving)
         self._camera = _camera(offset)
+        self._towards_camera = GHOST_SHIFT * offset
         self._floor = None if job["floor"] is None else float(job["floor"])
         self._spacing = float(job["spacing"])
         self._line_width = LINE_WIDTH * self._camera.distance
@@ -197,6 +201,10 @@ class Painter:
             is_geom = geom.objtype == int(mujoco.mjtObj.mjOBJ_GEOM)
             if is_geom and 0 <= geom.objid < len(self._is_moving) and self._is_moving[geom.objid]:
                 robot.paint(geom)
+
+                # Surfaces at the same place would be drawn as speckles.
+                if first:
+                    geom.pos[:] += self._towards_camera
 
     def _add_sticks(self, scene: mujoco.MjvScene, robot: PaintedRobot) -> None:
         """Add a ball and sticks to the children for each moving body without geoms."""
