@@ -80,7 +80,10 @@ def identify(
     inputs = input_files(system.experiment, [*recordings, *(held_out or [])])
     logs = recording_paths(recordings, system.channels)
     held_out_logs = recording_paths(held_out or [], system.channels)
-    names = (*estimate_files(len(logs)), *parts_of_identified(output, system.model_path))
+    names = (
+        *estimate_files(len(logs), len(held_out_logs)),
+        *parts_of_identified(output, system.model_path),
+    )
     claim_video(video, inputs, force=force)
     claim_folder(output, pictures.files(names), inputs, force=force)
 

@@ -296,8 +296,38 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         motion=problem.motion(solution.unknowns, 0),
         interrupted=findings.interrupted,
         labels=labels_of_system(system),
+        trace=_trace(result),
+        nominal=_nominal_outputs(result),
+        segments=_beginnings(problem),
         restart=result.restart,
     )
+
+
+def _trace(result: FitResult) -> Array:
+    """(n, p) the initial guess and the iterates of the search over all data [theta-unit]."""
+    iterates = [result.problem.theta(at) for at in result.solution.iterates]
+    return np.array([result.task.start, *iterates])
+
+
+def _nominal_outputs(result: FitResult) -> tuple[Array, ...]:
+    """(M, ny) outputs of the model at the initial guess, from the fitted initial states.
+
+    There are none where the model diverges.
+    """
+    problem, at = result.problem, result.solution.unknowns
+    guess = problem.begin(result.task.start)
+    if problem.layout.free_starts:
+        guess = replace(guess, private=at.private)
+    return tuple(problem.predict(guess) or ())
+
+
+def _beginnings(problem: FitProblem) -> tuple[Array, ...]:
+    """Times at which the segments of each recording begin [s]."""
+    begins: list[list[float]] = [[] for _ in problem.recordings]
+    for segment in problem.segments:
+        t = problem.recordings[segment.recording].t[segment.rows]
+        begins[segment.recording] += t[:1].tolist()
+    return tuple(np.array(times) for times in begins)
 
 
 def _as_aligned(problem: FitProblem, recordings: Sequence[Recording]) -> tuple[Recording, ...]:

@@ -195,9 +195,10 @@ class FitSearch:
             change = float(np.abs(sigma / problem.noise.sigma - 1.0).max())
             noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
             problem = problem.with_noise(noise)
-            solution = self._minimise(
+            refined = self._minimise(
                 problem, solution.unknowns, settings, f"{phase}, noise estimated"
             )
+            solution = replace(refined, iterates=(*solution.iterates, *refined.iterates[1:]))
             if change < NOISE_TOLERANCE:
                 break
         return problem, solution

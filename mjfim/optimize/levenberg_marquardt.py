@@ -9,7 +9,7 @@ protocol, not MuJoCo.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -171,6 +171,8 @@ class Solution:
         success: True where the search converged.
         status: Sentence that says why the search ended.
         interrupted: True where the stop token ended the search.
+        iterates: The begin and all accepted values, with the private unknowns of the first segment
+            only.
     """
 
     unknowns: UnknownValues
@@ -180,6 +182,7 @@ class Solution:
     success: bool
     status: str
     interrupted: bool = False
+    iterates: tuple[UnknownValues, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,6 +282,7 @@ class _Search:
         self.damping_growth = 2.0
         self.stagnant_iterations = 0
         self.previous_length = np.inf
+        self.iterates: list[UnknownValues] = []
 
     def run(self, start: UnknownValues, cost: float, condensed: Condensed) -> Solution:
         """Iterate from a point with its cost and linearisation until the search ends."""
@@ -286,6 +290,7 @@ class _Search:
         self.cost = cost
         self.condensed = condensed
         self.scale = condensed.column_norms
+        self._keep(start)
 
         while self.iteration < self.settings.max_iterations:
             ended = self._iterate()
@@ -322,6 +327,7 @@ class _Search:
         self.previous_length = trial.step.common_length
         self.unknowns = trial.unknowns
         self.cost = trial.cost
+        self._keep(trial.unknowns)
         self._report(trial.step)
 
         if converged:
@@ -452,6 +458,10 @@ class _Search:
         )
         return complete and length < SHORT_STEP and next_length < self.settings.tolerance
 
+    def _keep(self, at: UnknownValues) -> None:
+        """Keep an iterate, with the private unknowns of the first segment only."""
+        self.iterates.append(replace(at, private=at.private[:1]))
+
     def _report(self, step: Step) -> None:
         """Call the callback."""
         if self.callback is not None:
@@ -526,4 +536,5 @@ class _Search:
             success=success,
             status=status,
             interrupted=interrupted,
+            iterates=tuple(self.iterates),
         )

@@ -18,7 +18,13 @@ from mjfim.output import rerun as rerun_log
 from mjfim.output.mjcf.edited_files import copies_of_included_files
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.plots.pictures import Pictures, fit_names, histogram_name, pictures_of
+from mjfim.output.plots.pictures import (
+    Pictures,
+    fit_names,
+    held_out_names,
+    histogram_name,
+    pictures_of,
+)
 from mjfim.output.presentation import describe
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import write_report
@@ -60,7 +66,7 @@ DESIGN_FILES = (
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
 # Files that `mjfim check`, `mjfim robustness` and `mjfim export-sysid` may write.
-CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", *TABLE_FILES)
+CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "pairs.png", *TABLE_FILES)
 ROBUSTNESS_FILES = ("playback.json", "playback.npz", REPORT, "playback.png", *TABLE_FILES)
 SYSID_FILES = ("comparison.json", "sysid_report.html")
 
@@ -75,14 +81,15 @@ def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:
     return copies_of_included_files(folder / IDENTIFIED, model)
 
 
-def estimate_files(recordings: int) -> tuple[str, ...]:
+def estimate_files(recordings: int, held_out: int = 0) -> tuple[str, ...]:
     """List the files that `mjfim identify` may write for every model.
 
     Args:
         recordings: Number of recordings that are fitted.
+        held_out: Number of recordings that are held out.
     """
-    figures = ("parameters.png", "spectra.png", "predictions.png")
-    fits = tuple(f"{name}.png" for name in fit_names(recordings))
+    figures = ("parameters.png", "spectra.png", "trace.png", "pairs.png", "predictions.png")
+    fits = tuple(f"{name}.png" for name in (*fit_names(recordings), *held_out_names(held_out)))
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
     return (*data, *figures, *fits, *TABLE_FILES)
 
@@ -94,7 +101,7 @@ def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
         parameters: Names of the parameters.
     """
     histograms = tuple(f"{histogram_name(name)}.png" for name in parameters)
-    return ("montecarlo.json", "montecarlo.npz", REPORT, *histograms, *TABLE_FILES)
+    return ("montecarlo.json", "montecarlo.npz", REPORT, "overview.png", *histograms, *TABLE_FILES)
 
 
 def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
@@ -311,7 +318,10 @@ def write_estimate_folder(
         Sentences about results that could not be written completely.
     """
     endings = "|".join(PictureFormat)
-    _clear(folder, rf"(fit(_\d+)?|predictions)\.({endings})|identified(_.*)?\.xml")
+    _clear(
+        folder,
+        rf"((fit|held_out)(_\d+)?|predictions|pairs|trace)\.({endings})|identified(_.*)?\.xml",
+    )
     estimate.save(folder)
     write_tables(folder, estimate)
 

@@ -94,7 +94,7 @@ def render_table(table: SummaryTable) -> str:
     lines = [
         r"\begin{table}",
         r"  \centering",
-        rf"  \caption{{{escape(table.title)}}}",
+        *([rf"  \caption{{{escape(table.title)}}}"] if table.title else []),
         rf"  \begin{{tabular}}{{{alignment}}}",
         r"    \toprule",
         *_groups(table),

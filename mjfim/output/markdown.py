@@ -17,9 +17,10 @@ def render_tables(summary: Summary) -> str:
     Args:
         summary: The summary.
     """
-    blocks = [f"# {escape(summary.title)}"]
+    blocks = [f"# {escape(summary.title)}"] if summary.title else []
     for table in summary.tables:
-        blocks += [f"## {escape(table.title)}", render_table(table)]
+        blocks += [f"## {escape(table.title)}"] if table.title else []
+        blocks.append(render_table(table))
         if table.note:
             blocks.append(escape(table.note))
     return "\n\n".join(blocks) + "\n"

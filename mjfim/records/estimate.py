@@ -70,6 +70,11 @@ class Estimate(ShownRecord):
         prior: (p, p) information of the parameters' priors.
         labels: Names and units for figures and tables; None in records of earlier versions.
         restart: How the fit was repeated from fits over segments; None where it was not.
+        trace: (n, p) the initial guess, and the parameters at the begin and at each iteration of
+            the search over all data [theta-unit]; empty in records of earlier versions.
+        nominal: Outputs of the model at the initial guess, with the fitted initial states, for each
+            recording, (M, ny) [unit of the output]; empty where it diverges.
+        segments: Times at which the segments of each recording begin [s].
     """
 
     parameters: tuple[str, ...]
@@ -110,6 +115,9 @@ class Estimate(ShownRecord):
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     labels: Labels | None = None
     restart: Restart | None = None
+    trace: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    nominal: tuple[Array, ...] = ()
+    segments: tuple[Array, ...] = ()
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -141,7 +149,7 @@ class Estimate(ShownRecord):
             object.__setattr__(self, "units", ("",) * count)
 
         freeze(self, "theta", "std", "covariance", "initial_theta", "data", "prior")
-        freeze(self, "std_sandwich", "interval", "between_recordings")
+        freeze(self, "std_sandwich", "interval", "between_recordings", "trace")
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of estimate.json."""

@@ -21,7 +21,10 @@ from matplotlib.text import Text
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError
+from mjfim.model.coordinates import QUATERNION
 from mjfim.output import plots
+from mjfim.output.plots.limit_usage import joint_colours
+from mjfim.output.plots.positions import rotation_vectors
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     INITIAL_COLOUR,
@@ -30,7 +33,7 @@ from mjfim.output.plots.style import (
     quotient_unit,
     squared_unit,
 )
-from mjfim.records.design import Evaluation
+from mjfim.records.design import Evaluation, LimitUsage
 from mjfim.records.labels import Labels
 from tests.support.made_records import make_design, make_estimate, make_labels, make_study
 from tests.support.paths import ROOT
@@ -89,11 +92,11 @@ def test_figure_has_units_legend_and_pixels(
     name: str, dofs: int, count: int, tmp_path: Path
 ) -> None:
     figure = FIGURES[name](dofs, count)
-    axis_labels = [
-        label for axes in figure.axes for label in (axes.get_xlabel(), axes.get_ylabel()) if label
-    ]
-    assert axis_labels
-    assert all(re.search(r"\[.+\]", label, re.DOTALL) for label in axis_labels)
+    for axes in figure.axes:
+        titles = [axes.get_title(loc) for loc in ("left", "center", "right")]
+        words = [*titles, axes.get_xlabel(), axes.get_ylabel()]
+        rows = [label.get_text() for label in axes.get_yticklabels()]
+        assert any(re.search(r"\[.+\]", word, re.DOTALL) for word in (*words, *rows)), words
     assert len(figure.legends) == 1 and figure.legends[0].get_texts()
     render(figure, tmp_path)
 
@@ -127,17 +130,28 @@ def test_trajectories_with_more_positions_than_velocities_are_drawn() -> None:
     design = dataclasses.replace(design, initial=free(design.initial), final=free(design.final))
     labels = dataclasses.replace(make_labels(6, 3), qpos=tuple(f"q{i} [1]" for i in range(7)))
     assert len(plots.trajectories(design, labels).axes) == 7 + 6 + 1 + 1
+
+    # Where the labels name a quaternion, its rotation vector is drawn.
+    named = tuple(f"q{i}.{part} [1]" for i, part in enumerate(("x", "y", "z", *QUATERNION)))
+    labels = dataclasses.replace(labels, qpos=named)
+    assert len(plots.trajectories(design, labels).axes) == 6 + 6 + 1 + 1
     assert plots.sensitivity_phase(design, labels).axes
 
 
 def test_phase_plots_are_limited_in_number_and_say_so() -> None:
     figure = plots.sensitivity_phase(make_design(14, 30), make_labels(14, 30))
-    assert len(figure.axes) == 4 * 6
-    assert "4 of 14" in all_text(figure) and "6 of 30" in all_text(figure)
+    assert len(figure.axes) == 6
+    assert "6 of 420 pairs" in " ".join(all_text(figure).split())
+    for axes in figure.axes:
+        for ticks, ends in (
+            (axes.get_xticks(), axes.get_xlim()),
+            (axes.get_yticks(), axes.get_ylim()),
+        ):
+            assert sum(ends[0] <= tick <= ends[1] for tick in ticks) <= 4
 
 
 def test_phase_plots_do_not_draw_rounding_errors() -> None:
-    """A sensitivity far below that of the other degrees of freedom is replaced by a message."""
+    """A sensitivity far below the largest one has no panel."""
     design = make_design(2, 3)
     evaluations = {}
     for key in ("initial", "final"):
@@ -145,8 +159,39 @@ def test_phase_plots_do_not_draw_rounding_errors() -> None:
         psi[:, [0, 2], 1] *= 1e-9
         evaluations[key] = dataclasses.replace(getattr(design, key), sensitivity=psi)
 
+    assert len(plots.sensitivity_phase(design, make_labels(2, 3)).axes) == 6
     figure = plots.sensitivity_phase(dataclasses.replace(design, **evaluations), make_labels(2, 3))
-    assert all_text(figure).count("no sensitivity") == 1 + 1  # a panel and the note
+    assert len(figure.axes) == 5
+
+
+def test_the_units_of_a_figure_do_not_choose_its_phase_plots() -> None:
+    """A joint in other units has other sensitivities and other speeds."""
+    design = make_design(3, 4)
+    evaluations = {}
+    for key in ("initial", "final"):
+        evaluation = getattr(design, key)
+        psi, qvel = evaluation.sensitivity.copy(), evaluation.trajectory.qvel.copy()
+        psi[:, [1, 4]] *= 1e3
+        qvel[:, 1] *= 1e3
+        trajectory = dataclasses.replace(evaluation.trajectory, qvel=qvel)
+        evaluations[key] = dataclasses.replace(evaluation, sensitivity=psi, trajectory=trajectory)
+
+    other = dataclasses.replace(design, **evaluations)
+    labels = make_labels(3, 4)
+    names = [
+        [axes.get_xlabel().partition("\n")[0] for axes in plots.sensitivity_phase(d, labels).axes]
+        for d in (design, other)
+    ]
+    assert names[0] == names[1]
+
+
+def test_rotation_vectors_have_no_jumps() -> None:
+    """Three turns about an oblique axis are one straight line."""
+    angle = np.linspace(0.0, 6.0 * np.pi, 400)
+    axis = np.array([1.0, -2.0, 2.0]) / 3.0
+    turned = np.column_stack([np.cos(angle / 2.0), np.sin(angle / 2.0)[:, None] * axis])
+    flipped = turned * np.where(np.arange(400) % 2, 1.0, -1.0)[:, None]
+    np.testing.assert_allclose(rotation_vectors(flipped), angle[:, None] * axis, atol=1e-6)
 
 
 def test_histogram_reports_failed_trials_and_efficiency() -> None:
@@ -269,7 +314,7 @@ def test_fit_without_measurements_of_an_output(tmp_path: Path) -> None:
 
 def test_unnamed_output_shows_its_column() -> None:
     labels = dataclasses.replace(make_labels(2, 3), outputs={})
-    assert "qpos:joint_0\n[model unit]" in all_text(
+    assert "qpos:joint_0 [model unit]" in all_text(
         plots.fit(make_estimate(), 0, labels, [0.05, 0.05])
     )
 
@@ -434,3 +479,35 @@ def test_a_matplotlibrc_of_the_current_folder_changes_no_figure(tmp_path: Path) 
         pictures.append((folder / "figure.png").read_bytes())
 
     assert pictures[0] == pictures[1]
+
+
+# ---- limits
+
+
+def test_a_joint_has_one_colour_and_fast_curves_have_envelopes() -> None:
+    t = np.linspace(0.0, 1.0, 1000)
+    shares = {
+        ("position", "a"): 0.5 * t,
+        ("position", "b"): 0.999 * t,
+        ("force", "b"): 0.3 * np.sin(1000.0 * t),
+        ("force", "a"): 0.2 * np.sin(3.0 * t),
+    }
+    usage = tuple(
+        LimitUsage(kind=kind, name=name, t=t, share=share) for (kind, name), share in shares.items()
+    )
+    limits = {"position": 0.02, "force": 0.7}
+    design = dataclasses.replace(make_design(), usage=usage, limits=limits)
+    labels = dataclasses.replace(make_labels(2, 3), positions=("a [rad]", "b [rad]"))
+    figure = plots.limits(design, labels)
+
+    colours = joint_colours(design)
+    assert len(set(colours.values())) == 2
+    position, force = figure.axes
+    drawn = [to_hex(line.get_color()) for line in position.get_lines()]
+    assert set(colours.values()) <= set(drawn)
+    assert len(force.collections) == 1
+    assert to_hex(force.collections[0].get_facecolor()[0]) == colours["b"]
+
+    text = all_text(figure)
+    assert "position: smallest margin 0.020 rad" in text
+    assert "largest: b > 99 %, a 50 %" in text

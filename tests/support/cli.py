@@ -35,7 +35,7 @@ DESIGN = {
 # Files that `mjfim identify` writes.
 ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml", "tables.md", "tables.tex"}
 ESTIMATE = {*ESTIMATE_DATA, "report.html", "estimate.rrd"} | {
-    f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
+    f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions", "pairs", "trace")
 }
 
 # Files that `mjfim montecarlo` writes for the cart-pendulum.
@@ -43,6 +43,7 @@ STUDY = {
     "montecarlo.json",
     "montecarlo.npz",
     "report.html",
+    "overview.png",
     "histogram_m.png",
     "histogram_l.png",
     "histogram_c.png",

@@ -13,15 +13,21 @@ from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
 
-def make_labels(dofs: int, count: int) -> Labels:
-    """Make labels of a chain of hinges."""
-    joints = [f"joint_{i}" for i in range(dofs)]
+def padded(name: str, width: int) -> str:
+    """Lengthen a name in its middle to a number of characters, so that its ends differ."""
+    head, _, tail = name.partition("_")
+    return f"{head}_{'w' * max(width - len(name) - 1, 0)}_{tail}" if width > len(name) else name
+
+
+def make_labels(dofs: int, count: int, width: int = 0) -> Labels:
+    """Make labels of a chain of hinges, with names of at least `width` characters."""
+    joints = [padded(f"joint_{i}", width) for i in range(dofs)]
     return Labels(
         qpos=tuple(f"{j} [rad]" for j in joints),
         positions=tuple(f"{j} [rad]" for j in joints),
         velocities=tuple(f"{j} [rad/s]" for j in joints),
         controls=("torque [N m]",),
-        parameters=tuple(f"link_{j}.damping" for j in range(count)),
+        parameters=tuple(padded(f"link_{j}.damping", width) for j in range(count)),
         parameter_units=tuple(("N m s/rad", "kg", "")[j % 3] for j in range(count)),
         outputs={f"qpos:{j}": f"{j} [rad]" for j in joints},
     )

@@ -18,9 +18,6 @@ MAX_PARAMETERS = 8
 # Characters to which the names of parameters are shortened.
 PARAMETER_NAME_WIDTH = 18
 
-# Digits of the tick values of a logarithmic axis, from few to many ticks per decade.
-TICK_DIGITS = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8))
-
 
 @style.own_style
 def campaign_figure(campaign: Campaign, parameters: CampaignParameters) -> Figure:
@@ -36,8 +33,9 @@ def campaign_figure(campaign: Campaign, parameters: CampaignParameters) -> Figur
     for (left, right), j in zip(panels, shown, strict=True):
         name = style.shorten(parameters.names[j], PARAMETER_NAME_WIDTH)
         unit = parameters.units[j] or "model unit"
-        style.format_axes(left, ylabel=f"σ of {name} [{unit}]")
-        style.format_axes(right, ylabel=f"{name} [{unit}]")
+        guess = style.format_number(float(campaign.rounds[0].theta[j]), 4)
+        left.set_title(f"σ of {name} [{unit}]", loc="left")
+        right.set_title(f"{name} [{unit}], first design at {guess}", loc="left")
 
         true = None if parameters.true is None else float(parameters.true[j])
         _draw_std(left, campaign, j)
@@ -48,7 +46,6 @@ def campaign_figure(campaign: Campaign, parameters: CampaignParameters) -> Figur
     panels[0, 0].set_xlim(0.5, max(len(campaign.rounds), 2) + 0.5)
     for column in (0, 1):
         panels[-1, column].set_xlabel("round")
-        figure.align_ylabels(panels[:, column])
 
     title = f"{len(campaign.rounds)} rounds of design, recording and estimate"
     note = (
@@ -71,7 +68,7 @@ def _handles(*, simulated: bool) -> list[Line2D]:
     predicted = Line2D(
         [],
         [],
-        color=style.INITIAL_COLOUR,
+        color=style.DESIGNED_COLOUR,
         marker="o",
         markerfacecolor="white",
         linestyle="",
@@ -80,14 +77,14 @@ def _handles(*, simulated: bool) -> list[Line2D]:
     estimated = Line2D(
         [],
         [],
-        color=style.DESIGNED_COLOUR,
+        color=style.IDENTIFIED_COLOUR,
         marker="o",
         label="estimated after the round, from all recordings",
     )
     wanted = Line2D([], [], color=style.TEXT_COLOUR, linestyle="--", label="wanted")
     handles = [predicted, estimated, wanted]
     if simulated:
-        handles.append(Line2D([], [], color=style.MEASURED_COLOUR, label="true value"))
+        handles.append(Line2D([], [], color=style.TEXT_COLOUR, linewidth=1.0, label="true value"))
     return handles
 
 
@@ -102,14 +99,14 @@ def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
     axes.plot(
         rounds,
         predicted,
-        color=style.INITIAL_COLOUR,
+        color=style.DESIGNED_COLOUR,
         marker="o",
         markerfacecolor="white",
         linestyle="",
         markersize=8,
         zorder=2,
     )
-    axes.plot(rounds, attained, color=style.DESIGNED_COLOUR, marker="o", markersize=4, zorder=3)
+    axes.plot(rounds, attained, color=style.IDENTIFIED_COLOUR, marker="o", markersize=4, zorder=3)
 
     values = np.concatenate([predicted, attained, [wanted]])
     usable = values[np.isfinite(values) & (values > 0.0)]
@@ -119,7 +116,7 @@ def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
         _draw_target(axes, wanted)
 
     low, high = axes.get_ylim()
-    axes.set_yticks(_tick_values(low, high))
+    axes.set_yticks(style.log_ticks(low, high))
     axes.yaxis.set_major_formatter(lambda value, _: style.format_number(float(value), 1))
     axes.minorticks_off()
 
@@ -140,19 +137,6 @@ def _draw_target(axes: Axes, wanted: float) -> None:
     )
 
 
-def _tick_values(low: float, high: float) -> list[float]:
-    """Return round numbers on a logarithmic axis, so dense that at least two are within it."""
-    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    ticks: list[float] = []
-    for digits in TICK_DIGITS:
-        candidates = np.sort(np.outer(powers, digits).ravel())
-        within = (candidates >= low) & (candidates <= high)
-        ticks = candidates[within].tolist()
-        if len(ticks) >= 2:
-            break
-    return ticks
-
-
 def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -> None:
     """Draw the estimates of parameter j over the rounds, with the true value if it is known."""
     rounds = np.array([r.number for r in campaign.rounds])
@@ -161,7 +145,7 @@ def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -
     known = np.isfinite(std)
     bar = np.where(known, std, 0.0)
 
-    colour = style.DESIGNED_COLOUR
+    colour = style.IDENTIFIED_COLOUR
     axes.errorbar(rounds, theta, 2 * bar, color=colour, linestyle="", linewidth=0.9)
     axes.errorbar(
         rounds, theta, bar, color=colour, linestyle="", linewidth=2.4, marker="o", markersize=4
@@ -171,13 +155,4 @@ def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -
             low, high = theta[-1] - factor * bar[-1], theta[-1] + factor * bar[-1]
             axes.axhspan(low, high, color=colour, alpha=0.07, linewidth=0.0)
     if true is not None:
-        axes.axhline(true, color=style.MEASURED_COLOUR, linewidth=1.4)
-
-    guess = float(campaign.rounds[0].theta[j])
-    axes.set_title(
-        f"the first design assumes {style.format_number(guess, 4)}",
-        loc="right",
-        fontsize=style.SMALL_FONT,
-        color=style.MUTED_COLOUR,
-        pad=3,
-    )
+        axes.axhline(true, color=style.TEXT_COLOUR, linewidth=1.0)

@@ -4,118 +4,175 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.output.plots.style import (
-    DESIGNED_COLOUR,
     GRID_COLOUR,
-    INITIAL_COLOUR,
     MUTED_COLOUR,
-    NORMAL_FONT,
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
+    as_sentence,
     format_axes,
     format_percent,
     new_figure,
     own_style,
     shorten,
-    write_message,
+    text_width,
 )
 from mjfim.output.summaries.accuracy import BEST_CASE
-from mjfim.records.check import CONFOUNDED_CORRELATION, Check, ParameterCheck
+from mjfim.output.vocabulary import DESIGNED, INITIAL, MEASURED
+from mjfim.records.check import CONFOUNDED_CORRELATION, Check
 
 # Largest number of parameters for which correlations are written into the cells.
-MAX_WRITTEN_CELLS = 14
+MAX_WRITTEN_CELLS = 8
 
-# Largest number of parameters whose names and numbers are written in the usual size.
-MAX_USUAL_FONT = 30
+# Largest number of parameters whose names and numbers are written in the usual size, and the font
+# size of more [points].
+MAX_USUAL_FONT, MANY_ROWS_FONT = 30, 6.0
 
-# Font sizes for more parameters: of names beside the bars, and of names beside the cells [points].
-MANY_BARS_FONT, MANY_CELLS_FONT = 6.0, 5.5
+# Characters to which the names of parameters are shortened, beside the bars and below the cells.
+NAME_WIDTH, CELL_NAME_WIDTH = 26, 18
 
-# Characters to which the names of parameters beside the cells are shortened.
-CELL_NAME_WIDTH = 18
-
-# Sum of the characters of all names above which the names below the cells are turned upright.
-MAX_LEVEL_CHARACTERS = 24
+# Width that the cells have at least; names below them that need more are turned upright [inch].
+MATRIX_WIDTH = 3.6
 
 # Size of a correlation above which its cell is so dark that its number is white.
 DARK_CELL = 0.6
+
+# Height of a row, and of all that is above and below the rows [inch].
+ROW_HEIGHT, MANY_ROWS_HEIGHT, FRAME_HEIGHT = 0.3, 0.16, 2.4
+
+# Height of a bar as a share of the height of a row.
+BAR_HEIGHT = 0.6
+
+# Opacity of the bars of combinations.
+COMBINATION_OPACITY = 0.45
+
+# Colour of the cells of the diagonal, where a parameter meets itself.
+DIAGONAL_COLOUR = "#f1f2f3"
 
 
 @own_style
 def check_figure(check: Check) -> Figure:
     """Draw predicted and wanted relative standard deviations, and the correlation matrix.
 
+    Both have a row per parameter. Identifiable combinations have bars below the parameters.
+
     Args:
         check: The check.
     """
-    rows = [row for row in check.rows if not row.nuisance]
-    height = float(np.clip(2.2 + 0.32 * len(rows), 4.0, 16.0))
-    figure = new_figure(height)
-    left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.15])
-    _draw_standard_deviations(left, rows)
-    _draw_correlations(right, check)
+    count = len(check.wanted)
+    rows = count + len(check.combined)
+    row_height = ROW_HEIGHT if rows <= MAX_USUAL_FONT else MANY_ROWS_HEIGHT
+    figure = new_figure(FRAME_HEIGHT + row_height * rows)
+    has_correlations = bool(np.isfinite(check.correlation).any()) and count > 1
 
-    handles = [
-        Patch(color=INITIAL_COLOUR, label="predicted σ"),
+    if has_correlations:
+        left, right = figure.subplots(1, 2, sharey=True, width_ratios=[1.15, 1.0])
+        _draw_correlations(right, check)
+    else:
+        left = figure.subplots()
+    _draw_standard_deviations(left, check)
+
+    note = BEST_CASE
+    if not has_correlations and count > 1:
+        note = f"No parameter is identifiable alone, so there are no correlations. {note}"
+    verdict = check.verdict[0] if check.verdict else "all parameters are identifiable"
+    title = as_sentence(verdict.replace("`", "").removesuffix("."))
+    add_title(figure, title, _handles(check), note)
+    return figure
+
+
+def colour_of_source(check: Check) -> str:
+    """Return the colour of the motion that was checked.
+
+    Args:
+        check: The check.
+    """
+    if "recording" in check.source:
+        return MEASURED.colour
+    return DESIGNED.colour if "design" in check.source else INITIAL.colour
+
+
+def _handles(check: Check) -> list[Patch | Line2D]:
+    """Return the entries of the legend."""
+    colour = colour_of_source(check)
+    handles: list[Patch | Line2D] = [
+        Patch(color=colour, label=f"predicted σ, {check.source} ({check.horizon:g} s)"),
         Line2D(
             [], [], color=TEXT_COLOUR, marker="|", linestyle="", markersize=10, label="wanted σ"
         ),
-        Patch(
-            facecolor="white",
-            edgecolor=DESIGNED_COLOUR,
-            hatch="////",
-            label="not identifiable alone",
-        ),
     ]
-    verdict = "all parameters identifiable" if check.ok else "see the verdict in check.json"
-    title = f"Accuracy that {check.source} ({check.horizon:g} s) can give: {verdict}"
-    add_title(figure, title, handles, BEST_CASE)
-    return figure
+    if check.combined:
+        label = "identifiable combination"
+        handles.append(Patch(color=colour, alpha=COMBINATION_OPACITY, label=label))
+    if any(not np.isfinite(row.std) for row in check.rows if not row.nuisance):
+        handles.append(
+            Patch(
+                facecolor="white",
+                edgecolor=MUTED_COLOUR,
+                hatch="////",
+                label="not identifiable alone",
+            )
+        )
+    return handles
 
 
 # ---- standard deviations
 
 
-def _draw_standard_deviations(axes: Axes, rows: list[ParameterCheck]) -> None:
-    """Draw a bar per parameter and a mark at its wanted value.
+def _draw_standard_deviations(axes: Axes, check: Check) -> None:
+    """Draw a bar per parameter and combination, and a mark at the wanted value of a parameter.
 
     The bar is hatched where the parameter is not identifiable alone.
     """
-    relative_std = np.array([row.relative for row in rows])
+    rows = [row for row in check.rows if not row.nuisance]
+    combined = check.combined
+    of_combinations = [c.std_final / abs(c.value) if c.value else np.nan for c in combined]
+    relative_std = np.array([*(row.relative for row in rows), *of_combinations])
     wanted = np.array([row.wanted / row.size for row in rows])
     known = np.isfinite(relative_std) & (relative_std > 0.0)
 
     # The axis holds all bars and marks, and the numbers at its right end.
-    shown = np.concatenate([relative_std[known], wanted])
-    low = float(shown.min()) / 3.0
-    high = max(float(shown.max()) * 4.0, 0.2)
+    shown = np.concatenate([relative_std[known], wanted[np.isfinite(wanted) & (wanted > 0.0)]])
+    low, high = 1e-3, 1.0
+    if len(shown):
+        low, high = float(shown.min()) / 3.0, float(shown.max())
+        high *= (high / low) ** 0.35
 
-    format_axes(axes, "predicted standard deviation, relative to the parameter's size [–]")
+    format_axes(axes, "predicted σ, relative to the size of the parameter [%]")
     axes.set_xscale("log")
     axes.set_xlim(low, high)
-    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set_ylim(len(relative_std) - 0.5, -0.5)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{100.0 * value:g}")
+    axes.minorticks_off()
+    axes.grid(False, axis="y")
 
-    places = np.arange(len(rows))
-    axes.barh(places[known], relative_std[known], height=0.6, color=INITIAL_COLOUR)
-    axes.barh(
-        places[~known],
-        high,
-        height=0.6,
-        facecolor="white",
-        edgecolor=DESIGNED_COLOUR,
-        hatch="////",
-        linewidth=0.8,
-    )
+    colour = colour_of_source(check)
+    for place, value in enumerate(relative_std):
+        if not known[place]:
+            is_alone = place >= len(rows) or np.isfinite(rows[place].std)
+            axes.barh(
+                place,
+                high,
+                height=BAR_HEIGHT,
+                facecolor="white",
+                edgecolor=GRID_COLOUR if is_alone else MUTED_COLOUR,
+                hatch="" if is_alone else "////",
+                linewidth=0.5,
+            )
+            continue
+        opacity = 1.0 if place < len(rows) else COMBINATION_OPACITY
+        axes.barh(place, value, height=BAR_HEIGHT, color=colour, alpha=opacity)
     axes.plot(
         wanted,
-        places,
+        np.arange(len(rows)),
         linestyle="",
         marker="|",
         color=TEXT_COLOUR,
@@ -123,25 +180,28 @@ def _draw_standard_deviations(axes: Axes, rows: list[ParameterCheck]) -> None:
         markeredgewidth=1.6,
     )
 
-    few = len(rows) <= MAX_USUAL_FONT
+    few = len(relative_std) <= MAX_USUAL_FONT
     if few:
-        _write_percentages(axes, relative_std[known], places[known], high)
-    axes.grid(False, axis="y")
-    names = [shorten(row.name) for row in rows]
-    axes.set_yticks(places, names, fontsize=SMALL_FONT if few else MANY_BARS_FONT)
+        _write_percentages(axes, relative_std, known, colour)
+    names = [shorten(row.name, NAME_WIDTH) for row in rows]
+    names += [shorten(combination.expression, NAME_WIDTH) for combination in combined]
+    size = SMALL_FONT if few else MANY_ROWS_FONT
+    axes.set_yticks(range(len(names)), names, fontsize=size)
+    axes.tick_params(axis="y", length=0.0)
 
 
-def _write_percentages(axes: Axes, relative_std: Array, places: Array, right: float) -> None:
-    """Write relative standard deviations (n,) at the rows `places` (n,), aligned at `right`."""
-    for value, place in zip(relative_std, places, strict=True):
+def _write_percentages(axes: Axes, relative_std: Array, known: Array, colour: str) -> None:
+    """Write the known relative standard deviations (n,) at the right end of their rows."""
+    for place in np.flatnonzero(known):
         axes.text(
-            right,
-            place,
-            format_percent(float(value)),
+            0.99,
+            float(place),
+            format_percent(float(relative_std[place])),
+            transform=axes.get_yaxis_transform(),
             ha="right",
             va="center",
             fontsize=SMALL_FONT,
-            color=INITIAL_COLOUR,
+            color=colour,
         )
 
 
@@ -149,57 +209,55 @@ def _write_percentages(axes: Axes, relative_std: Array, places: Array, right: fl
 
 
 def _draw_correlations(axes: Axes, check: Check) -> None:
-    """Draw the correlation matrix of the estimates as coloured cells."""
-    # Of many parameters, only those that are identifiable alone have a row.
-    indices = np.arange(len(check.wanted))
-    if len(indices) > MAX_WRITTEN_CELLS:
-        indices = np.flatnonzero(np.isfinite(np.diag(check.correlation)))
-    correlation = check.correlation[np.ix_(indices, indices)]
-    names = [shorten(check.wanted[i], CELL_NAME_WIDTH) for i in indices]
+    """Draw the correlation matrix of the estimates as coloured cells, beside the bars."""
+    count = len(check.wanted)
+    correlation = np.array(check.correlation)
+    unknown = ~np.isfinite(correlation)
+    np.fill_diagonal(correlation, np.nan)
 
-    if not np.isfinite(correlation).any():
-        axes.set_axis_off()
-        write_message(axes, "no parameter is identifiable alone:\nthere are no correlations")
-        return
-
-    image = axes.imshow(np.ma.masked_invalid(correlation), cmap="RdBu_r", vmin=-1.0, vmax=1.0)
-    axes.set_facecolor(GRID_COLOUR)
-    _name_cells(axes, names)
-    if len(names) <= MAX_WRITTEN_CELLS:
+    axes.imshow(
+        np.ma.masked_invalid(correlation), cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto"
+    )
+    _shade(axes, unknown, GRID_COLOUR)
+    _shade(axes, np.eye(count, dtype=bool) & ~unknown, DIAGONAL_COLOUR)
+    if count <= MAX_WRITTEN_CELLS:
         _write_correlations(axes, correlation)
     else:
         _mark_confounded(axes, correlation)
-    _add_colour_bar(axes, image)
 
-    mark = "bold" if len(names) <= MAX_WRITTEN_CELLS else "dots"
-    title = f"correlations; {mark}: above {CONFOUNDED_CORRELATION:g}, hardly distinguishable"
-    if np.isnan(correlation).any():
-        title += "; grey: not identifiable alone"
-    axes.set_title(title, fontsize=SMALL_FONT, color=MUTED_COLOUR)
-
-
-def _name_cells(axes: Axes, names: list[str]) -> None:
-    """Write the names of the parameters beside and below the cells."""
-    count = len(names)
-    font = SMALL_FONT if count <= MAX_USUAL_FONT else MANY_CELLS_FONT
-    upright = sum(len(name) for name in names) > MAX_LEVEL_CHARACTERS
-
+    names = [shorten(name, CELL_NAME_WIDTH) for name in check.wanted]
+    font = SMALL_FONT if count <= MAX_USUAL_FONT else MANY_ROWS_FONT
+    upright = max(text_width(name) for name in names) > MATRIX_WIDTH / count
     axes.set_xticks(range(count), names, fontsize=font, rotation=90 if upright else 0)
-    axes.set_yticks(range(count), names, fontsize=font)
-    axes.tick_params(length=0.0)
+    axes.tick_params(length=0.0, labelleft=False)
     axes.spines[:].set_visible(False)
+    axes.grid(False)
+
+    mark = "bold" if count <= MAX_WRITTEN_CELLS else "dot"
+    title = "correlation (red: positive, blue: negative)\n"
+    title += f"{mark}: beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
+    if unknown.any():
+        title += "\ngrey: not identifiable alone"
+    axes.set_title(title, loc="left", fontsize=SMALL_FONT, color=MUTED_COLOUR)
+
+
+def _shade(axes: Axes, cells: NDArray[np.bool_], colour: str) -> None:
+    """Fill the cells that are true in (n, n) with a colour."""
+    image = np.ma.masked_equal(np.asarray(cells, dtype=np.float64), 0.0)
+    if image.count():
+        axes.imshow(image, cmap=ListedColormap([colour]), aspect="auto")
 
 
 def _write_correlations(axes: Axes, correlation: Array) -> None:
-    """Write the finite correlations (n, n) into their cells, except the diagonal."""
+    """Write the finite correlations (n, n) into their cells."""
     for (i, j), value in np.ndenumerate(correlation):
-        if i == j or not np.isfinite(value):
+        if not np.isfinite(value):
             continue
         confounded = abs(value) > CONFOUNDED_CORRELATION
         axes.text(
             j,
             i,
-            f"{value:+.2f}",
+            f"{value:+.2f}".replace("-", "−"),
             ha="center",
             va="center",
             fontsize=SMALL_FONT,
@@ -211,15 +269,5 @@ def _write_correlations(axes: Axes, correlation: Array) -> None:
 def _mark_confounded(axes: Axes, correlation: Array) -> None:
     """Draw a dot into each cell of `correlation` (n, n) with hardly distinguishable parameters."""
     # Comparisons with NaN are false.
-    confounded = np.abs(correlation) > CONFOUNDED_CORRELATION
-    np.fill_diagonal(confounded, False)
-
-    rows, columns = np.nonzero(confounded)
-    axes.plot(columns, rows, linestyle="", marker="o", color=TEXT_COLOUR, markersize=2.0)
-
-
-def _add_colour_bar(axes: Axes, image: AxesImage) -> None:
-    """Add a bar that says which colour stands for which correlation."""
-    bar = axes.figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02)
-    bar.set_label("correlation of the estimates", fontsize=NORMAL_FONT, color=TEXT_COLOUR)
-    bar.ax.tick_params(labelsize=SMALL_FONT, color=MUTED_COLOUR)
+    rows, columns = np.nonzero(np.abs(correlation) > CONFOUNDED_CORRELATION)
+    axes.plot(columns, rows, linestyle="", marker="o", color="white", markersize=3.0)

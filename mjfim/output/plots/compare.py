@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -66,6 +66,7 @@ def compare_figure(comparison: Comparison) -> Figure:
         comparison: The comparison.
     """
     count = len(comparison.wanted)
+    comparison = replace(comparison, rows=tuple(sorted(comparison.rows, key=_rank)))
     height = float(np.clip(1.9 + 0.36 * len(comparison.rows), 3.2, 12.0))
     cells_width = float(np.clip(0.55 * count, 2.2, 9.0))
 
@@ -76,10 +77,17 @@ def compare_figure(comparison: Comparison) -> Figure:
 
     note = (
         f"{' '.join(comparison.verdict)} Each method had {budget_in_words(comparison)}. "
-        "Predicted standard deviations are the best case."
+        "Predicted standard deviations are the best case. Sorted by J, best first. In grey: the "
+        "smallest margin of all limits, as a share of half of the limit's range, and its kind; "
+        "negative: the limit is violated."
     )
     add_title(figure, "The design compared with other methods", _handles(comparison), note)
     return figure
+
+
+def _rank(row: MethodResult) -> tuple[bool, float]:
+    """Return a key by which methods are sorted: the best first, those of no use last."""
+    return not row.sound, row.cost if np.isfinite(row.cost) else np.inf
 
 
 def _handles(comparison: Comparison) -> list[Patch]:
@@ -187,6 +195,7 @@ def _draw_cells(axes: Axes, comparison: Comparison) -> None:
     _name_methods(axes, comparison)
     axes.tick_params(length=0.0)
     axes.spines[:].set_visible(False)
+    axes.grid(False)
     axes.set_title(ratios.title, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
 
     # Numbers of many parameters would not fit into the cells.
@@ -261,11 +270,11 @@ def _draw_worst_combination(axes: Axes, comparison: Comparison) -> None:
     worst = np.array([row.worst_relative_std for row in rows])
     known = worst[np.isfinite(worst)]
 
-    format_axes(axes, "standard deviation relative to the parameters' scales [–]")
+    format_axes(axes, "σ over the scales [–]")
     axes.grid(False, axis="y")
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_yticks([])
-    title = "σ of the worst combination, and smallest margin of all limits"
+    title = "σ of the worst combination"
     axes.set_title(title, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
     if not len(known):
         write_message(axes, "no method found a usable control")

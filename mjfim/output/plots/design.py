@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import per_second
+from mjfim.output.plots.positions import shown_positions
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     GRID_COLOUR,
@@ -22,33 +23,44 @@ from mjfim.output.plots.style import (
     TEXT_COLOUR,
     add_title,
     as_sentence,
-    break_before_unit,
+    fit_label,
     format_axes,
     format_number,
     new_figure,
     own_style,
+    panel_width,
     quotient_unit,
+    scale_axis,
     shorten,
     trajectory_handles,
     write_message,
 )
-from mjfim.records.design import Design, Evaluation
+from mjfim.records.design import Design
 from mjfim.records.labels import Labels
 
-# Largest number of panels of the trajectories that stand in two columns; more stand in four.
-MAX_PANELS_IN_TWO_COLUMNS = 9
+# Number of panels of the trajectories side by side.
+PANEL_COLUMNS = 4
 
-# Largest number of parameters and of degrees of freedom in the phase plots of the sensitivities.
-MAX_PHASE_PARAMETERS, MAX_PHASE_DOFS = 6, 4
+# Largest number of intervals between the ticks of a panel.
+MAX_TIME_TICKS, MAX_PANEL_TICKS = 5, 4
 
-# Largest number of intervals between the ticks of the horizontal axis of a phase plot.
-MAX_PHASE_TICKS = 5
+# Widths of the lines of the initial and of the designed trajectory [points].
+LINE_WIDTHS = (1.1, 1.6)
 
-# Characters to which the names of parameters are shortened in the phase plots.
-PARAMETER_NAME_WIDTH = 18
+# Background of the panels of controls.
+CONTROL_BACKGROUND = "#f1f2f3"
 
-# Share of the largest sensitivity to a parameter below which a sensitivity is a rounding error.
-NEGLIGIBLE_SENSITIVITY = 1e-7
+# Largest number of phase plots, and of those side by side.
+MAX_PHASE_PLOTS, PHASE_COLUMNS = 6, 3
+
+# Largest number of intervals between the ticks of a phase plot, which has one tick more at most.
+MAX_PHASE_TICKS = 3
+
+# Characters to which the names of coordinates and parameters are shortened in the phase plots.
+PHASE_NAME_WIDTH = 16
+
+# Share of the largest sensitivity below which a sensitivity is a rounding error.
+NEGLIGIBLE_SENSITIVITY = 1e-6
 
 # Ratio of the designed to the initial loop of sensitivities above which the initial one is drawn
 # enlarged.
@@ -61,19 +73,27 @@ ENLARGED_LOOP_HEIGHT = 0.62
 # ---- trajectories
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Panel:
-    """One panel of the trajectories.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Group:
+    """Panels of one kind of quantity; they stand in rows of their own.
 
     Attributes:
-        quantity: Field of the trajectory: "qpos", "qvel" or "ctrl".
-        column: Column of that field.
-        label: Label `name [unit]`.
+        name: Name of the kind.
+        labels: Label `name [unit]` of every column.
+        initial: (n, columns) values along the initial trajectory.
+        designed: (n, columns) values along the designed trajectory.
+        held: True for values that are held from each sample to the next.
     """
 
-    quantity: str
-    column: int
-    label: str
+    name: str
+    labels: tuple[str, ...]
+    initial: Array
+    designed: Array
+    held: bool = False
+
+    def rows(self, columns: int) -> int:
+        """Return the number of rows of panels, for a number of columns."""
+        return -(-len(self.labels) // columns)
 
 
 @own_style
@@ -95,85 +115,82 @@ def trajectories(design: Design, labels: Labels) -> Figure:
         velocities=trajectory.qvel.shape[1],
         controls=trajectory.ctrl.shape[1],
     )
-    panels = _state_panels(labels)
-    columns = 2 if len(panels) <= MAX_PANELS_IN_TWO_COLUMNS else 4
-    rows = len(panels) // columns + 1
+    groups = [group for group in _groups(design, labels) if group.labels]
+    columns = min(PANEL_COLUMNS, max(len(group.labels) for group in groups))
+    rows = sum(group.rows(columns) for group in groups) + 1
+    figure = new_figure(1.15 * rows + 1.7)
+    grid = figure.add_gridspec(rows, columns, height_ratios=[1.0] * (rows - 1) + [1.6])
 
-    figure = new_figure(1.55 * rows + 0.9)
-    grid = figure.add_gridspec(rows, columns)
-    first: Axes | None = None
-    for k, panel in enumerate(panels):
-        axes = figure.add_subplot(grid[divmod(k, columns)], sharex=first)
-        first = first or axes
-        _draw_state(axes, design, panel)
+    row = 0
+    for group in groups:
+        for k in range(len(group.labels)):
+            down, column = divmod(k, columns)
+            axes = figure.add_subplot(grid[row + down, column])
+            _draw_panel(axes, design, group, k)
+            format_axes(axes, ylabel=group.name if column == 0 else "")
+            axes.yaxis.label.set_fontweight("bold")
+        row += group.rows(columns)
 
-        in_last_row = k // columns == rows - 1
-        format_axes(axes, ylabel=break_before_unit(panel.label))
-        axes.tick_params(labelbottom=in_last_row)
-        axes.set_xlabel("time [s]" if in_last_row else "")
-
-    # The information takes the rest of the last row.
-    axes = figure.add_subplot(grid[rows - 1, len(panels) % columns :], sharex=first)
+    # The information has the last row.
+    axes = figure.add_subplot(grid[rows - 1, :])
     _draw_information(axes, design)
-    format_axes(
-        axes, "time [s]", r"$\sqrt{\lambda_{\min}}$  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]"
-    )
+    format_axes(axes, "time [s]", "information")
+    axes.yaxis.label.set_fontweight("bold")
+    root = r"$\sqrt{\lambda_{\min}}$ up to each time"
+    axes.set_title(root + r"  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]", loc="left")
 
     note = (
         "λ_min: smallest eigenvalue of the Fisher information up to time t, divided by the "
-        "measurement rate."
+        "measurement rate. All horizontal axes: time [s]. Grey background: controls."
     )
-    add_title(
-        figure, "Trajectories and the information that they gather", trajectory_handles(), note
-    )
+    title = "Trajectories and the information that they gather"
+    add_title(figure, title, trajectory_handles(), note)
     return figure
 
 
-def _state_panels(labels: Labels) -> list[_Panel]:
-    """Return a panel for every state and control.
-
-    Positions and velocities alternate if there are equally many.
-    """
-    positions = _panels("qpos", labels.qpos)
-    velocities = _panels("qvel", labels.velocities)
-    controls = _panels("ctrl", labels.controls)
-
-    if len(positions) != len(velocities):
-        return [*positions, *velocities, *controls]
-    states = []
-    for position, velocity in zip(positions, velocities, strict=True):
-        states += [position, velocity]
-    return [*states, *controls]
-
-
-def _panels(quantity: str, labels: tuple[str, ...]) -> list[_Panel]:
-    """Return a panel for every column of a field of the trajectory."""
-    return [_Panel(quantity=quantity, column=i, label=label) for i, label in enumerate(labels)]
+def _groups(design: Design, labels: Labels) -> list[_Group]:
+    """Return the panels of positions, velocities and controls."""
+    initial, designed = design.initial.trajectory, design.final.trajectory
+    names, both = shown_positions(labels, initial.qpos, designed.qpos)
+    velocities = tuple(label.replace(" velocity [", " [") for label in labels.velocities)
+    controls = tuple(label.replace(" (control)", " [model unit]") for label in labels.controls)
+    return [
+        _Group(name="positions", labels=names, initial=both[0], designed=both[1]),
+        _Group(name="velocities", labels=velocities, initial=initial.qvel, designed=designed.qvel),
+        _Group(
+            name="controls",
+            labels=controls,
+            initial=initial.ctrl,
+            designed=designed.ctrl,
+            held=True,
+        ),
+    ]
 
 
-def _styled_evaluations(design: Design) -> tuple[tuple[Evaluation, str, float], ...]:
-    """Return both evaluations of a design, each with its colour and its line width [points]."""
-    return (design.initial, INITIAL_COLOUR, 1.5), (design.final, DESIGNED_COLOUR, 1.7)
-
-
-def _draw_state(axes: Axes, design: Design, panel: _Panel) -> None:
-    """Draw one coordinate or control of both trajectories over time."""
-    for evaluation, colour, width in _styled_evaluations(design):
-        trajectory = evaluation.trajectory
-        values = getattr(trajectory, panel.quantity)[:, panel.column]
-
-        # A control is held from each sample to the next.
-        if panel.quantity == "ctrl":
-            axes.stairs(
-                values, trajectory.t, baseline=None, color=colour, linewidth=width, snap=False
-            )
+def _draw_panel(axes: Axes, design: Design, group: _Group, k: int) -> None:
+    """Draw column k of a group along both trajectories."""
+    times = design.initial.trajectory.t, design.final.trajectory.t
+    both = group.initial, group.designed
+    colours = (INITIAL_COLOUR, DESIGNED_COLOUR)
+    for t, values, colour, width in zip(times, both, colours, LINE_WIDTHS, strict=True):
+        if group.held:
+            axes.stairs(values[:, k], t, baseline=None, color=colour, linewidth=width, snap=False)
         else:
-            axes.plot(trajectory.t, values, color=colour, linewidth=width)
+            axes.plot(t, values[:, k], color=colour, linewidth=width)
+
+    label = fit_label(group.labels[k], panel_width(PANEL_COLUMNS), SMALL_FONT)
+    axes.set_title(label, loc="left", fontsize=SMALL_FONT, pad=3)
+    axes.locator_params(axis="x", nbins=MAX_TIME_TICKS)
+    axes.locator_params(axis="y", nbins=MAX_PANEL_TICKS)
+    if group.held:
+        axes.set_facecolor(CONTROL_BACKGROUND)
 
 
 def _draw_information(axes: Axes, design: Design) -> None:
     """Draw the root of the smallest eigenvalue up to each time, with its last value."""
-    for evaluation, colour, width in _styled_evaluations(design):
+    evaluations = (design.initial, design.final)
+    colours = (INITIAL_COLOUR, DESIGNED_COLOUR)
+    for evaluation, colour, width in zip(evaluations, colours, LINE_WIDTHS, strict=True):
         t = evaluation.trajectory.t
         root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
         axes.plot(t, root, color=colour, linewidth=width)
@@ -192,11 +209,22 @@ def _draw_information(axes: Axes, design: Design) -> None:
 # ---- sensitivities
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Loop:
+    """A phase plot: the sensitivity of one degree of freedom to one parameter.
+
+    Attributes:
+        dof: Number of the degree of freedom.
+        parameter: Number of the parameter.
+    """
+
+    dof: int
+    parameter: int
+
+
 @own_style
 def sensitivity_phase(design: Design, labels: Labels) -> Figure:
-    """Draw phase plots of the sensitivities psi (the paper's figure 3).
-
-    There is a row per degree of freedom and a column per parameter.
+    """Draw phase plots of the largest sensitivities psi (the paper's figure 3).
 
     Args:
         design: The design.
@@ -208,33 +236,32 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
     nv = design.trajectory.qvel.shape[1]
     count = len(design.theta)
     labels.check(positions=nv, velocities=nv, parameters=count)
-    dofs = _most_sensitive_dofs(design, nv)
-    parameters = _least_known_parameters(design)
+    relative = _relative_sensitivities(design)
+    loops = _shown_loops(design, relative)
 
-    figure = new_figure(2.6 * len(dofs) + 0.9)
-    grid = figure.add_gridspec(len(dofs), len(parameters))
-    for row, dof in enumerate(dofs):
-        for column, j in enumerate(parameters):
-            axes = figure.add_subplot(grid[row, column])
-            _label_phase_axes(axes, labels, int(dof), int(j))
-            if _is_insensitive(design, int(dof), int(j)):
-                write_message(axes, "no sensitivity")
-                axes.set(xticks=[], yticks=[])
-                continue
+    columns = min(max(len(loops), 1), PHASE_COLUMNS)
+    rows = max(-(-len(loops) // columns), 1)
+    figure = new_figure(2.75 * rows + 1.0)
+    grid = figure.add_gridspec(rows, columns)
+    for k, loop in enumerate(loops):
+        axes = figure.add_subplot(grid[divmod(k, columns)])
+        curves = _curves(design, loop)
+        _draw_loops(axes, curves)
+        _label_phase_axes(axes, labels, loop, curves)
+        _enlarge_initial_loop(axes, curves)
+    if not loops:
+        write_message(figure.add_subplot(grid[0, 0]), "the motion depends on no parameter")
 
-            loops = _loops(design, int(dof), int(j))
-            _draw_loops(axes, loops)
-            _enlarge_initial_loop(axes, loops)
-
+    total = int(np.count_nonzero(relative > NEGLIGIBLE_SENSITIVITY * relative.max(initial=0.0)))
     note = (
         "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative. "
         "A blue box shows the initial curve enlarged."
     )
-    if len(dofs) < nv or len(parameters) < count:
+    if len(loops) < total:
         note += (
-            f" Shown: {len(dofs)} of {nv} degrees of freedom (most sensitive), "
-            f"{len(parameters)} of {count} parameters (largest predicted relative standard "
-            "deviation)."
+            f" Shown: {len(loops)} of {total} pairs of a degree of freedom and a parameter: the "
+            "parameters with the largest predicted relative standard deviations, and what moves "
+            "most with them."
         )
     start = Line2D(
         [], [], color=TEXT_COLOUR, marker="o", markersize=3.5, linestyle="", label="start"
@@ -242,6 +269,42 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
     handles = [*trajectory_handles(), start]
     add_title(figure, "Sensitivity of the motion to each parameter", handles, note)
     return figure
+
+
+def _relative_sensitivities(design: Design) -> Array:
+    """Return how much each degree of freedom reacts to relative changes of each parameter.
+
+    Changes of velocities are relative to the largest velocity, so that units do not matter.
+
+    Returns:
+        (nv, p) largest changes over time [1].
+    """
+    nv = design.trajectory.qvel.shape[1]
+    change = np.abs(design.final.sensitivity[:, nv : 2 * nv] * design.sizes).max(axis=0)
+    speed = np.abs(design.trajectory.qvel).max(axis=0)
+    relative = change / np.where(speed > 0.0, speed, np.inf)[:, None]
+    return np.asarray(relative, dtype=np.float64)
+
+
+def _shown_loops(design: Design, relative: Array) -> list[_Loop]:
+    """Return the phase plots to draw, by parameter; those of rounding errors are left out.
+
+    Args:
+        design: The design.
+        relative: (nv, p) relative sensitivities.
+    """
+    parameters = [int(j) for j in _least_known_parameters(design)]
+    negligible = NEGLIGIBLE_SENSITIVITY * relative.max(initial=0.0)
+    most_sensitive = {j: np.argsort(-relative[:, j], kind="stable") for j in parameters}
+
+    # The most sensitive degree of freedom of each parameter, then the second one, and so on.
+    chosen = []
+    for rank in range(len(relative)):
+        for j in parameters:
+            dof = int(most_sensitive[j][rank])
+            if relative[dof, j] > negligible:
+                chosen.append(_Loop(dof=dof, parameter=j))
+    return sorted(chosen[:MAX_PHASE_PLOTS], key=lambda loop: (loop.parameter, loop.dof))
 
 
 def _least_known_parameters(design: Design) -> NDArray[np.intp]:
@@ -257,55 +320,33 @@ def _least_known_parameters(design: Design) -> NDArray[np.intp]:
     relative_std = np.where(np.isfinite(std), std, 0.0) / sizes
 
     descending = np.argsort(-relative_std[wanted], kind="stable")
-    return np.sort(wanted[descending][:MAX_PHASE_PARAMETERS])
+    return np.sort(wanted[descending][:MAX_PHASE_PLOTS])
 
 
-def _most_sensitive_dofs(design: Design, nv: int) -> NDArray[np.intp]:
-    """Return the degrees of freedom that react most to relative changes of the parameters.
-
-    Their numbers are in ascending order.
-    """
-    psi = design.final.sensitivity[:, :nv]
-    relative_psi = np.abs(psi * design.sizes)
-
-    largest = relative_psi.max(axis=(0, 2))
-    descending = np.argsort(-largest, kind="stable")
-    return np.sort(descending[:MAX_PHASE_DOFS])
-
-
-def _loops(design: Design, dof: int, j: int) -> tuple[Array, Array]:
-    """Return the sensitivities of position and velocity of a degree of freedom to parameter j.
+def _curves(design: Design, loop: _Loop) -> tuple[Array, Array]:
+    """Return the sensitivities of position and velocity along both trajectories.
 
     Returns:
         (N+1, 2) of the initial and of the designed trajectory [x-unit / theta-unit].
     """
     nv = design.trajectory.qvel.shape[1]
-    columns = [dof, nv + dof]
-    return design.initial.sensitivity[:, columns, j], design.final.sensitivity[:, columns, j]
+    columns = [loop.dof, nv + loop.dof]
+    initial, designed = design.initial.sensitivity, design.final.sensitivity
+    return initial[:, columns, loop.parameter], designed[:, columns, loop.parameter]
 
 
-def _is_insensitive(design: Design, dof: int, j: int) -> bool:
-    """Return whether a degree of freedom reacts to parameter j by rounding errors only."""
-    largest = max(
-        np.abs(evaluation.sensitivity[..., j]).max()
-        for evaluation in (design.initial, design.final)
-    )
-    of_dof = max(np.abs(loop).max() for loop in _loops(design, dof, j))
-    return bool(of_dof <= NEGLIGIBLE_SENSITIVITY * largest)
-
-
-def _draw_loops(axes: Axes, loops: tuple[Array, Array]) -> None:
+def _draw_loops(axes: Axes, curves: tuple[Array, Array]) -> None:
     """Draw both loops; the initial one lies on top, because it is the smaller one."""
-    initial, designed = loops
+    initial, designed = curves
     axes.plot(*initial.T, color=INITIAL_COLOUR, linewidth=1.5, zorder=3)
     axes.plot(*designed.T, color=DESIGNED_COLOUR, linewidth=1.7, zorder=2)
     axes.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=3.5, zorder=4)
-    axes.locator_params(axis="x", nbins=MAX_PHASE_TICKS)
+    axes.locator_params(nbins=MAX_PHASE_TICKS)
 
 
-def _enlarge_initial_loop(axes: Axes, loops: tuple[Array, Array]) -> None:
+def _enlarge_initial_loop(axes: Axes, curves: tuple[Array, Array]) -> None:
     """Draw a tiny initial loop once more, enlarged, in a box above the other one."""
-    initial, designed = loops
+    initial, designed = curves
     initial_extent = np.ptp(initial, axis=0)
     designed_extent = np.ptp(designed, axis=0)
     tiny = (ENLARGING_RATIO * initial_extent < designed_extent).all()
@@ -320,28 +361,30 @@ def _enlarge_initial_loop(axes: Axes, loops: tuple[Array, Array]) -> None:
     box = axes.inset_axes((0.2, 0.72, 0.6, 0.27))
     box.plot(*initial.T, color=INITIAL_COLOUR, linewidth=1.2)
     box.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=2.5)
-    box.tick_params(
-        labelsize=SMALL_FONT - 2.5,
-        color=MUTED_COLOUR,
-        labelcolor=MUTED_COLOUR,
-        length=2,
-        pad=1.5,
+    box.set(xticks=[], yticks=[])
+    box.spines[:].set(visible=True, color=INITIAL_COLOUR, linewidth=0.7)
+    times = format_number(float((designed_extent / initial_extent).min()), 2)
+    box.set_title(
+        f"initial: 1/{times} of the size", fontsize=SMALL_FONT - 1.5, color=INITIAL_COLOUR, pad=2
     )
-    box.locator_params(nbins=3)
-    box.spines[:].set_color(INITIAL_COLOUR)
-    box.spines[:].set_linewidth(0.7)
 
 
-def _label_phase_axes(axes: Axes, labels: Labels, dof: int, j: int) -> None:
-    """Label the axes with the derivatives of position and velocity with respect to parameter j."""
-    name, unit = split_unit(labels.positions[dof])
-    parameter = shorten(labels.parameters[j], PARAMETER_NAME_WIDTH)
-    divisor = labels.parameter_units[j]
-    format_axes(
-        axes,
-        f"∂{name}/∂{parameter}\n[{quotient_unit(unit, divisor)}]",
-        f"∂{name}′/∂{parameter}\n[{quotient_unit(per_second(unit), divisor)}]",
-    )
+def _label_phase_axes(axes: Axes, labels: Labels, loop: _Loop, curves: tuple[Array, Array]) -> None:
+    """Label the axes with the derivatives of position and velocity; units have a power of ten."""
+    name, unit = split_unit(labels.positions[loop.dof])
+    divisor = labels.parameter_units[loop.parameter]
+    parameter = shorten(labels.parameters[loop.parameter], PHASE_NAME_WIDTH)
+    name = shorten(name, PHASE_NAME_WIDTH)
+    units = quotient_unit(unit, divisor), quotient_unit(per_second(unit), divisor)
+
+    texts = []
+    for axis, mark, quotient, column in zip(
+        (axes.xaxis, axes.yaxis), ("", "′"), units, (0, 1), strict=True
+    ):
+        largest = max(float(np.abs(curve[:, column]).max(initial=0.0)) for curve in curves)
+        power = scale_axis(axis, largest)
+        texts.append(f"∂{name}{mark}/∂{parameter}\n[{power}{quotient}]")
+    format_axes(axes, *texts)
 
 
 # ---- convergence

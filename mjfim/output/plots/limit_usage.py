@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
+from mjfim.arrays import Array
 from mjfim.excitation.constraints import SUBSTEP_KINDS
+from mjfim.model.coordinates import split_unit
+from mjfim.model.units import LENGTH, per_second
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     GRID_COLOUR,
     MUTED_COLOUR,
+    NORMAL_FONT,
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
@@ -18,86 +23,115 @@ from mjfim.output.plots.style import (
     format_number,
     new_figure,
     own_style,
+    panel_width,
     shorten,
+    text_width,
 )
 from mjfim.records.design import Design, LimitUsage
+from mjfim.records.labels import Labels
 
 # Kinds of limits in the order of their panels.
 LIMIT_KINDS = (*SUBSTEP_KINDS, "control", "control_rate", "clearance")
 
-# Colours of the curves that come closest to a bound, the closest first; these curves are named in
-# the legend.
-NAMED_COLOURS = (DESIGNED_COLOUR, "#ee7733", "#aa3377")
+# Largest number of panels that are as wide as the figure.
+MAX_WIDE_PANELS = 3
 
-# Characters to which the names of curves are shortened.
-CURVE_NAME_WIDTH = 24
+# Colours of the joints; they differ also for readers who cannot tell red from green.
+JOINT_COLOURS = (
+    "#4477aa",
+    "#ee6677",
+    "#228833",
+    "#ccbb44",
+    "#66ccee",
+    "#aa3377",
+    "#332288",
+    "#999933",
+    "#882255",
+    "#44aa99",
+    "#dd8844",
+    "#555555",
+)
+
+# Number of curves of a panel that are named with their shares, those closest to a bound.
+NAMED_CURVES = 3
+
+# Characters to which the names of curves are shortened, in the panels and in the legend.
+CURVE_NAME_WIDTH, LEGEND_NAME_WIDTH = 18, 24
+
+# Number of turning points above which a curve would be a solid area; its envelope is drawn instead.
+MAX_TURNS = 120
+
+# Number of intervals of time of which an envelope shows the smallest and the largest value.
+ENVELOPE_INTERVALS = 150
 
 
 @own_style
-def limits(design: Design) -> Figure:
-    """Draw a panel per kind of limit; the curves that come closest to a bound are named.
+def limits(design: Design, labels: Labels) -> Figure:
+    """Draw a panel per kind of limit; a joint has the same colour in all of them.
 
     Args:
         design: A design with limits.
+        labels: Labels of the model's columns, which have the units.
     """
     kinds = [kind for kind in LIMIT_KINDS if any(usage.kind == kind for usage in design.usage)]
-    columns = 2 if len(kinds) > 1 else 1
+    columns = 2 if len(kinds) > MAX_WIDE_PANELS else 1
     rows = -(-len(kinds) // columns)
+    colours = joint_colours(design)
 
-    figure = new_figure(2.1 * rows + 0.9)
+    figure = new_figure(2.0 * rows + 1.3)
     grid = figure.add_gridspec(rows, columns)
+    has_envelope = False
     for i, kind in enumerate(kinds):
         axes = figure.add_subplot(grid[divmod(i, columns)])
-        lowest = i + columns >= len(kinds)
-        _draw_kind(axes, design, kind, "time [s]" if lowest else "")
+        curves = [usage for usage in design.usage if usage.kind == kind]
+        _draw_curves(axes, curves, colours)
+        _draw_bounds(axes, curves, one_sided=kind == "clearance")
+        _label(axes, curves, _margin_in_words(design, kind, labels), panel_width(columns))
+        axes.set_xlabel("time [s]" if i + columns >= len(kinds) else "")
+        has_envelope |= any(_would_be_solid(usage) for usage in curves)
 
     note = (
-        "All engine steps of the stated model, relative to the bounds at ±1; grey: beyond a bound. "
-        "Percentages: largest share of a limit that is used. Margins: in the unit of the limit."
+        "All engine steps of the stated model. ±100 %: at the upper and at the lower bound; grey: "
+        "beyond a bound. Of a clearance: required over actual distance."
     )
+    if has_envelope:
+        note += " Filled: smallest and largest value of a curve that changes too fast to be seen."
     end_limits = [
-        _margin_in_words(kind, margin)
+        f"{_words(kind)} {_kept(margin)}"
         for kind, margin in design.limits.items()
         if kind.startswith("end_")
     ]
     if end_limits:
         note += f" At the end: {', '.join(end_limits)}."
-    add_title(figure, "How much of each limit the design uses", [], note)
+    handles = [
+        Line2D([], [], color=colour, linewidth=2.0, label=shorten(name, LEGEND_NAME_WIDTH))
+        for name, colour in colours.items()
+    ]
+    add_title(figure, "How much of each limit the design uses", handles, note)
     return figure
 
 
-def _draw_kind(axes: Axes, design: Design, kind: str, xlabel: str) -> None:
-    """Draw the panel of one kind of limit, with its smallest margin as title."""
-    is_clearance = kind == "clearance"
-    curves = [usage for usage in design.usage if usage.kind == kind]
-    _draw_curves(axes, curves)
-    _draw_bounds(axes, curves, is_clearance)
-    axes.legend(
-        loc="upper left",
-        bbox_to_anchor=(-0.01, 1.17),
-        ncols=len(NAMED_COLOURS),
-        fontsize=SMALL_FONT - 1,
-        frameon=False,
-    )
-
-    ylabel = "required / actual distance [–]" if is_clearance else "position in range [–]"
-    format_axes(axes, xlabel, ylabel)
-    margin = design.limits.get(kind, np.nan)
-    axes.set_title(
-        _margin_in_words(kind, margin),
-        loc="left",
-        fontsize=SMALL_FONT + 1,
-        color=DESIGNED_COLOUR if margin < 0.0 else TEXT_COLOUR,
-        pad=17,
-    )
+# ---- colours
 
 
-def _margin_in_words(kind: str, margin: float) -> str:
-    """Say whether a limit holds, and by which margin."""
-    words = kind.replace("_", " ")
-    if margin < 0.0:
-        return f"{words}: VIOLATED by {format_number(-margin)}"
-    return f"{words}: smallest margin {format_number(margin)}"
+def joint_colours(design: Design) -> dict[str, str]:
+    """Return the colour of each joint, actuator and pair of geoms, by its name.
+
+    Of more names than there are colours, those that come closest to a bound have one.
+
+    Args:
+        design: A design with limits.
+    """
+    largest: dict[str, float] = {}
+    for usage in design.usage:
+        largest[usage.name] = max(largest.get(usage.name, 0.0), _largest_share(usage))
+
+    closest = sorted(largest, key=lambda name: -largest[name])[: len(JOINT_COLOURS)]
+    shown = [name for name in largest if name in closest]
+    return dict(zip(shown, JOINT_COLOURS, strict=False))
+
+
+# ---- curves
 
 
 def _largest_share(usage: LimitUsage) -> float:
@@ -105,33 +139,135 @@ def _largest_share(usage: LimitUsage) -> float:
     return float(np.abs(usage.share).max())
 
 
-def _draw_curves(axes: Axes, curves: list[LimitUsage]) -> None:
-    """Draw the curves of one kind; those closest to a bound are strong and named, others pale."""
+def _would_be_solid(usage: LimitUsage) -> bool:
+    """Return whether a curve turns so often that its line would fill an area."""
+    change = np.diff(usage.share)
+    rising = np.sign(change[change != 0.0])
+    return int(np.count_nonzero(np.diff(rising))) > MAX_TURNS
+
+
+def _draw_curves(axes: Axes, curves: list[LimitUsage], colours: dict[str, str]) -> None:
+    """Draw the curves of one kind; those closest to a bound are strong and on top."""
     closest_first = sorted(curves, key=lambda usage: -_largest_share(usage))
     for rank, usage in enumerate(closest_first):
-        if rank >= len(NAMED_COLOURS):
-            axes.plot(usage.t, usage.share, color=MUTED_COLOUR, linewidth=0.7, alpha=0.5, zorder=2)
+        colour = colours.get(usage.name, MUTED_COLOUR)
+        strong = rank < NAMED_CURVES
+        order = 3.0 - rank / len(curves)
+        if not _would_be_solid(usage):
+            width = 1.4 if strong else 0.7
+            axes.plot(usage.t, 100.0 * usage.share, color=colour, linewidth=width, zorder=order)
             continue
 
-        percent = 100 * _largest_share(usage)
-        axes.plot(
-            usage.t,
-            usage.share,
-            color=NAMED_COLOURS[rank],
-            label=f"{shorten(usage.name, CURVE_NAME_WIDTH)} {percent:.5g} %",
-            linewidth=1.3,
-            zorder=3,
+        t, low, high = _envelope(usage)
+        axes.fill_between(
+            t, low, high, color=colour, alpha=0.25 if strong else 0.08, linewidth=0.0, zorder=order
         )
+        for end in (low, high):
+            axes.plot(t, end, color=colour, linewidth=0.9 if strong else 0.4, zorder=order)
+
+
+def _envelope(usage: LimitUsage) -> tuple[Array, Array, Array]:
+    """Return times [s], and smallest and largest shares [%], of successive intervals."""
+    starts = np.unique(np.linspace(0, len(usage.t), ENVELOPE_INTERVALS, endpoint=False).astype(int))
+    percent = 100.0 * usage.share
+    low, high = np.minimum.reduceat(percent, starts), np.maximum.reduceat(percent, starts)
+    ends = np.append(starts[1:], len(usage.t)) - 1
+    return 0.5 * (usage.t[starts] + usage.t[ends]), low, high
 
 
 def _draw_bounds(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
-    """Draw the bounds at 1 and, unless there is only one, at -1; what lies beyond them is grey."""
-    largest = max(_largest_share(usage) for usage in curves)
-    reach = max(1.08, 1.05 * largest)
+    """Draw the bounds at 100 % and, unless there is only one, at -100 %; beyond them is grey."""
+    largest = 100.0 * max(_largest_share(usage) for usage in curves)
+    reach = max(112.0, 1.05 * largest)
     axes.set_ylim(0.0 if one_sided else -reach, reach)
+    for side in (1.0,) if one_sided else (1.0, -1.0):
+        axes.axhspan(100.0 * side, reach * side, color=GRID_COLOUR, zorder=0, linewidth=0.0)
+        axes.axhline(100.0 * side, color=TEXT_COLOUR, linewidth=0.8, zorder=1)
 
-    axes.axhspan(1.0, reach, color=GRID_COLOUR, zorder=0)
-    axes.axhline(1.0, color=TEXT_COLOUR, linewidth=0.8, zorder=1)
-    if not one_sided:
-        axes.axhspan(-reach, -1.0, color=GRID_COLOUR, zorder=0)
-        axes.axhline(-1.0, color=TEXT_COLOUR, linewidth=0.8, zorder=1)
+
+# ---- words
+
+
+def _label(axes: Axes, curves: list[LimitUsage], margin: str, width: float) -> None:
+    """Write the margin of a kind, and the curves that come closest to a bound, above a panel."""
+    closest = sorted(curves, key=lambda usage: -_largest_share(usage))[:NAMED_CURVES]
+    shares = [
+        f"{shorten(usage.name, CURVE_NAME_WIDTH)} {whole_percent(_largest_share(usage))}"
+        for usage in closest
+    ]
+    format_axes(axes, ylabel="share of the limit [%]")
+
+    # Names that do not fit above the panel are left out, the ones farthest from their bounds first.
+    size = SMALL_FONT - 1.0
+    while len(shares) > 1 and text_width(", ".join(shares), size) > width - text_width("largest: "):
+        shares.pop()
+    violated = any(_largest_share(usage) > 1.0 for usage in closest)
+    axes.set_title(
+        margin,
+        loc="left",
+        fontsize=NORMAL_FONT,
+        color=DESIGNED_COLOUR if violated else TEXT_COLOUR,
+        pad=16,
+    )
+    axes.text(
+        0.0,
+        1.02,
+        f"largest: {', '.join(shares)}",
+        transform=axes.transAxes,
+        fontsize=size,
+        color=MUTED_COLOUR,
+        va="bottom",
+    )
+
+
+def whole_percent(share: float) -> str:
+    """Write a share in whole percents; one within the bound is never rounded to 100 %.
+
+    Args:
+        share: The share, 1 at the bound.
+    """
+    percent = round(100.0 * share)
+    if share < 1.0 and percent == 100:
+        return "> 99 %"
+    return f"{percent} %"
+
+
+def _words(kind: str) -> str:
+    """Return the name of a kind of limit in words."""
+    return kind.replace("_", " ")
+
+
+def _kept(margin: float, unit: str = "") -> str:
+    """Say whether a limit holds, and by which margin."""
+    size = f"{format_number(abs(margin), 2)} {unit}".rstrip()
+    return f"VIOLATED by {size}" if margin < 0.0 else f"smallest margin {size}"
+
+
+def _margin_in_words(design: Design, kind: str, labels: Labels) -> str:
+    """Say whether a kind of limit holds, and by which margin in its unit."""
+    margin = design.limits.get(kind, float("nan"))
+    units = {
+        _unit_of(usage, labels)
+        for usage in design.usage
+        if usage.kind == kind and np.isfinite(usage.share).any()
+    }
+    return f"{_words(kind)}: {_kept(margin, units.pop() if len(units) == 1 else '')}"
+
+
+def _unit_of(usage: LimitUsage, labels: Labels) -> str:
+    """Return the unit of a limited quantity; empty where the labels do not say it."""
+    if usage.kind == "clearance":
+        return LENGTH
+
+    columns = labels.controls if usage.kind.startswith("control") else labels.positions
+    units = dict(split_unit(label) for label in columns)
+    unit = units.get(usage.name, "")
+    if not unit or unit == "model unit":
+        return ""
+    return {
+        "position": unit,
+        "velocity": per_second(unit),
+        "acceleration": f"{unit}/s²",
+        "control": unit,
+        "control_rate": per_second(unit),
+    }.get(usage.kind, "")

@@ -1,4 +1,4 @@
-"""Figure of a Monte Carlo study: histograms of the estimates of one parameter."""
+"""Figures of a Monte Carlo study: an overview of all parameters, and histograms of one."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 from scipy.stats import norm
 
 from mjfim.arrays import Array
@@ -23,6 +24,8 @@ from mjfim.output.plots.style import (
     new_figure,
     own_style,
     quotient_unit,
+    set_plain_log_ticks,
+    shorten_label,
     squared_unit,
     trajectory_style,
     write_message,
@@ -44,11 +47,125 @@ HUGE_BOUND = 20.0
 # Smallest relative width of a histogram's range.
 MIN_RELATIVE_RANGE = 1e-9
 
+# Largest number of parameters of an overview; of more, the least efficient ones are drawn.
+MAX_PARAMETERS = 30
+
+# Distance between the trajectories in a row of an overview, as a share of the height of the row.
+ROW_OFFSET = 0.3
+
+# Characters to which the names of parameters are shortened.
+OVERVIEW_NAME_WIDTH = 26
+
 # Number of points of the normal curve.
 CURVE_POINTS = 400
 
 # Smallest and largest number of bars of a histogram.
 MIN_BINS, MAX_BINS = 8, 60
+
+
+# ---- overview
+
+
+@own_style
+def study_overview(study: MonteCarloStudy, labels: Labels) -> Figure:
+    """Draw scatter, Cramér-Rao bound and efficiency of every parameter along each trajectory.
+
+    Args:
+        study: The study.
+        labels: Labels of the parameters.
+
+    Raises:
+        MjfimError: The labels do not fit the study.
+    """
+    labels.check(parameters=len(study.theta))
+    shown = _shown_parameters(study)
+    figure = new_figure(1.9 + 0.36 * len(shown))
+    left, right = figure.subplots(1, 2, sharey=True)
+    left.set_xscale("log")
+    offsets = ROW_OFFSET * (np.arange(len(study.sets)) - 0.5 * (len(study.sets) - 1))
+    for offset, (trajectory, trials) in zip(offsets, study.sets.items(), strict=True):
+        colour = trajectory_style(trajectory)[1]
+        _draw_scatter(left, study, trials, shown, float(offset), colour)
+        _draw_efficiency(right, trials, shown, float(offset), colour)
+
+    names = [shorten_label(labels.parameter(int(j)), OVERVIEW_NAME_WIDTH) for j in shown]
+    left.set_yticks(range(len(shown)), names)
+    left.set_ylim(len(shown) - 0.5, -0.5)
+    set_plain_log_ticks(left.xaxis)
+    right.axvline(1.0, color=TEXT_COLOUR, linewidth=1.0, linestyle="--")
+    first = trajectory_style(next(iter(study.sets)))[0]
+    format_axes(left, f"standard deviation / bound of the {first} trajectory [–]")
+    format_axes(right, "efficiency: bound / observed variance [–]")
+    for axes in (left, right):
+        axes.grid(False, axis="y")
+    right.tick_params(labelleft=False)
+
+    handles = [
+        Line2D([], [], color=colour, marker="o", linestyle="", label=f"{name}: estimates")
+        for name, colour in map(trajectory_style, study.sets)
+    ]
+    bound = Line2D(
+        [], [], color=TEXT_COLOUR, marker="|", markersize=10, linestyle="", label="Cramér–Rao bound"
+    )
+    note = (
+        f"Simulated recordings of the model with noise of the stated σ, at {study.measure_rate:g} "
+        "Hz. Efficiency with its 95 % interval; 1: the bound is reached."
+    )
+    if len(shown) < len(study.theta):
+        note += (
+            f" Shown: {len(shown)} of {len(study.theta)} parameters, those with the smallest "
+            "efficiency."
+        )
+    add_title(figure, "Monte Carlo study against the Cramér–Rao bound", [*handles, bound], note)
+    return figure
+
+
+def _shown_parameters(study: MonteCarloStudy) -> NDArray[np.intp]:
+    """Return the parameters of an overview: of many, those with the smallest efficiency."""
+    smallest = np.min([trials.efficiency for trials in study.sets.values()], axis=0)
+    order = np.argsort(np.nan_to_num(smallest, nan=np.inf), kind="stable")
+    return np.sort(order[:MAX_PARAMETERS])
+
+
+def _draw_scatter(
+    axes: Axes,
+    study: MonteCarloStudy,
+    trials: TrialStatistics,
+    shown: NDArray[np.intp],
+    offset: float,
+    colour: str,
+) -> None:
+    """Draw observed and least standard deviations over the least one of the first trajectory."""
+    first = next(iter(study.sets.values()))
+    least = np.sqrt(np.diagonal(first.crlb)[shown])
+    size = np.where(np.isfinite(least), least, np.sqrt(np.diagonal(first.covariance)[shown]))
+    size = np.where(size > 0.0, size, np.nan)
+
+    places = np.arange(len(shown)) + offset
+    observed = np.sqrt(np.diagonal(trials.covariance)[shown]) / size
+    bound = np.sqrt(np.diagonal(trials.crlb)[shown]) / size
+    axes.plot(
+        np.where(np.isfinite(bound), bound, np.nan),
+        places,
+        "|",
+        color=TEXT_COLOUR,
+        markersize=10,
+        markeredgewidth=1.4,
+    )
+    axes.plot(observed, places, "o", color=colour, markersize=4.5)
+
+
+def _draw_efficiency(
+    axes: Axes, trials: TrialStatistics, shown: NDArray[np.intp], offset: float, colour: str
+) -> None:
+    """Draw the efficiency of some parameters with its interval."""
+    places = np.arange(len(shown)) + offset
+    low, high = trials.efficiency_interval[shown].T
+    axes.hlines(places, low, high, color=colour, linewidth=1.4)
+    axes.plot(trials.efficiency[shown], places, "o", color=colour, markersize=4.5)
+
+
+# ---- histograms
 
 
 @own_style

@@ -7,12 +7,14 @@ import re
 from collections.abc import Callable
 from functools import partial, singledispatch
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from mjfim.errors import MjfimError, unknown
 from mjfim.output import plots
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.labels import complete_labels
+from mjfim.output.plots.pairs import has_pairs
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
@@ -86,7 +88,7 @@ def _(design: Design) -> Pictures:
         "standard_deviations": partial(plots.std_bars, design, labels),
     }
     if design.usage:
-        pictures["limits"] = partial(plots.limits, design)
+        pictures["limits"] = partial(plots.limits, design, labels)
     return pictures
 
 
@@ -98,12 +100,19 @@ def _(estimate: Estimate) -> Pictures:
         "parameters": partial(plots.parameter_intervals, estimate, labels),
         "spectra": partial(plots.residual_spectra, estimate, labels),
     }
+    if len(estimate.trace) > 1:
+        pictures["trace"] = partial(plots.parameter_trace, estimate, labels)
+    if has_pairs(estimate.std):
+        pictures["pairs"] = partial(plots.estimate_pairs, estimate, labels)
     if estimate.predictions:
         pictures["predictions"] = partial(plots.predictions, estimate, labels)
 
     sigma = list(estimate.sigma.values())
     for i, name in enumerate(fit_names(len(estimate.recordings))):
         pictures[name] = partial(plots.fit, estimate, i, labels, sigma)
+    kept = sum(prediction.recording is not None for prediction in estimate.predictions)
+    for i, name in enumerate(held_out_names(kept)):
+        pictures[name] = partial(plots.held_out, estimate, i, labels)
     return pictures
 
 
@@ -111,16 +120,19 @@ def _(estimate: Estimate) -> Pictures:
 def _(study: MonteCarloStudy) -> Pictures:
     """The figures of a Monte Carlo study."""
     labels = complete_labels(study)
-    return {
-        histogram_name(name): partial(plots.histogram, study, i, labels)
-        for i, name in enumerate(study.parameters)
-    }
+    pictures: Pictures = {"overview": partial(plots.study_overview, study, labels)}
+    for i, name in enumerate(study.parameters):
+        pictures[histogram_name(name)] = partial(plots.histogram, study, i, labels)
+    return pictures
 
 
 @pictures_of.register
 def _(check: Check) -> Pictures:
-    """The figure of a check."""
-    return {"check": partial(plots.check_figure, check)}
+    """The figures of a check."""
+    pictures: Pictures = {"check": partial(plots.check_figure, check)}
+    if has_pairs(np.array([row.std for row in check.rows if not row.nuisance])):
+        pictures["pairs"] = partial(plots.check_pairs, check)
+    return pictures
 
 
 @pictures_of.register
@@ -149,6 +161,13 @@ def fit_names(count: int) -> tuple[str, ...]:
     if count == 1:
         return ("fit",)
     return tuple(f"fit_{i + 1}" for i in range(count))
+
+
+def held_out_names(count: int) -> tuple[str, ...]:
+    """Return the names of the figures of the predictions of `count` held-out recordings."""
+    if count == 1:
+        return ("held_out",)
+    return tuple(f"held_out_{i + 1}" for i in range(count))
 
 
 def histogram_name(parameter: str) -> str:

@@ -25,8 +25,11 @@ LEAST_DRAWN_MARGIN = -1.0
 # Characters to which the names of limits and of parameters are shortened.
 LIMIT_NAME_WIDTH, PARAMETER_NAME_WIDTH = 26, 24
 
+# Largest number of parameters whose coverage is written, and the font size of more names [points].
+MAX_WRITTEN_NUMBERS, MANY_NAMES_FONT = 12, 6.0
+
 # Sum of the characters of all names of parameters above which the names are turned.
-MAX_LEVEL_CHARACTERS = 60
+MAX_LEVEL_CHARACTERS = 48
 
 
 @style.own_style
@@ -36,12 +39,14 @@ def robustness_figure(result: Robustness) -> Figure:
     Args:
         result: The study.
     """
-    figure = style.new_figure(max(7.0, 0.8 + 0.27 * len(result.limits)))
-    grid = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.25))
-    left, right = figure.add_subfigure(grid[0]), figure.add_subfigure(grid[1])
+    figure = style.new_figure(max(6.6, 2.0 + 0.22 * len(result.limits)))
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.3), height_ratios=(1.4, 0.8, 1.0))
+    axes = [figure.add_subplot(grid[0, 1])]
+    axes += [figure.add_subplot(grid[row, 1], sharex=axes[0]) for row in (1, 2)]
+    for upper in axes[:2]:
+        upper.tick_params(labelbottom=False)
 
-    _draw_limits(left.subplots(), result)
-    axes = right.subplots(3, 1, sharex=True, height_ratios=(1.5, 0.8, 1.0))
+    _draw_limits(figure.add_subplot(grid[:, 0]), result)
     _draw_errors(axes[0], result)
     _draw_coverage(axes[1], result)
     _draw_before_and_after(axes[2], result)
@@ -52,7 +57,12 @@ def robustness_figure(result: Robustness) -> Figure:
         f"{result.runs} robots, every parameter {100 * conditions.wrong:g} % off, commands "
         f"{1e3 * conditions.latency:g} ms late, {control}"
     )
-    figure.suptitle(title, x=0.01, ha="left", fontsize=style.LARGE_FONT, color=style.TEXT_COLOUR)
+    note = (
+        "Left: dots are robots. Right, from above: errors over the formal σ (shaded: 95 % range); "
+        "robots whose 95 % interval holds the true value (dashed: required, shaded: expected); "
+        "errors in percent of the error of the guess."
+    )
+    style.add_title(figure, title, _handles(), note)
     return figure
 
 
@@ -69,7 +79,7 @@ def _draw_limits(axes: Axes, result: Robustness) -> None:
     style.format_axes(axes, "margin over half of the range [%]")
     axes.axvspan(low, 0.0, color=style.DESIGNED_COLOUR, alpha=0.10, linewidth=0.0)
     for i, row in enumerate(rows):
-        colour = style.INITIAL_COLOUR if result.kept[:, i].all() else style.DESIGNED_COLOUR
+        colour = style.MEASURED_COLOUR if result.kept[:, i].all() else style.DESIGNED_COLOUR
         heights = row + rng.uniform(-0.22, 0.22, result.runs)
         axes.plot(
             percent[:, i], heights, "o", color=colour, markersize=3.5, alpha=0.5, markeredgewidth=0
@@ -83,24 +93,16 @@ def _draw_limits(axes: Axes, result: Robustness) -> None:
     axes.set_yticks(rows, [style.shorten(name, LIMIT_NAME_WIDTH) for name in names])
     axes.set_xlim(low, high)
     axes.set_ylim(-0.7, len(limits) - 0.3)
-    title = f"Limits at every engine step: {result.all_kept} of {result.runs} robots keep all"
+    title = f"{result.all_kept} of {result.runs} robots keep all limits"
     axes.set_title(title, fontsize=style.NORMAL_FONT, loc="left", color=style.TEXT_COLOUR)
-    axes.legend(
-        handles=_limit_handles(),
-        fontsize=style.SMALL_FONT,
-        frameon=False,
-        loc="upper left",
-        bbox_to_anchor=(0.0, -0.06),
-        ncols=3,
-    )
 
 
-def _limit_handles() -> list[Line2D]:
-    """Return the entries of the legend of the limits."""
+def _handles() -> list[Line2D]:
+    """Return the entries of the legend."""
     keeping = Line2D(
         [],
         [],
-        color=style.INITIAL_COLOUR,
+        color=style.MEASURED_COLOUR,
         marker=".",
         linestyle="",
         label="robots, all keep the limit",
@@ -114,7 +116,21 @@ def _limit_handles() -> list[Line2D]:
         label="robots, some exceed the limit",
     )
     planned = Line2D([], [], color=style.TEXT_COLOUR, linewidth=1.6, label="planned")
-    return [planned, keeping, exceeding]
+    guess = Line2D([], [], color=style.NOMINAL_COLOUR, marker="o", linestyle="", label="guess")
+    estimates = Line2D(
+        [], [], color=style.IDENTIFIED_COLOUR, marker="o", linestyle="", label="estimates"
+    )
+    predicted = Line2D(
+        [],
+        [],
+        color=style.TEXT_COLOUR,
+        marker="_",
+        markersize=14,
+        markeredgewidth=1.8,
+        linestyle="",
+        label="σ predicted by the design",
+    )
+    return [planned, keeping, exceeding, guess, estimates, predicted]
 
 
 def _draw_errors(axes: Axes, result: Robustness) -> None:
@@ -123,8 +139,8 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
     axes.axhspan(
         -INTERVAL_HALF_WIDTH,
         INTERVAL_HALF_WIDTH,
-        color=style.MEASURED_COLOUR,
-        alpha=0.12,
+        color=style.GRID_COLOUR,
+        alpha=0.8,
         linewidth=0.0,
     )
     axes.axhline(0.0, color=style.MUTED_COLOUR, linewidth=0.8)
@@ -136,7 +152,7 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
         x = j + rng.uniform(-0.28, 0.28, len(z))
         inside = np.abs(z) <= INTERVAL_HALF_WIDTH
         for chosen, colour in (
-            (inside, style.MEASURED_COLOUR),
+            (inside, style.IDENTIFIED_COLOUR),
             (~inside, style.DESIGNED_COLOUR),
         ):
             axes.plot(
@@ -151,7 +167,7 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
 
     axes.set_ylim(-LARGEST_DRAWN_ERROR - 0.2, LARGEST_DRAWN_ERROR + 0.2)
     axes.set_title(
-        "Errors of the estimates; shaded: range of 95 %",
+        "errors of the estimates",
         fontsize=style.NORMAL_FONT,
         loc="left",
         color=style.TEXT_COLOUR,
@@ -165,12 +181,13 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
     share = 100.0 * result.inside / n
     style.format_axes(axes, "", "coverage [%]")
     low, high = (100.0 * k / n for k in binom.interval(CONFIDENCE, n, CONFIDENCE))
-    axes.axhspan(low, high, color=style.MEASURED_COLOUR, alpha=0.12, linewidth=0.0)
+    axes.axhspan(low, high, color=style.GRID_COLOUR, alpha=0.8, linewidth=0.0)
     axes.axhline(
         100.0 * REQUIRED_COVERAGE, color=style.DESIGNED_COLOUR, linewidth=1.0, linestyle="--"
     )
-    axes.plot(x, share, "o", color=style.TEXT_COLOUR, markersize=5.0)
-    for i, value in enumerate(share):
+    axes.plot(x, share, "o", color=style.IDENTIFIED_COLOUR, markersize=5.0)
+    few = len(share) <= MAX_WRITTEN_NUMBERS
+    for i, value in enumerate(share if few else []):
         axes.annotate(
             f"{value:.0f}",
             (i, value),
@@ -180,13 +197,13 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
             color=style.TEXT_COLOUR,
         )
     axes.set_ylim(min(85.0, float(share.min(initial=100.0)) - 3.0), 103.0)
-    title = "Robots whose 95 % interval holds the true value; dashed: required, shaded: expected"
+    title = "robots whose 95 % interval holds the true value"
     axes.set_title(title, fontsize=style.NORMAL_FONT, loc="left", color=style.TEXT_COLOUR)
 
 
 def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
     """Draw the errors of the guess, the predicted and the observed errors of each unknown."""
-    style.format_axes(axes, "", "error / error of guess [%]")
+    style.format_axes(axes, "", "error [%]")
     x = np.arange(len(result.names))
     guess = np.where(result.wrong > 0.0, result.wrong, np.nan)
     predicted, observed = result.predicted / guess, result.observed / guess
@@ -195,10 +212,9 @@ def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
         x,
         np.full(len(x), 100.0),
         "o",
-        color=style.MUTED_COLOUR,
+        color=style.NOMINAL_COLOUR,
         markersize=4.0,
         markeredgewidth=0.0,
-        label="guess",
     )
     axes.plot(
         x,
@@ -207,16 +223,14 @@ def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
         color=style.TEXT_COLOUR,
         markersize=20.0,
         markeredgewidth=1.8,
-        label="σ predicted by the design",
     )
     axes.plot(
         x,
         100.0 * observed,
         ".",
-        color=style.DESIGNED_COLOUR,
+        color=style.IDENTIFIED_COLOUR,
         markersize=9.0,
         markeredgewidth=0.0,
-        label="rms error of the estimates",
     )
 
     axes.set_yscale("log")
@@ -227,12 +241,9 @@ def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
     if sum(len(name) for name in names) <= MAX_LEVEL_CHARACTERS:
         axes.set_xticks(x, names)
     else:
-        axes.set_xticks(x, names, rotation=30, ha="right")
-    axes.legend(
-        fontsize=style.SMALL_FONT,
-        frameon=False,
-        loc="lower left",
-        bbox_to_anchor=(0.0, 0.98),
-        ncols=3,
-        borderpad=0.0,
+        axes.set_xticks(x, names, rotation=90)
+        many = len(names) > MAX_WRITTEN_NUMBERS
+        axes.tick_params(axis="x", labelsize=MANY_NAMES_FONT if many else style.SMALL_FONT)
+    axes.set_title(
+        "rms error and σ, over the error of the guess", fontsize=style.NORMAL_FONT, loc="left"
     )

@@ -21,11 +21,13 @@ import numpy as np
 from matplotlib import rc_params_from_file
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
@@ -91,6 +93,9 @@ TITLE_LINE, TITLE_SPACE = 0.2, 0.07
 # Space at both sides of titles, legends and notes [inch].
 SIDE_SPACE = 0.12
 
+# Part of the width of a panel that ticks and gaps take [inch].
+PANEL_FRAME = 0.6
+
 # Width of a line with its gap in a legend, and space between two entries, over the font size.
 LEGEND_LINE, LEGEND_GAP = 2.8, 2.0
 
@@ -105,6 +110,9 @@ TRAJECTORY_STYLES: dict[str, tuple[str, str]] = {
 
 # Entries without a time in the files of the formats that hold one.
 DATELESS: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+
+# Digits of the tick values of a logarithmic axis, from few to many ticks per decade.
+TICK_DIGITS = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8))
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -242,6 +250,42 @@ def shorten(text: str, width: int = 28) -> str:
     return f"{text[:kept]}…{text[-kept:]}"
 
 
+def fit_text(text: str, width: float, size: float) -> str:
+    """Shorten a text in its middle until it fits.
+
+    Args:
+        text: The text.
+        width: Width that is free [inch].
+        size: Size of the font [points].
+    """
+    characters = len(text)
+    while characters > 3 and text_width(shorten(text, characters), size) > width:
+        characters -= 1
+    return shorten(text, characters)
+
+
+def fit_label(label: str, width: float, size: float) -> str:
+    """Shorten the name in a label `name [unit]` until the label fits; the unit stays.
+
+    Args:
+        label: The label.
+        width: Width that is free [inch].
+        size: Size of the font [points].
+    """
+    name, unit = split_unit(label)
+    suffix = f" [{unit}]" if unit else ""
+    return fit_text(name, width - text_width(suffix, size), size) + suffix
+
+
+def panel_width(columns: int) -> float:
+    """Return the width that a title above one of several panels side by side may have [inch].
+
+    Args:
+        columns: Number of panels side by side.
+    """
+    return WIDTH / columns - PANEL_FRAME
+
+
 def shorten_label(label: str, width: int = 28) -> str:
     """Shorten the name in a label `name [unit]`; the unit stays.
 
@@ -329,6 +373,67 @@ def format_axes(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
     return axes
+
+
+def scale_axis(axis: Axis, largest: float) -> str:
+    """Let the ticks of an axis count in a power of ten, for its label.
+
+    Args:
+        axis: The axis.
+        largest: Largest absolute value on it.
+
+    Returns:
+        The power with a space behind it, such as `10⁻³ `; empty where numbers of moderate size
+        need none.
+    """
+    power = int(np.floor(np.log10(largest))) if np.isfinite(largest) and largest > 0.0 else 0
+    power = 3 * (power // 3) if power < 0 else power
+    if -1 <= power < 4:
+        return ""
+
+    scale = 10.0**power
+    axis.set_major_formatter(lambda value, _: f"{value / scale:g}".replace("-", "−"))
+    return f"10{str(power).translate(SUPERSCRIPTS)} "
+
+
+def set_plain_log_ticks(axis: Axis) -> None:
+    """Let a logarithmic axis have few ticks, with plain numbers.
+
+    Args:
+        axis: The axis, with its final limits.
+    """
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(FixedLocator(log_ticks(float(low), float(high))))
+    axis.set_major_formatter(lambda value, _: plain_number(float(value)))
+    axis.set_minor_locator(NullLocator())
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Return round numbers on a logarithmic axis: at least two, and at most about five.
+
+    Args:
+        low: Lower end of the axis, positive.
+        high: Upper end of the axis.
+    """
+    decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    decades = decades[:: max(len(decades) // 4, 1)]
+    ticks: list[float] = []
+    for digits in TICK_DIGITS:
+        candidates = np.sort(np.outer(10.0**decades, digits).ravel())
+        within = (candidates >= low) & (candidates <= high)
+        ticks = candidates[within].tolist()
+        if len(ticks) >= 2:
+            break
+    return ticks
+
+
+def plain_number(value: float) -> str:
+    """Write the number of a tick: 0.01, 300, 10⁵.
+
+    Args:
+        value: The number.
+    """
+    return f"{value:g}" if 1e-4 < value < 1e5 else format_number(value, 1)
 
 
 def write_message(axes: Axes, sentence: str) -> None:

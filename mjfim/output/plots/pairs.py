@@ -1,0 +1,252 @@
+"""Figures of the joint uncertainty of pairs of parameters, as ellipses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from mjfim.arrays import Array
+from mjfim.output.plots.check import colour_of_source
+from mjfim.output.plots.style import (
+    IDENTIFIED_COLOUR,
+    NOMINAL_COLOUR,
+    SMALL_FONT,
+    add_title,
+    format_axes,
+    format_number,
+    new_figure,
+    own_style,
+    shorten,
+)
+from mjfim.output.summaries.accuracy import BEST_CASE
+from mjfim.records.check import Check
+from mjfim.records.estimate import Estimate
+from mjfim.records.labels import Labels
+
+# Largest number of parameters of a figure; of more, those with the largest correlations are drawn.
+MAX_PARAMETERS = 6
+
+# Half the range of every axis, and places of its ticks [standard deviations].
+RANGE, TICK = 3.2, 2.0
+
+# Standard deviations of the ellipses, each with its opacity.
+ELLIPSES = ((2.0, 0.18), (1.0, 0.35))
+
+# Number of points of a curve.
+CURVE_POINTS = 90
+
+# Characters to which the names of parameters are shortened.
+NAME_WIDTH = 18
+
+# Height of a row of panels, and of all that is above and below them [inch].
+ROW_HEIGHT, FRAME_HEIGHT = 1.15, 1.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Estimates:
+    """Parameters with their values and their joint uncertainty.
+
+    Attributes:
+        names: Names of the k parameters.
+        units: Their units; may be empty.
+        values: (k,) values [theta-unit].
+        covariance: (k, k) covariance [product of the units].
+        guess: (k,) initial guess [theta-unit], or None.
+        colour: Colour of the ellipses.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    covariance: Array
+    guess: Array | None
+    colour: str
+
+    @property
+    def std(self) -> Array:
+        """(k,) standard deviations [theta-unit]."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    def part(self, chosen: NDArray[np.intp]) -> _Estimates:
+        """Return some of the parameters."""
+        return _Estimates(
+            names=tuple(self.names[j] for j in chosen),
+            units=tuple(self.units[j] for j in chosen),
+            values=self.values[chosen],
+            covariance=self.covariance[np.ix_(chosen, chosen)],
+            guess=None if self.guess is None else self.guess[chosen],
+            colour=self.colour,
+        )
+
+
+def has_pairs(std: Array) -> bool:
+    """Return whether at least two parameters have a standard deviation.
+
+    Args:
+        std: (k,) standard deviations; infinite or NaN where there is none.
+    """
+    return bool(np.count_nonzero(np.isfinite(std) & (std > 0.0)) > 1)
+
+
+@own_style
+def estimate_pairs(estimate: Estimate, labels: Labels) -> Figure:
+    """Draw the joint uncertainty of the estimates of every pair of parameters.
+
+    Args:
+        estimate: The estimate.
+        labels: Labels of the parameters.
+
+    Raises:
+        MjfimError: The labels do not fit the estimate.
+    """
+    labels.check(parameters=len(estimate.theta))
+    estimates = _Estimates(
+        names=estimate.parameters,
+        units=labels.parameter_units,
+        values=estimate.theta,
+        covariance=estimate.covariance,
+        guess=estimate.initial_theta,
+        colour=IDENTIFIED_COLOUR,
+    )
+    note = "Formal uncertainty: it is right only if the model and the noise are right."
+    return _draw(estimates, "Joint uncertainty of the identified parameters", note)
+
+
+@own_style
+def check_pairs(check: Check) -> Figure:
+    """Draw the predicted joint uncertainty of the estimates of every pair of parameters.
+
+    Args:
+        check: The check.
+    """
+    rows = [row for row in check.rows if not row.nuisance]
+    std = np.array([row.std for row in rows])
+    scale = np.where(np.isfinite(std), std, np.nan)
+    estimates = _Estimates(
+        names=tuple(row.name for row in rows),
+        units=tuple(row.unit for row in rows),
+        values=np.array([row.value for row in rows]),
+        covariance=check.correlation * np.outer(scale, scale),
+        guess=None,
+        colour=colour_of_source(check),
+    )
+    title = f"Predicted joint uncertainty, {check.source} ({check.horizon:g} s)"
+    return _draw(estimates, title, BEST_CASE)
+
+
+def _draw(estimates: _Estimates, title: str, note: str) -> Figure:
+    """Draw a density per parameter, and ellipses for every pair."""
+    chosen = _shown_parameters(estimates)
+    shown = estimates.part(chosen)
+    count = len(chosen)
+    figure = new_figure(ROW_HEIGHT * count + FRAME_HEIGHT)
+    grid = figure.add_gridspec(count, count)
+    for i in range(count):
+        for j in range(i + 1):
+            axes = figure.add_subplot(grid[i, j])
+            if i == j:
+                _draw_density(axes, shown, i)
+            else:
+                _draw_ellipses(axes, shown, i, j)
+            _label_ticks(axes, shown, i, j)
+
+    handles = [
+        Line2D([], [], color=shown.colour, linewidth=7.0, alpha=opacity + 0.1, label=f"{size:g} σ")
+        for size, opacity in reversed(ELLIPSES)
+    ]
+    if shown.guess is not None and _guesses_in_range(shown):
+        handles.append(
+            Line2D([], [], color=NOMINAL_COLOUR, marker="x", linestyle="", label="guess")
+        )
+    if count < len(estimates.names):
+        note += (
+            f" Shown: {count} of {len(estimates.names)} parameters, those with the largest "
+            "correlations."
+        )
+    add_title(figure, title, handles, note)
+    return figure
+
+
+def _shown_parameters(estimates: _Estimates) -> NDArray[np.intp]:
+    """Return the parameters to draw: of many, those with the largest correlations."""
+    std = estimates.std
+    known = np.flatnonzero(np.isfinite(std) & (std > 0.0))
+    correlation = estimates.covariance[np.ix_(known, known)] / np.outer(std[known], std[known])
+    np.fill_diagonal(correlation, 0.0)
+    largest = np.abs(np.nan_to_num(correlation)).max(axis=0)
+    return np.sort(known[np.argsort(-largest, kind="stable")[:MAX_PARAMETERS]])
+
+
+def _draw_density(axes: Axes, shown: _Estimates, i: int) -> None:
+    """Draw the normal density of one parameter."""
+    x = np.linspace(-RANGE, RANGE, CURVE_POINTS)
+    axes.fill_between(x, norm.pdf(x), color=shown.colour, alpha=0.25, linewidth=0.0)
+    axes.plot(x, norm.pdf(x), color=shown.colour)
+    axes.set(xlim=(-RANGE, RANGE), ylim=(0.0, 0.45), yticks=[])
+    axes.spines["left"].set_visible(False)
+    axes.set_title(shorten(shown.names[i], NAME_WIDTH), fontsize=SMALL_FONT, pad=3)
+    if shown.guess is not None:
+        guess = float((shown.guess[i] - shown.values[i]) / shown.std[i])
+        if abs(guess) < RANGE:
+            axes.plot(guess, 0.02, "x", color=NOMINAL_COLOUR, markersize=5)
+
+
+def _draw_ellipses(axes: Axes, shown: _Estimates, i: int, j: int) -> None:
+    """Draw the ellipses of parameter j (across) and i (up), in standard deviations."""
+    std = shown.std
+    correlation = float(np.clip(shown.covariance[i, j] / (std[i] * std[j]), -1.0, 1.0))
+    angle = np.linspace(0.0, 2.0 * np.pi, CURVE_POINTS)
+    x = np.cos(angle)
+    y = correlation * x + np.sqrt(1.0 - correlation**2) * np.sin(angle)
+    for size, opacity in ELLIPSES:
+        axes.fill(size * x, size * y, facecolor=shown.colour, alpha=opacity, linewidth=0.0)
+    axes.plot(2.0 * x, 2.0 * y, color=shown.colour, linewidth=0.8)
+    axes.plot(0.0, 0.0, ".", color=shown.colour, markersize=4)
+    axes.set(xlim=(-RANGE, RANGE), ylim=(-RANGE, RANGE))
+    if shown.guess is not None:
+        guess = (shown.guess - shown.values) / std
+        if max(abs(guess[i]), abs(guess[j])) < RANGE:
+            axes.plot(guess[j], guess[i], "x", color=NOMINAL_COLOUR, markersize=5)
+
+
+def _label_ticks(axes: Axes, shown: _Estimates, i: int, j: int) -> None:
+    """Write values two standard deviations from the estimate at the outer axes."""
+    is_lowest, is_left = i == len(shown.names) - 1, j == 0 and i > 0
+    format_axes(
+        axes,
+        _unit(shown, j) if is_lowest else "",
+        _unit(shown, i) if is_left else "",
+    )
+    axes.xaxis.set_major_locator(FixedLocator([-TICK, TICK]))
+    axes.tick_params(labelbottom=is_lowest, labelleft=is_left)
+    axes.xaxis.set_major_formatter(lambda x, _: _value(shown, j, x))
+    if i != j:
+        axes.yaxis.set_major_locator(FixedLocator([-TICK, TICK]))
+        axes.yaxis.set_major_formatter(lambda y, _: _value(shown, i, y))
+
+
+def _unit(shown: _Estimates, i: int) -> str:
+    """Return the label of an axis: the unit of a parameter."""
+    return f"[{shown.units[i] or 'model unit'}]"
+
+
+def _value(shown: _Estimates, i: int, stds: float) -> str:
+    """Write the value of a parameter at a distance from its estimate, with digits that differ."""
+    value = float(shown.values[i] + stds * shown.std[i])
+    size = max(abs(value), float(shown.std[i]))
+    digits = int(np.clip(np.ceil(np.log10(size / float(shown.std[i]))) + 1.0, 2, 6))
+    return format_number(value, digits)
+
+
+def _guesses_in_range(shown: _Estimates) -> bool:
+    """Return whether the guess of at least one parameter is on its axis."""
+    if shown.guess is None:
+        return False
+    return bool((np.abs(shown.guess - shown.values) < RANGE * shown.std).any())

@@ -1,0 +1,332 @@
+"""No text of a figure overlaps another text or leaves the figure, whatever the size of the result.
+
+The records are hand-made: few and many parameters and joints, with short and with long names.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from mjfim.output import plots
+from mjfim.output.campaign_parameters import CampaignParameters
+from mjfim.records.campaign import Campaign, CampaignStatus, Round
+from mjfim.records.check import Check, ParameterCheck, SelfTest
+from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
+from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
+from mjfim.records.estimate import Estimate, Prediction, PredictionErrors, Whiteness
+from mjfim.records.labels import Labels
+from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
+from tests.support.figure_text import misplaced_texts
+from tests.support.made_records import make_design, make_estimate, make_labels, make_study
+
+# Number of characters of a long name.
+LONG = 40
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """Size of the records that are drawn.
+
+    Attributes:
+        joints: Number of joints.
+        parameters: Number of parameters.
+        width: Least number of characters of a name.
+    """
+
+    joints: int
+    parameters: int
+    width: int = 0
+
+    @property
+    def labels(self) -> Labels:
+        """Names and units."""
+        return make_labels(self.joints, self.parameters, self.width)
+
+
+SMALL, USUAL, LARGE = Size(1, 1), Size(3, 4), Size(12, 30, LONG)
+WIDE = Size(2, 3, LONG)
+
+
+@cache
+def design(size: Size) -> Design:
+    """A design with limits on all joints."""
+    found = make_design(size.joints, size.parameters)
+    t = np.linspace(0.0, 2.0, 400)
+    names = [label.partition(" ")[0] for label in size.labels.positions]
+    usage = [
+        LimitUsage(
+            kind=kind, name=name, t=t, share=np.sin((200.0 if kind == "force" else 3.0) * t + i)
+        )
+        for kind in ("position", "velocity", "force", "control")
+        for i, name in enumerate(names)
+    ]
+    margins = {"position": 0.1, "velocity": -0.01, "force": 1e-5, "control": 1.0}
+    combined = (
+        CombinationAccuracy(expression="a + 2 b", value=1.0, std_initial=1.0, std_final=0.5),
+    )
+    return dataclasses.replace(
+        found,
+        parameters=size.labels.parameters,
+        usage=tuple(usage),
+        limits=margins,
+        combined=combined,
+    )
+
+
+@cache
+def estimate(size: Size) -> Estimate:
+    """An estimate with predictions, segments, a trace and the nominal model."""
+    made = make_estimate(size.joints, size.parameters)
+    recording = made.recordings[0]
+    labels = size.labels
+    outputs = tuple(labels.outputs)
+    recording = dataclasses.replace(recording, outputs=outputs, name="logs/" + "n" * 60 + ".csv")
+    errors = PredictionErrors(
+        name=recording.name,
+        outputs=outputs,
+        rms=np.geomspace(1e-3, 10.0, size.joints),
+        mae=np.geomspace(1e-3, 10.0, size.joints),
+    )
+    nominal = dataclasses.replace(errors, rms=7.0 * errors.rms)
+    held = Prediction(
+        name=recording.name,
+        identified=errors,
+        nominal=nominal,
+        held_out=True,
+        recording=recording,
+        identified_outputs=made.predicted[0],
+        nominal_outputs=1.3 * made.predicted[0],
+    )
+    other = dataclasses.replace(held, recording=None, held_out=False, name="other.csv")
+    whiteness = tuple(
+        Whiteness(
+            output=name, count=50, variance=1.2, correlation=0.3, p=1e-9, inflation=2.0, time=3.0
+        )
+        for name in outputs
+    )
+    return dataclasses.replace(
+        made,
+        parameters=labels.parameters,
+        at_bound=labels.parameters[:1],
+        recordings=(recording,),
+        sigma=dict.fromkeys(outputs, 0.05),
+        predictions=(held, other, other) if size.joints > 1 else (held,),
+        whiteness=whiteness,
+        trace=np.linspace(1.2, 1.0, 6)[:, None] * made.theta,
+        nominal=(1.3 * made.predicted[0],),
+        segments=(np.arange(0.0, 2.0, 0.25),),
+    )
+
+
+@cache
+def check(size: Size) -> Check:
+    """A check with a combination; of several parameters, the first one is not known alone."""
+    labels = size.labels
+    count = size.parameters
+    std = np.geomspace(1e-4, 1.0, count)
+    correlation = np.full((count, count), 0.97)
+    np.fill_diagonal(correlation, 1.0)
+    if count > 1:
+        std[0], correlation[0], correlation[:, 0] = np.inf, np.nan, np.nan
+    rows = tuple(
+        ParameterCheck(
+            name=name,
+            unit="kg",
+            value=1.0,
+            nuisance=False,
+            size=1.0,
+            std=float(std[j]),
+            relative=float(std[j]),
+            wanted=0.05,
+            stated=True,
+            repetitions=1,
+            seconds=1.0,
+        )
+        for j, name in enumerate(labels.parameters)
+    )
+    return Check(
+        source="the initial control",
+        horizon=2.0,
+        rows=rows,
+        wanted=labels.parameters,
+        information=np.eye(count),
+        eigenvalues=np.ones(count),
+        correlation=correlation,
+        confounded=(),
+        not_separable=(),
+        not_excited=(),
+        self_test=SelfTest(roughness=None, recursion=0.0, slope=0.0),
+        verdict=(
+            f"{count} parameters miss their wanted sigma; the worst is {rows[-1].name}. Stop",
+        ),
+        combined=(
+            CombinationAccuracy(expression="a + b", value=1.0, std_initial=0.1, std_final=0.1),
+        ),
+    )
+
+
+@cache
+def comparison(size: Size) -> Comparison:
+    """A comparison of six methods, one of which cannot be used."""
+    std = np.linspace(0.01, 0.02, size.parameters)
+    titles = ("chirp", "multisine " + "m" * 30, "steps", "splines", "random", "mjfim's design")
+    rows = [
+        MethodResult(
+            method=DESIGN if "design" in title else title,
+            title=title,
+            outcome=MethodOutcome.OUTSIDE if title == "steps" else MethodOutcome.INSIDE,
+            control=None,
+            cost=1.0 + i,
+            criterion=1.0,
+            std=(1.0 + i) * std,
+            min_eigenvalue=1.0,
+            worst_relative_std=0.02 * (1.0 + i),
+            seconds=1.0,
+            steps=100,
+            margins={"control_rate": 0.1},
+            relative_margins={"control_rate": 0.01},
+        )
+        for i, title in enumerate(titles)
+    ]
+    return Comparison(
+        source="e",
+        criterion="E",
+        nats=0.0,
+        parameters=size.labels.parameters,
+        units=size.labels.parameter_units,
+        scale=np.ones(size.parameters),
+        nuisance=(),
+        rows=tuple(rows),
+        seconds=6.0,
+        steps=np.inf,
+        seed=0,
+        weighted=False,
+    )
+
+
+@cache
+def robustness(size: Size) -> Robustness:
+    """A study of twelve robots."""
+    labels = size.labels
+    count, runs = size.parameters, 12
+    rng = np.random.default_rng(0)
+    limits = tuple(
+        AssessedLimit(
+            kind="control_rate", name=label.partition(" ")[0], lower=-1.0, upper=1.0, scale=1.0
+        )
+        for label in labels.positions
+    )
+    return Robustness(
+        conditions=RobotConditions(),
+        names=labels.parameters,
+        units=labels.parameter_units,
+        limits=limits,
+        wrong=np.full(count, 0.2),
+        z=rng.normal(size=(runs, count)),
+        error=0.01 * rng.normal(size=(runs, count)),
+        std=np.full((runs, count), 0.01),
+        predicted=np.full(count, 0.01),
+        joint=(runs, runs),
+        margins=rng.uniform(-0.1, 0.5, (runs, size.joints)),
+        planned=np.full(size.joints, 0.2),
+        fit=1.0,
+        misfits=0,
+        restarted=0,
+        troubles={},
+    )
+
+
+def campaign_figure(size: Size) -> Figure:
+    """Draw a campaign of three rounds."""
+    found = estimate(size)
+    rounds = tuple(
+        Round(
+            number=k,
+            theta=1.1 * found.theta,
+            predicted=0.03 / k * found.theta,
+            control=np.zeros((2, 1)),
+            recordings=found.recordings,
+            estimate=found,
+        )
+        for k in (1, 2, 3)
+    )
+    campaign = Campaign(
+        parameters=size.labels.parameters,
+        wanted=0.01 * found.theta,
+        rounds=rounds,
+        status=CampaignStatus.EXHAUSTED,
+    )
+    parameters = CampaignParameters(
+        names=size.labels.parameters,
+        units=size.labels.parameter_units,
+        guess=found.initial_theta,
+        interest=tuple(range(size.parameters)),
+        true=found.theta,
+    )
+    return plots.campaign_figure(campaign, parameters)
+
+
+FIGURES: dict[str, Callable[[Size], Figure]] = {
+    "campaign_figure": campaign_figure,
+    "check_figure": lambda size: plots.check_figure(check(size)),
+    "check_pairs": lambda size: plots.check_pairs(check(size)),
+    "compare_figure": lambda size: plots.compare_figure(comparison(size)),
+    "convergence": lambda size: plots.convergence(design(size)),
+    "estimate_pairs": lambda size: plots.estimate_pairs(estimate(size), size.labels),
+    "fit": lambda size: plots.fit(estimate(size), 0, size.labels, np.full(size.joints, 0.05)),
+    "held_out": lambda size: plots.held_out(estimate(size), 0, size.labels),
+    "histogram": lambda size: plots.histogram(make_study(size.parameters), 0, size.labels),
+    "limits": lambda size: plots.limits(design(size), size.labels),
+    "parameter_intervals": lambda size: plots.parameter_intervals(estimate(size), size.labels),
+    "parameter_trace": lambda size: plots.parameter_trace(estimate(size), size.labels),
+    "predictions": lambda size: plots.predictions(estimate(size), size.labels),
+    "residual_spectra": lambda size: plots.residual_spectra(estimate(size), size.labels),
+    "robustness_figure": lambda size: plots.robustness_figure(robustness(size)),
+    "sensitivity_phase": lambda size: plots.sensitivity_phase(design(size), size.labels),
+    "std_bars": lambda size: plots.std_bars(design(size), size.labels),
+    "study_overview": lambda size: plots.study_overview(make_study(size.parameters), size.labels),
+    "trajectories": lambda size: plots.trajectories(design(size), size.labels),
+}
+
+# Figures that are drawn quickly, in the fast tests.
+QUICK = ("check_figure", "limits", "predictions")
+
+
+def drawn(name: str, size: Size) -> Figure:
+    """Draw a figure with few dots per inch, which changes no place of a text."""
+    figure = FIGURES[name](size)
+    figure.set_dpi(50.0)
+    return figure
+
+
+def test_every_figure_is_tested() -> None:
+    assert {*FIGURES, "save"} == set(plots.__all__)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_texts_of_quick_figures_do_not_overlap(name: str) -> None:
+    assert misplaced_texts(drawn(name, WIDE)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [SMALL, USUAL, WIDE, LARGE], ids=str)
+@pytest.mark.parametrize("name", FIGURES)
+def test_texts_do_not_overlap_and_stay_inside(name: str, size: Size) -> None:
+    if name.endswith("_pairs") and size.parameters < 2:
+        pytest.skip("a pair needs two parameters")
+    assert misplaced_texts(drawn(name, size)) == []
+
+
+def test_overlapping_and_escaping_texts_are_found() -> None:
+    figure = Figure(figsize=(2.0, 1.0))
+    figure.text(0.5, 0.5, "one")
+    figure.text(0.52, 0.5, "two")
+    figure.text(0.9, 0.1, "leaves")
+    figure.text(0.5, 0.5, "hidden").set_visible(False)
+    assert misplaced_texts(figure) == ["leaves the figure: 'leaves'", "overlap: 'one' and 'two'"]
