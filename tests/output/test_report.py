@@ -18,6 +18,7 @@ from mjfim.output.report import REPORT
 from mjfim.output.report.build import page_of, rewrite_report, write_report
 from mjfim.output.report.correlations import correlation_of
 from mjfim.output.report.curves import packed, points_per_curve, thinned
+from mjfim.output.report.page import PlotGroup
 from mjfim.output.report.render import no_video_in, rendered, video_in
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
 from mjfim.output.video import Video
@@ -99,6 +100,20 @@ def test_every_plot_has_a_place_and_a_unit(verb: str) -> None:
     assert places == list(range(len(panels)))
     titles = re.findall(r"<figcaption><b>(.*?)</b>", html)
     assert all(re.search(r"\[.+\]", title) for title in titles), titles
+
+
+@pytest.mark.parametrize("verb", results.MAKERS)
+def test_every_name_in_a_legend_has_curves(verb: str) -> None:
+    """A click on it would hide nothing otherwise; bands are no curves."""
+    for section in page_of(record_of(verb)).sections:
+        groups = [part for part in section.parts if isinstance(part, PlotGroup)]
+        for legend, panels in [
+            *((group.keys, group.panels) for group in groups),
+            *((panel.keys, [panel]) for group in groups for panel in group.panels),
+        ]:
+            curves = {trace["legendgroup"] for p in panels for trace in p.traces if "name" in trace}
+            names = {key.name for key in legend if key.role != "band"}
+            assert names <= curves, (section.title, names - curves)
 
 
 @pytest.mark.parametrize("verb", results.MAKERS)

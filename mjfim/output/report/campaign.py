@@ -18,11 +18,10 @@ from mjfim.records.campaign import Campaign
 MAX_PARAMETERS = 12
 
 # Names of the curves in the legends.
-PREDICTED, ESTIMATED, WANTED, GUESS = (
+PREDICTED, ESTIMATED, WANTED = (
     "predicted before the round",
-    "estimated after the round",
+    "identified after the round",
     "wanted",
-    "guess",
 )
 
 
@@ -146,7 +145,7 @@ def _estimate_plots(campaign: Campaign, parameters: CampaignParameters) -> PlotG
                     "yaxis": axis(range=[float(ends.min()) - room, float(ends.max()) + room]),
                     "shapes": [level(guess, NOMINAL.word)],
                 },
-                remark=f"guess {guess:.4g}",
+                remark=f"{NOMINAL.word} {guess:.4g}",
             )
         )
     keys = [Key(name=ESTIMATED, role=IDENTIFIED.word)]

@@ -40,6 +40,9 @@ MAX_OUTPUTS = 12
 # Largest number of recordings whose signals are drawn.
 MAX_RECORDINGS = 8
 
+# Name of the identified parameters in the legend.
+WITH_INTERVAL = f"{IDENTIFIED.word}, 95 % interval"
+
 # Largest number of segments whose beginnings are drawn as lines.
 MAX_SEGMENTS = 20
 
@@ -108,11 +111,11 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
         panels.append(correlation_panel(correlation, names, "correlation of the estimates [–]"))
     keys = [
         Key(name=NOMINAL.word, role=NOMINAL.word),
-        Key(name=f"{IDENTIFIED.word}, 95 % interval", role=IDENTIFIED.word),
+        Key(name=WITH_INTERVAL, role=IDENTIFIED.word),
     ]
     note = (
         "The interval allows for residuals that are not white noise and for recordings that "
-        "disagree. A guess of 0 has no relative difference; see the table."
+        "disagree. A nominal value of 0 has no relative difference; see the table."
     )
     yield PlotGroup(title="", panels=panels, keys=keys, note=note)
     for part in summary.parts:
@@ -121,7 +124,7 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
 
 
 def _interval_panel(estimate: Estimate, names: Sequence[str]) -> Panel:
-    """Return the plot of the estimates with their intervals, relative to the guess."""
+    """Return the plot of the estimates with their intervals, relative to the nominal values."""
     guess = estimate.initial_theta
     percent = np.where(guess == 0.0, np.nan, np.abs(guess)) / 100.0
     centre = (estimate.theta - guess) / percent
@@ -136,7 +139,7 @@ def _interval_panel(estimate: Estimate, names: Sequence[str]) -> Panel:
         text = f"{name}: {Quantity(value=float(estimate.theta[j]), digits=5)} {unit}"
         texts.append(f"{text} (95 %: {left:.4g} to {right:.4g})" if known[j] else text)
 
-    estimates = dots(centre, rows, "estimate, 95 % interval", IDENTIFIED.word, size=9, texts=texts)
+    estimates = dots(centre, rows, WITH_INTERVAL, IDENTIFIED.word, size=9, texts=texts)
     estimates["error_x"] = {
         "type": "data",
         "symmetric": False,
@@ -146,13 +149,15 @@ def _interval_panel(estimate: Estimate, names: Sequence[str]) -> Panel:
         "thickness": 2,
         "width": 6,
     }
-    zero = dots(np.zeros(len(rows)), rows, "guess", NOMINAL.word, size=12, symbol="line-ns-open")
+    zero = dots(
+        np.zeros(len(rows)), rows, NOMINAL.word, NOMINAL.word, size=12, symbol="line-ns-open"
+    )
     zero["hoverinfo"] = "skip"
     return Panel(
-        title="difference from the guess, with 95 % interval [% of the guess]",
+        title="difference from the nominal value, with 95 % interval [%]",
         traces=[zero, estimates],
         layout={
-            "xaxis": axis("difference from the guess [%]"),
+            "xaxis": axis("difference from the nominal value [%]"),
             "yaxis": row_axis(names),
             "shapes": [level(0.0, NOMINAL.word, across="y", dash="solid")],
             "hovermode": "closest",
@@ -502,7 +507,7 @@ def _trace_plots(estimate: Estimate) -> PlotGroup | None:
             )
         )
     keys = [Key(name=IDENTIFIED.word, role=IDENTIFIED.word)]
-    note = "The dashed line is the guess."
+    note = "The dashed line is the nominal value."
     if len(estimate.parameters) > MAX_OUTPUTS:
         note += f" The first {MAX_OUTPUTS} of {len(estimate.parameters)} parameters are drawn."
     return PlotGroup(
