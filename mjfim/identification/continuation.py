@@ -45,6 +45,11 @@ MAX_SHARE = 0.5
 SEGMENT_ITERATIONS = 12
 RESTART_ITERATIONS = 25
 
+# Free initial states make an iteration over segments longer than one over whole recordings. All
+# fits over segments together take about the time of so many iterations over whole recordings.
+ITERATIONS_OF_ALL_SEGMENTS = 45
+FEWEST_SEGMENT_ITERATIONS = 3
+
 # Length of a step [standard deviations] at which a fit over segments ends; only its neighbourhood
 # is needed.
 SEGMENT_TOLERANCE = 0.1
@@ -82,8 +87,11 @@ def continued_fit(
 ) -> WholeFit:
     """Repeat a doubtful fit from fits over segments, and keep the result with the lower cost.
 
-    A fit is doubtful if it ended without convergence or does not explain the recordings. Nothing is
-    repeated where the user states the length of the segments, and with the method `newton`.
+    A search that then is stuck, because the residuals are rough, goes on with longer differences.
+
+    A fit is doubtful if it does not explain the recordings, or, where this cannot be tested because
+    the noise is estimated, if it ended without convergence. Nothing is repeated where the user
+    states the length of the segments, and with the method `newton`.
 
     Args:
         search: The searches of the identification.
@@ -97,6 +105,20 @@ def continued_fit(
     Raises:
         SimulationDivergedError: The simulation diverges at the solution of the first fit.
     """
+    kept = _better_of_two(search, problem, first, null_space)
+    found = search.over_roughness(kept.problem, kept.solution)
+    if found[1] is kept.solution:
+        return kept
+    return replace(kept, problem=found[0], solution=found[1], quality=fit_quality(*found))
+
+
+def _better_of_two(
+    search: FitSearch,
+    problem: FitProblem,
+    first: tuple[FitProblem, Solution],
+    null_space: NullSpace,
+) -> WholeFit:
+    """The first fit, or its repetition from fits over segments if that costs less."""
     task = search.task
     begun = WholeFit(problem=first[0], solution=first[1], quality=fit_quality(*first))
     stated = task.settings.segments is not None or task.method == "newton"
@@ -112,9 +134,13 @@ def continued_fit(
 
 
 def _is_doubtful(task: FitTask, fit: WholeFit) -> bool:
-    """Whether a fit may have ended in a local minimum, or before a minimum."""
+    """Whether a fit may have ended in a local minimum, or before a minimum.
+
+    Residuals that agree with the stated noise leave no lower minimum that matters.
+    """
     quality = fit.quality
-    if not fit.solution.success or quality.unexplained:
+    untested = not fit.solution.success and not task.noise_is_stated
+    if untested or quality.unexplained:
         return True
 
     reasons = misfit_reasons(
@@ -144,12 +170,14 @@ def _start_from_segments(
     places = np.array([names.index(name) for name in system.parameters.names], dtype=np.intp)
     theta = np.array(task.start)
 
-    for length in segment_lengths(problem.recordings):
+    all_lengths = segment_lengths(problem.recordings)
+    for length in all_lengths:
         part = _segment_problem(task, system, length)
         if part is None:
             continue
         part = part.pinned(theta[places], _of_parameters(null_space, places))
-        found = _fit_segments(search, part, theta[places], length)
+        iterations = _iterations(problem, part, len(all_lengths))
+        found = _fit_segments(search, part, theta[places], length, iterations)
         if found is None:
             continue
 
@@ -228,8 +256,25 @@ def _of_parameters(null_space: NullSpace, places: np.ndarray) -> NullSpace:
     return replace(null_space, directions=U[:, sizes > SMALLEST_DIRECTION])
 
 
+def _iterations(problem: FitProblem, part: FitProblem, count: int) -> int:
+    """Largest number of iterations of one of several fits over segments.
+
+    Args:
+        problem: The problem of the whole recordings.
+        part: The problem of the segments.
+        count: Number of fits over segments.
+    """
+    # Both are linearised by two simulations for each direction and one without a change.
+    whole, parts = (
+        1 + 2 * (int(each.layout.estimated.sum()) + each.simulation.private_count)
+        for each in (problem, part)
+    )
+    allowed = int(ITERATIONS_OF_ALL_SEGMENTS / count * whole / parts)
+    return min(max(allowed, FEWEST_SEGMENT_ITERATIONS), SEGMENT_ITERATIONS)
+
+
 def _fit_segments(
-    search: FitSearch, part: FitProblem, theta: Array, length: float
+    search: FitSearch, part: FitProblem, theta: Array, length: float, iterations: int
 ) -> UnknownValues | None:
     """Unknowns of a fit over segments of a length [s]; None where it diverges at its start.
 
@@ -238,7 +283,7 @@ def _fit_segments(
     subset = quick_subset(part)
     some = part.of_segments(subset)
     settings = SearchSettings(
-        max_iterations=SEGMENT_ITERATIONS, tolerance=SEGMENT_TOLERANCE, relinearise_at_end=False
+        max_iterations=iterations, tolerance=SEGMENT_TOLERANCE, relinearise_at_end=False
     )
     phase = f"segments of {length:.2g} s"
     found = search.minimise(some, some.begin(theta), settings, phase)

@@ -165,6 +165,7 @@ def _linearise(
     theta[places] = at.theta
 
     wider = FitProblem.of(extended, recordings).of_segments(segments).with_noise(problem.noise)
+    wider = replace(wider, difference_step=problem.difference_step)
     condensed = wider.condense(replace(at, theta=theta))
     if condensed is None:
         return None

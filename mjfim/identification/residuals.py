@@ -113,6 +113,7 @@ class FitProblem:
         loss: Loss of a whitened residual.
         pins: Combinations that no recording determines, and their values.
         with_priors: Whether priors of the parameters count.
+        difference_step: Relative step of the two-sided differences of a linearisation.
     """
 
     simulation: SegmentSimulation
@@ -121,6 +122,7 @@ class FitProblem:
     loss: RobustLoss
     pins: Pins
     with_priors: bool
+    difference_step: float = SENSITIVITY_STEP
 
     @classmethod
     def of(
@@ -206,6 +208,20 @@ class FitProblem:
             The problem.
         """
         return replace(self, noise=noise)
+
+    def with_longer_differences(self, factor: float) -> FitProblem:
+        """This problem with longer steps of the differences that linearise it.
+
+        They give the slope of the trend where contacts, dry friction or chaos make the residuals
+        rough, and are less accurate where the residuals are smooth.
+
+        Args:
+            factor: Factor by which the steps are longer.
+
+        Returns:
+            The problem.
+        """
+        return replace(self, difference_step=factor * self.difference_step)
 
     def of_segments(self, indices: np.ndarray) -> FitProblem:
         """The problem of some segments only; only their rows count.
@@ -462,7 +478,7 @@ class FitProblem:
         blocks = np.zeros((int(self._block_offsets[-1]), m, m))
         segment_of_block = np.repeat(np.arange(len(self.segments)), np.diff(self._block_offsets))
 
-        for rows in self.simulation.rows(at, derivatives=True):
+        for rows in self.simulation.rows(at, derivatives=True, step=self.difference_step):
             if rows is None:
                 return None
 
@@ -499,7 +515,7 @@ class FitProblem:
         residuals = []
         jacobians = []
 
-        for rows in self.simulation.rows(at, derivatives=True):
+        for rows in self.simulation.rows(at, derivatives=True, step=self.difference_step):
             if rows is None:
                 return None
             _, residual, J = self._linearised(rows)

@@ -59,6 +59,12 @@ MAX_NOISE_ROUNDS = 10
 # Relative change of an estimated standard deviation below which it has converged.
 NOISE_TOLERANCE = 0.01
 
+# Factors by which the differences of the derivatives are longer where the residuals are rough.
+LONGER_DIFFERENCES = (100.0, 1000.0)
+
+# Iterations of a search with longer differences.
+ROUGH_ITERATIONS = 15
+
 # Smallest estimated standard deviation, as a share of the stated one.
 MIN_NOISE_SHARE = 1e-3
 
@@ -178,10 +184,7 @@ class FitSearch:
         Raises:
             SimulationDivergedError: The simulation diverges at the begin.
         """
-        settings = self._final_settings(problem)
-        if max_iterations is not None:
-            fewest = min(max_iterations, settings.max_iterations)
-            settings = replace(settings, max_iterations=fewest)
+        settings = self._final_settings(problem, max_iterations)
         solution = self._minimise(problem, begin, settings, phase)
         if self.task.noise_is_stated:
             return problem, solution
@@ -203,14 +206,50 @@ class FitSearch:
                 break
         return problem, solution
 
-    def _final_settings(self, problem: FitProblem) -> SearchSettings:
-        """Settings of the search over all data."""
+    def over_roughness(
+        self, problem: FitProblem, solution: Solution
+    ) -> tuple[FitProblem, Solution]:
+        """Continue a search that ended because no step lowered the cost.
+
+        Contacts, dry friction and chaos make residuals rough: derivatives of short differences then
+        do not show where the cost falls. Longer differences show the trend.
+
+        Args:
+            problem: Problem of all segments.
+            solution: Where the search ended.
+
+        Returns:
+            The problem and its solution, unchanged after a search that ended otherwise.
+        """
+        for factor in LONGER_DIFFERENCES:
+            if not solution.stuck or self.task.method == "newton" or self.interrupted():
+                break
+            longer = problem.with_longer_differences(factor)
+            settings = self._final_settings(longer, ROUGH_ITERATIONS)
+            phase = "all data, longer differences"
+            found = self.minimise(longer, solution.unknowns, settings, phase)
+            if found is None:
+                break
+            if found.success:
+                return longer, found
+
+            # A lower cost counts, but slopes that lead nowhere do not.
+            condensed = problem.condense(found.unknowns)
+            if condensed is not None and found.cost < solution.cost:
+                solution = replace(found, condensed=condensed)
+        return problem, solution
+
+    def _final_settings(
+        self, problem: FitProblem, max_iterations: int | None = None
+    ) -> SearchSettings:
+        """Settings of the search over all data, with at most some iterations."""
         if self.task.method == "newton":
             return NEWTON
 
-        settings = SearchSettings(
-            max_iterations=self.task.settings.max_iterations, tolerance=FINAL_TOLERANCE
-        )
+        iterations = self.task.settings.max_iterations
+        if max_iterations is not None:
+            iterations = min(iterations, max_iterations)
+        settings = SearchSettings(max_iterations=iterations, tolerance=FINAL_TOLERANCE)
         samples = problem.sample_count * 2 * len(self.task.system.parameters)
         if samples < SAMPLES_OF_MUCH_DATA:
             return settings

@@ -173,6 +173,7 @@ class Solution:
         interrupted: True where the stop token ended the search.
         iterates: The begin and all accepted values, with the private unknowns of the first segment
             only.
+        stuck: True where no step lowered the cost, although the linearisation predicts one.
     """
 
     unknowns: UnknownValues
@@ -183,6 +184,7 @@ class Solution:
     status: str
     interrupted: bool = False
     iterates: tuple[UnknownValues, ...] = ()
+    stuck: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -512,11 +514,12 @@ class _Search:
         if predicted.common_length < SHORT_STEP and predicted.private_length < SHORT_STEP:
             return self._solution("converged: the residual stopped falling", success=True)
 
-        return self._solution(
+        solution = self._solution(
             "stopped: no step lowers the residual any more, though the linearised model predicts "
             "one",
             success=False,
         )
+        return replace(solution, stuck=True)
 
     def _stopped(self, reason: StopReason) -> Solution:
         """Best values so far, where the budget is exhausted."""
