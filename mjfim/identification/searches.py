@@ -230,6 +230,7 @@ class FitSearch:
             found = self.minimise(longer, solution.unknowns, settings, phase)
             if found is None:
                 break
+            found = replace(found, iterates=(*solution.iterates, *found.iterates[1:]))
             if found.success:
                 return longer, found
 
