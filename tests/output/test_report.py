@@ -172,7 +172,7 @@ def test_a_design_shows_its_tables_and_curves() -> None:
 
 def test_an_estimate_shows_predictions_and_residuals() -> None:
     html = html_of("identify")
-    for heading in ("Parameters", "Predictions", "Signals", "Residuals"):
+    for heading in ("Parameters", "Predictions", "Signals", "Residuals", "Search"):
         assert f"<h2>{heading}</h2>" in html
     assert "Autocorrelation of the residuals" in html
     assert "Spectrum of the residuals" in html

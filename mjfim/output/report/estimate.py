@@ -332,8 +332,7 @@ def _fit_plots(estimate: Estimate, labels: Labels, columns: Sequence[int]) -> It
     """Yield the measured and the identified signals of every recording, and their residuals."""
     shown = estimate.recordings[:MAX_RECORDINGS]
     outputs = estimate.recordings[0].outputs
-    nominal: tuple[Array, ...] = getattr(estimate, "nominal", ())
-    segments: tuple[Array, ...] = getattr(estimate, "segments", ())
+    nominal, segments = estimate.nominal, estimate.segments
     for i, recording in enumerate(shown):
         signals = _Signals(
             recording=recording,
@@ -482,7 +481,7 @@ def _spectrum_panel(residuals: Residuals, name: str) -> Panel:
 
 def _trace_plots(estimate: Estimate) -> PlotGroup | None:
     """Return the parameters over the iterations of the fit; None where they are not known."""
-    trace: Array = getattr(estimate, "trace", np.zeros((0, 0)))
+    trace = estimate.trace
     if len(trace) < 2:
         return None
 
