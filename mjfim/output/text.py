@@ -26,8 +26,10 @@ from mjfim.output.terminal_tables import fold, table_text
 # and about its files, the output has less than 25 lines.
 MAX_LINES = 20
 
-# Number of rows or sentences that the short form shows at least of each table and list.
-FEWEST = 4
+# Number of rows of results, and of other rows or sentences of each table and list, that the short
+# form shows if others can be left out instead.
+FEWEST_RESULTS = 10
+FEWEST = 2
 
 # Rich style of every emphasis.
 STYLES = {
@@ -167,16 +169,20 @@ def _plural(noun: str) -> str:
 
 
 def _shorten(blocks: Sequence[_Block]) -> None:
-    """Leave out units until the short form has few enough lines; explanations go first."""
-    explanations = [block for block in blocks if block.is_explanation]
-    _reduce(explanations, blocks, fewest=0)
-    _reduce(blocks, blocks, fewest=FEWEST)
-    _reduce(blocks, blocks, fewest=1)
+    """Leave out units until the short form has few enough lines.
 
-    # The verdict and the first table remain in the smallest terminal.
+    Explanations go first. The first table, which has the results, keeps its rows longest.
+    """
+    _reduce([block for block in blocks if block.is_explanation], blocks, fewest=0)
+
     tables = [block for block in blocks if block.is_table and block.kind != "sentence"]
-    kept = [block for block in tables[:1] if block.units]
-    _reduce([block for block in blocks if block not in kept], blocks, fewest=0)
+    results = [block for block in tables[:1] if block.units]
+    others = [block for block in blocks if block not in results]
+    _reduce(others, blocks, fewest=FEWEST)
+    _reduce(results, blocks, fewest=FEWEST_RESULTS)
+    _reduce(others, blocks, fewest=1)
+    _reduce(results, blocks, fewest=1)
+    _reduce(others, blocks, fewest=0)
 
 
 def _reduce(some: Sequence[_Block], blocks: Sequence[_Block], *, fewest: int) -> None:

@@ -47,11 +47,11 @@ def estimate(task: DesignTask, design: Design) -> Estimate:
     )
 
 
-def printed(summary: Summary) -> str:
+def printed(summary: Summary, *, verbose: bool = False) -> str:
     """Text in a wide terminal without colours."""
     console = Console(width=200, no_color=True)
     with console.capture() as capture:
-        console.print(render(summary))
+        console.print(render(summary, verbose=verbose))
     return capture.get()
 
 
@@ -91,12 +91,15 @@ def test_the_terminal_and_markdown_show_the_same_numbers(task: DesignTask, desig
 def test_an_estimate_names_units_bounds_and_warnings(estimate: Estimate) -> None:
     """Units, bounds and warnings are in the terminal and in the Markdown."""
     odd = replace(estimate, at_bound=("l",), misfit=True, warnings=("residuals are [odd]",))
-    for text in (printed(describe_estimate(odd)), estimate_text(odd, "see the report")):
+    for text in (
+        printed(describe_estimate(odd), verbose=True),
+        estimate_text(odd, "see the report"),
+    ):
         assert "N m s/rad" in text
         assert "at bound" in text
         assert "residuals are [odd]" in text
         assert "not explained by noise: the formal σ underestimates the errors" in text
-    assert "at bound" not in printed(describe_estimate(estimate))
+    assert "at bound" not in printed(describe_estimate(estimate), verbose=True)
 
 
 def test_inseparable_parameters_are_marked(task: DesignTask, design: Design) -> None:

@@ -36,15 +36,7 @@ MANY = tuple(f"{LONG[:-2]}{j:02d}" for j in range(30))
 FEW = ("m", "l", "c")
 
 # Begins of the first row of the first table.
-BEGINS = (
-    "m",
-    "nominal",
-    "▶",
-    LONG[:-2] + "00",
-    "left_forearm_and_hand_with_",
-    "left_forearm_and_hand_",
-    "left_",
-)
+BEGINS = ("m ", "nominal", "▶", "left_")
 
 WARNING = (
     "not smooth: derivatives with two different difference steps disagree by 2.6 % for "
@@ -223,7 +215,7 @@ def test_the_short_form_is_short_and_cuts_nothing(
 
     # It begins with the verdict, and shows the first parameter or method.
     assert letters("".join(lines)).startswith(letters(summary.outcome)[1:], 1)
-    assert any(line.split()[0] in BEGINS for line in lines)
+    assert any(line.startswith(BEGINS) for line in lines)
 
 
 @pytest.mark.parametrize("width", [80, 120])

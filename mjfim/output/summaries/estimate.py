@@ -18,6 +18,7 @@ from mjfim.output.summary_parts import (
     Row,
     Summary,
     SummaryTable,
+    capitalised,
     columns,
 )
 from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
@@ -28,6 +29,9 @@ MAX_DIGITS = 9
 
 # Heading of the standard deviation that is right if the model and the noise are.
 FORMAL = "formal σ"
+
+# Heading of the column that marks estimates at a bound.
+AT_BOUND = "at bound"
 
 # Mark of recordings that are part of the last fit, and its meaning.
 FITTED_MARK = " *"
@@ -43,7 +47,8 @@ def describe_estimate(estimate: Estimate) -> Summary:
     Args:
         estimate: The estimate.
     """
-    parts: list[Part] = [_estimate_table(estimate)]
+    fit = Paragraph(text=capitalised(_fit_sentence(estimate)))
+    parts: list[Part] = [_estimate_table(estimate), fit]
     if estimate.restart is not None:
         parts.append(Paragraph(text=str(estimate.restart)))
     if estimate.predictions:
@@ -75,7 +80,7 @@ def describe_estimate(estimate: Estimate) -> Summary:
     )
     return Summary(
         title="Estimated parameters",
-        outcome=f"{estimate.status}; {_fit_sentence(estimate)}",
+        outcome=estimate.status,
         parts=tuple(parts),
         warnings=estimate.warnings,
     )
@@ -111,17 +116,18 @@ def _estimate_table(estimate: Estimate) -> SummaryTable:
             *uncertainty,
             "yes" if name in estimate.at_bound else "",
         )
-        rows.append(Row(cells=cells))
+        emphasis = Emphasis.WARNING if name in estimate.at_bound else Emphasis.NORMAL
+        rows.append(Row(cells=cells, emphasis=emphasis))
 
     headings = ["parameter", NOMINAL.word, IDENTIFIED.word, FORMAL, "honest σ", "95 % low", "high"]
     if estimate.at_bound:
-        headings.append("at bound")
+        headings.append(AT_BOUND)
     else:
         rows = [Row(cells=row.cells[:-1]) for row in rows]
     return SummaryTable(
         key="estimates",
         title="Estimates with their 95 % intervals",
-        columns=columns(*headings, details=[FORMAL]),
+        columns=columns(*headings, details=[FORMAL, AT_BOUND]),
         rows=tuple(rows),
     )
 
