@@ -18,6 +18,7 @@ from mjfim.excitation.interior_problem import values_of
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.short_steps import ShortSteps
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.schema import Experiment
@@ -35,6 +36,9 @@ SMOOTH_POWER = 40.0
 # Growth of a small deviation along the trajectory above which the projection uses feedback. It is
 # larger than without hard limits, because steps are shorter here.
 FEEDBACK_THRESHOLD = 100.0
+
+# Share of the budget of a design after which a descent has to be better than random controls.
+PATIENCE_WITHOUT_PROGRESS = 0.35
 
 # Weight of an eigenvector, relative to the largest weight, below which the gradient leaves it out.
 MIN_EIGENVECTOR_WEIGHT = 3e-3
@@ -62,6 +66,9 @@ class ConstrainedSearch:
         tightening: Share of half of each range that is held back, by kind of constraint.
         inside_first: Steer the control inside all limits before the cost is minimised, however
             little it violates them.
+        until_held_up: End the search when its steps become very short.
+        cost_to_beat: End the search, too, where it has not found a lower cost than this after
+            `PATIENCE_WITHOUT_PROGRESS` of the budget of the whole design.
     """
 
     experiment: Experiment
@@ -76,6 +83,8 @@ class ConstrainedSearch:
     threads: int | None = None
     tightening: Mapping[str, float] = field(default_factory=dict)
     inside_first: bool = False
+    until_held_up: bool = False
+    cost_to_beat: float = np.inf
 
     def run(self, task: DesignTask | None = None) -> Generator[DesignEvent, None, RunResult]:
         """Run the search.
@@ -197,6 +206,7 @@ class _Search:
         result = RunResult(name=self.order.start.name)
         status: Status | None = None
         best_of_stages: dict[float, Array] = {}
+        steps = ShortSteps()
         control = self.task.averaged(self.order.start.control)
 
         # A simulation that diverges ends this search, not those of other initial controls.
@@ -217,13 +227,21 @@ class _Search:
                 result = replace(result, history=extended(result.history, [row]))
                 yield DesignEvent(start=result.name, row=row)
 
-                if self.budget.stop.requested:
+                has_short_steps = steps.hold_up(row.gamma, row.mu) and self.order.until_held_up
+                is_held_up = has_short_steps or self._is_too_slow(result.cost)
+                result = replace(result, is_held_up=is_held_up)
+                if is_held_up or self.budget.stop.requested:
                     break
         except (SimulationDivergedError, np.linalg.LinAlgError):
             status = Status.STALLED
 
         earlier = tuple(best_of_stages.values())[:-1]
         return replace(result, status=self._final_status(result, status), earlier=earlier)
+
+    def _is_too_slow(self, cost: float) -> bool:
+        """Check whether the search has not reached the cost that it should have reached by now."""
+        is_late = self.order.budget.used > PATIENCE_WITHOUT_PROGRESS
+        return is_late and cost > self.order.cost_to_beat
 
     def _exact_point(self, iterate: BarrierIterate) -> DesignPoint | None:
         """Point of the iterate with the exact cost over all repetitions; None without a cost."""

@@ -21,13 +21,14 @@ from mjfim.excitation.controls_within_limits import (
 )
 from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.levels import DescentLevel, coarse_level, easier_level
-from mjfim.excitation.multistart import Multistart
+from mjfim.excitation.levels import DescentLevel, coarse_level
+from mjfim.excitation.limited_search import LimitedSearch
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import verify
+from mjfim.information.smoothness import roughness
 from mjfim.records.design import Status
 
 
@@ -99,19 +100,36 @@ class ControlSearch:
             inside = ControlsWithinLimits(cost=limited, budget=self.budget).best(inside)
             starts[0] = InitialControl(name=starts[0].name, control=inside.begin)
 
-        free = limited.level
-        multistart = Multistart(
-            fine=free, coarse=easier_level(free), executor=self.executor, budget=self.budget
+        search = LimitedSearch(
+            limited=limited,
+            is_rough=self._is_rough(starts[0].control),
+            executor=self.executor,
+            budget=self.budget,
         )
-        constrained = yield from multistart.run(starts)
-        constrained = yield from multistart.tighten_winner(constrained)
-
+        constrained = yield from search.run(starts, inside)
         found = [self._on_stated_plant(result) for result in constrained]
         results += self._not_worse(found, inside)
         if results:
             steps = results[0].steps + steps_without_barrier
             results[0] = replace(results[0], steps=steps)
         return results
+
+    def _is_rough(self, control: Array) -> bool:
+        """Check whether derivatives fail somewhere along a control, if it is the initial one."""
+        task = self.stage.task
+        if control is not task.control or self.first.trajectory is None:
+            return False
+
+        model = task.system.model_at(task.theta)
+        found = roughness(
+            task.plant,
+            task.system.noise,
+            model,
+            task.theta,
+            self.first.trajectory,
+            self.first.sensitivity,
+        )
+        return found is not None
 
     def _is_far_outside(self, control: Array, limited: LimitedCost) -> bool:
         """Check whether a control is far outside; that of the initial control is known."""

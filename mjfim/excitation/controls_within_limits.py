@@ -8,7 +8,7 @@ begins with the best of these controls. All of them are judged by simulations wi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -152,6 +152,7 @@ class InsideControl:
         about: (nu,) control about which it deviates [u-unit].
         deviation: (N, nu) deviation [u-unit].
         cost: J along the control.
+        criterion: phi, the information term of the cost.
         min_eigenvalue: Smallest eigenvalue of the information per second that the cost uses.
         share: Share of a larger deviation.
     """
@@ -159,6 +160,7 @@ class InsideControl:
     about: Array
     deviation: Array
     cost: float
+    criterion: float
     min_eigenvalue: float
     share: float = 1.0
 
@@ -205,10 +207,12 @@ class ControlsWithinLimits:
     Attributes:
         cost: Cost of controls that keep all limits.
         budget: Time of the whole design, and the token that stops it.
+        share: Share of the budget after which no further control is tried.
     """
 
     cost: LimitedCost
     budget: Budget
+    share: float = TRIAL_SHARE
 
     def scaled(self, control: Array) -> InsideControl | None:
         """Scale a control about each control that nearly holds the start; the best one counts.
@@ -223,7 +227,7 @@ class ControlsWithinLimits:
         for centre in self.cost.level.task.centres:
             if self.budget.stop.requested:
                 break
-            inside = self._largest(centre, self._fitted(control - centre))
+            inside = self.largest(centre, self.fitted(control - centre))
             if inside is not None:
                 found.append(inside)
         return min(found, key=lambda inside: inside.cost, default=None)
@@ -237,46 +241,46 @@ class ControlsWithinLimits:
         Returns:
             The best of it, of random controls of several bandwidths and of changes of the best one.
         """
-        best = self._enlarged(scaled)
+        best = self.enlarged(scaled)
         rng = np.random.default_rng(self.cost.level.task.experiment.descent.seed)
 
         for deviation in self._random(rng):
             best = self._better(best, deviation)
 
         for _ in range(CHANGES):
-            if self._is_over:
+            if self.is_over:
                 break
             best = self._better(best, self._changed(best.deviation, rng))
         return best
 
     @property
-    def _is_over(self) -> bool:
+    def is_over(self) -> bool:
         """Whether no further control is tried."""
-        return self.budget.exhausted is not None or self.budget.used > TRIAL_SHARE
+        return self.budget.exhausted is not None or self.budget.used > self.share
 
     def _better(self, best: InsideControl, deviation: Array) -> InsideControl:
         """The best control so far, or a new one of any size where that costs less."""
-        found = self._largest(best.about, deviation)
+        found = self.largest(best.about, deviation)
         if found is None or found.cost >= best.cost:
             return best
-        return self._enlarged(found)
+        return self.enlarged(found)
 
     def _random(self, rng: np.random.Generator) -> Iterator[Array]:
         """Random deviations, (N, nu) each, that reach the bounds of the controls."""
         widths = self.cost.constraints.control.bounds.scale
         for bandwidth in BANDWIDTHS:
-            if self._is_over:
+            if self.is_over:
                 return
-            noise = self._noise(bandwidth, rng)
-            yield self._fitted(widths * noise / np.abs(noise).max(axis=0))
+            noise = self.noise(bandwidth, rng)
+            yield self.fitted(widths * noise / np.abs(noise).max(axis=0))
 
     def _changed(self, deviation: Array, rng: np.random.Generator) -> Array:
         """A deviation, (N, nu), with a random change of every actuator in proportion to it."""
-        noise = self._noise(float(rng.choice(BANDWIDTHS)), rng)
+        noise = self.noise(float(rng.choice(BANDWIDTHS)), rng)
         sizes = np.sqrt((deviation**2).mean(axis=0) / (noise**2).mean(axis=0))
-        return np.asarray(deviation + self._fitted(CHANGE_SIZE * sizes * noise))
+        return np.asarray(deviation + self.fitted(CHANGE_SIZE * sizes * noise))
 
-    def _noise(self, bandwidth: float, rng: np.random.Generator) -> Array:
+    def noise(self, bandwidth: float, rng: np.random.Generator) -> Array:
         """Random curves that fade in, and fade out where the design ends at rest.
 
         Args:
@@ -297,7 +301,7 @@ class ControlsWithinLimits:
         begin = np.clip(np.arange(N)[:, None] / (FADE_SHARE * N), 0.0, 1.0)
         return np.asarray(begin * task.fade(N) * np.fft.irfft(spectrum, n=N, axis=0))
 
-    def _fitted(self, deviation: Array) -> Array:
+    def fitted(self, deviation: Array) -> Array:
         """The nearest deviation, (N, nu), that has the bandwidth which the experiment allows."""
         task = self.cost.level.task
         basis = bandwidth_basis(task, task.stated_times)
@@ -305,10 +309,40 @@ class ControlsWithinLimits:
             return deviation
         return np.asarray(basis @ np.linalg.lstsq(basis, deviation)[0])
 
-    def _largest(self, about: Array, deviation: Array) -> InsideControl | None:
-        """Find the largest share of a deviation, (N, nu), that keeps all limits."""
+    def largest(self, about: Array, deviation: Array) -> InsideControl | None:
+        """Find the largest share of a deviation that keeps all limits.
+
+        Args:
+            about: (nu,) control about which it deviates [u-unit].
+            deviation: (N, nu) deviation [u-unit].
+
+        Returns:
+            The control; None where no share keeps all limits, or where it tells nothing.
+        """
+        for keeps in (self._nearly_keeps, self._keeps):
+            share = self._largest_share(about, deviation, keeps)
+            if share is None:
+                return None
+            found = self.inside(about, share * deviation, share)
+            if found is not None:
+                return found
+        return None
+
+    def _nearly_keeps(self, control: Array) -> bool:
+        """Check the limits on the plant of the search only, which is much quicker."""
+        values = self.cost.values(control)
+        return values is not None and self.cost.constraints.is_feasible(values)
+
+    def _keeps(self, control: Array) -> bool:
+        """Check the limits on the unmodified model as well."""
+        return self.cost.trajectory(control) is not None
+
+    def _largest_share(
+        self, about: Array, deviation: Array, keeps: Callable[[Array], bool]
+    ) -> float | None:
+        """The largest share of a deviation, (N, nu), with which a control passes a test."""
         share, outside = 1.0, np.inf
-        while self.cost.trajectory(about + share * deviation) is None:
+        while not keeps(about + share * deviation):
             share, outside = SHARE_STEP * share, share
             if share < LEAST_SHARE or self.budget.stop.requested:
                 return None
@@ -316,13 +350,13 @@ class ControlsWithinLimits:
         # Bisect between the share that keeps the limits and the next larger one that does not.
         while np.isfinite(outside) and outside > SHARE_RATIO * share:
             middle = float(np.sqrt(share * outside))
-            if self.cost.trajectory(about + middle * deviation) is not None:
+            if keeps(about + middle * deviation):
                 share = middle
             else:
                 outside = middle
-        return self._inside(about, share * deviation, share)
+        return share
 
-    def _inside(self, about: Array, deviation: Array, share: float) -> InsideControl | None:
+    def inside(self, about: Array, deviation: Array, share: float) -> InsideControl | None:
         """A control with its cost; None where it violates a limit or tells nothing."""
         point = self.cost.point(about + deviation)
         if point is None or point.criterion is None or not np.isfinite(point.cost):
@@ -331,26 +365,33 @@ class ControlsWithinLimits:
             about=about,
             deviation=deviation,
             cost=point.cost,
+            criterion=point.criterion.value,
             min_eigenvalue=float(point.criterion.eigenvalues[0]),
             share=share,
         )
 
-    def _enlarged(self, inside: InsideControl) -> InsideControl:
+    def enlarged(self, inside: InsideControl) -> InsideControl:
         """Enlarge the deviation of one actuator after the other while all limits hold."""
-        actuators = inside.deviation.shape[1]
-        factors = np.ones(actuators)
-        if actuators == 1:
+        if inside.deviation.shape[1] == 1:
             return inside
 
+        for keeps in (self._nearly_keeps, self._keeps):
+            factors = self._largest_factors(inside, keeps)
+            found = self.inside(inside.about, factors * inside.deviation, inside.share)
+            if found is not None:
+                return found if found.cost < inside.cost else inside
+        return inside
+
+    def _largest_factors(self, inside: InsideControl, keeps: Callable[[Array], bool]) -> Array:
+        """(nu,) factors of the deviations of the actuators with which a control passes a test."""
+        actuators = inside.deviation.shape[1]
+        factors = np.ones(actuators)
         for factor in SINGLE_FACTORS:
             for i in range(actuators):
                 larger = np.array(factors)
                 larger[i] *= factor
-                deviation = larger * inside.deviation
-                if self._is_over:
-                    break
-                if self.cost.trajectory(inside.about + deviation) is not None:
+                if self.is_over:
+                    return factors
+                if keeps(inside.about + larger * inside.deviation):
                     factors = larger
-
-        found = self._inside(inside.about, factors * inside.deviation, inside.share)
-        return inside if found is None or found.cost >= inside.cost else found
+        return factors

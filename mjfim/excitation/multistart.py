@@ -84,12 +84,18 @@ class Multistart:
         coarse: A level that is quicker to simulate, or smoother; None without one.
         executor: Runs the starts side by side; None to run them one by one in this process.
         budget: Time of the whole design, and the token that stops it.
+        until_held_up: End searches whose steps become very short.
+        cost_to_beat: Cost that random controls have reached, see `ConstrainedSearch`.
+        iterations_done: Iterations of the design before.
     """
 
     fine: DescentLevel
     coarse: DescentLevel | None
     executor: Executor | None = None
     budget: Budget
+    until_held_up: bool = False
+    cost_to_beat: float = np.inf
+    iterations_done: int = 0
 
     def run(self, starts: Sequence[InitialControl]) -> Runs:
         """Optimise from all starts in two rounds.
@@ -163,7 +169,7 @@ class Multistart:
             )
             for result in repeated:
                 if np.isfinite(result.cost):
-                    results[winner] = _append_run(results[winner], result)
+                    results[winner] = append_run(results[winner], result)
 
         results = self._repaired(results)
         if any(np.isfinite(result.cost) for result in results) or self.budget.stop.requested:
@@ -285,7 +291,7 @@ class Multistart:
             inside_first=True,
         )
         for run in self._repaired(runs):
-            return _append_run(result, run)
+            return append_run(result, run)
         return result
 
     # ---- properties of the task
@@ -417,7 +423,7 @@ class Multistart:
     @property
     def _max_iterations(self) -> int:
         """Largest number of iterations of one start over all rounds."""
-        return self.fine.task.experiment.descent.max_iterations
+        return max(self.fine.task.experiment.descent.max_iterations - self.iterations_done, 1)
 
     def _run_single_round(self, starts: Sequence[InitialControl]) -> Runs:
         """Optimise on the stated plant with all barrier weights."""
@@ -492,6 +498,8 @@ class Multistart:
                 threads=threads,
                 tightening=tightening or {},
                 inside_first=inside_first,
+                until_held_up=self.until_held_up,
+                cost_to_beat=self.cost_to_beat,
             )
             for start in starts
         ]
@@ -586,6 +594,7 @@ def _merge(first: RunResult, second: RunResult) -> RunResult:
         steps=first.steps + second.steps,
         status=second.status,
         slope=second.slope,
+        is_held_up=second.is_held_up,
     )
     merged = replace(merged, earlier=(*first.earlier, *second.earlier))
     if second.control is not None and second.cost <= first.cost:
@@ -600,7 +609,7 @@ def _merge(first: RunResult, second: RunResult) -> RunResult:
     return merged
 
 
-def _append_run(first: RunResult, second: RunResult) -> RunResult:
+def append_run(first: RunResult, second: RunResult) -> RunResult:
     """The second result, with the history and the engine steps of both."""
     return replace(
         second,

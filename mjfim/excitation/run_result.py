@@ -35,6 +35,7 @@ class RunResult:
             larger distances from the limits, and replace the control where that violates a limit
             of the unmodified model.
         left_limits: True where a run without a barrier ended because it left the limits.
+        is_held_up: True where a run under hard limits ended because its steps were very short.
     """
 
     name: str
@@ -48,6 +49,7 @@ class RunResult:
     is_feasible: bool = True
     earlier: tuple[Array, ...] = ()
     left_limits: bool = False
+    is_held_up: bool = False
 
     @property
     def start_result(self) -> StartResult:

@@ -67,6 +67,24 @@ def stiff_arm_experiment(folder: Path, amplitude: float = 0.3, **tables: Any) ->
     return Experiment(**{**stated, **tables}, directory=folder)
 
 
+def dry_arm_experiment(folder: Path, **tables: Any) -> Experiment:
+    """The same arm with dry friction, which hides gentle swings: derivatives hardly hold.
+
+    Args:
+        folder: Folder for the model.
+        **tables: Tables of the experiment that replace those of `stiff_arm_experiment`.
+    """
+    parameters = {
+        "mass": {"target": "body/fore:mass"},
+        "damping": {"target": "joint/shoulder:damping"},
+        "friction": {"target": "joint/shoulder:frictionloss"},
+    }
+    experiment = stiff_arm_experiment(folder, 0.0005, **{"parameters": parameters, **tables})
+    dry = STIFF_ARM.replace('damping="0.6"', 'damping="0.6" frictionloss="0.05"')
+    (folder / "stiff_arm.xml").write_text(dry, encoding="utf-8")
+    return experiment
+
+
 def stiff_arm_task(folder: Path, amplitude: float = 0.3, **tables: Any) -> DesignTask:
     """The task of `stiff_arm_experiment`."""
     return DesignTask.resolve(stiff_arm_experiment(folder, amplitude, **tables), threads=1)

@@ -1,0 +1,200 @@
+"""Search within hard limits: descents, and random changes where these gain more."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.budget import Budget
+from mjfim.excitation.controls_within_limits import (
+    ControlsWithinLimits,
+    InsideControl,
+    LimitedCost,
+)
+from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.levels import easier_level
+from mjfim.excitation.multistart import Multistart, append_run
+from mjfim.excitation.random_search import LEAST_PROGRESS, PATIENCE, RandomSearch
+from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.task import DesignTask
+from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
+
+# Share of the time for random controls before a descent whose derivatives may mislead.
+PROBE_SHARE = 0.05
+
+# Share of the time that is left for random changes of a control, between two descents, and for the
+# report of the design after the last changes.
+RANDOM_SHARE = 0.5
+CLOSING_SHARE = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LimitedSearch:
+    """Search for the best control within hard limits.
+
+    Where contacts open and close, or where dry friction changes its sign, a descent may be held
+    up far from any optimum. Random changes need no derivatives, and then gain more in the same
+    time.
+
+    Attributes:
+        limited: Cost of controls that keep all limits.
+        is_rough: Whether derivatives fail somewhere along the first start.
+        executor: Runs several starts side by side, or None.
+        budget: Time of the search and the token that stops it.
+    """
+
+    limited: LimitedCost
+    is_rough: bool
+    executor: Executor | None
+    budget: Budget
+
+    def run(self, starts: list[InitialControl], inside: InsideControl | None) -> Runs:
+        """Descend from several starts, and change controls at random where that gains more.
+
+        Args:
+            starts: The initial controls.
+            inside: A control that keeps all limits, or None.
+        """
+        search = RandomSearch(
+            cost=self.limited,
+            name=starts[0].name,
+            time=self.budget,
+            seed=self._task.experiment.descent.seed,
+        )
+
+        # Where derivatives may mislead, a descent has to be better than some random controls.
+        best, cost_to_beat = inside, np.inf
+        if self.is_rough:
+            best = self._best_inside(starts[0].control, inside)
+        if best is not None and best is not inside:
+            best, rows = yield from search.run(best, self.budget.share(PROBE_SHARE), patience=0)
+            cost_to_beat = best.cost if rows else np.inf
+
+        results = yield from self._descend(starts, cost_to_beat=cost_to_beat)
+        winner = min(range(len(results)), key=lambda i: results[i].cost, default=None)
+        if winner is None or self.budget.stop.requested:
+            return results
+        if results[winner].is_held_up or results[winner].cost > cost_to_beat:
+            results = list(results)
+            result = results[winner]
+            results[winner] = yield from self._helped_by_chance(search, result, best)
+        return results
+
+    def _descend(
+        self,
+        starts: list[InitialControl],
+        *,
+        cost_to_beat: float = np.inf,
+        done: int = 0,
+    ) -> Runs:
+        """Descend within limits from several starts, after `done` iterations."""
+        free = self.limited.level
+        multistart = Multistart(
+            fine=free,
+            coarse=easier_level(free) if done == 0 else None,
+            executor=self.executor,
+            budget=self.budget,
+            until_held_up=True,
+            cost_to_beat=cost_to_beat,
+            iterations_done=done,
+        )
+        constrained = yield from multistart.run(starts)
+        return (yield from multistart.tighten_winner(constrained))
+
+    def _helped_by_chance(
+        self,
+        search: RandomSearch,
+        result: RunResult,
+        inside: InsideControl | None,
+    ) -> Generator[DesignEvent, None, RunResult]:
+        """Continue a descent that is held up by random changes, and descend again from there.
+
+        What makes more progress gets the time: random changes go on until they find nothing better
+        for a while, the descent until it is held up again. Where one of them gains nothing, the
+        rest of the time is for random changes.
+
+        Args:
+            search: The random search.
+            result: Result of the descent.
+            inside: A control that keeps all limits, or None.
+        """
+        best = self._best_inside(result.control, inside)
+        if best is None:
+            return result
+
+        is_descent_useful = True
+        while True:
+            before = best
+            result, best = yield from self._changed(search, result, best, is_descent_useful)
+            done = result.history[-1].iteration if result.history else 0
+            is_over = self.budget.exhausted is not None
+            if is_over or not is_descent_useful or done >= self._max_iterations:
+                return result
+
+            is_descent_useful = _is_progress(before, best)
+            if not is_descent_useful:
+                continue
+
+            # Descend from there.
+            start = InitialControl(name=result.name, control=best.begin)
+            descended, *_ = yield from self._descend([start], done=done)
+            before, best = best, self._best_inside(descended.control, best) or best
+            is_descent_useful = _is_progress(before, best)
+            result = append_run(result, descended)
+            result = replace(result, control=best.control, cost=best.cost)
+            if not descended.is_held_up and best is not before:
+                return result
+
+    def _changed(
+        self, search: RandomSearch, result: RunResult, best: InsideControl, is_descent_useful: bool
+    ) -> Generator[DesignEvent, None, tuple[RunResult, InsideControl]]:
+        """Change the best control at random, for a part of the time or for the rest of it."""
+        plant = search.cost.level.task.plant
+        steps = plant.engine_steps
+        share, patience = 1.0 - CLOSING_SHARE, np.inf
+        if is_descent_useful:
+            share, patience = RANDOM_SHARE, float(PATIENCE)
+
+        found, rows = yield from search.run(best, self.budget.share(share), patience)
+        changed = RunResult(
+            name=result.name,
+            control=found.control,
+            cost=found.cost,
+            status=Status.BEST_SEEN if np.isinf(self.budget.deadline) else Status.MAX_ITERATIONS,
+            slope=result.slope,
+            history=rows,
+            steps=plant.engine_steps - steps,
+        )
+        return append_run(result, changed), found
+
+    @property
+    def _max_iterations(self) -> int:
+        """Largest number of iterations of one start."""
+        return self._task.experiment.descent.max_iterations
+
+    def _best_inside(
+        self, control: Array | None, other: InsideControl | None
+    ) -> InsideControl | None:
+        """The largest share of a control, (N, nu), within limits, or another one that is better."""
+        found = None
+        if control is not None:
+            trials = ControlsWithinLimits(cost=self.limited, budget=self.budget)
+            centre = self._task.centre
+            found = trials.largest(centre, control - centre)
+        known = [inside for inside in (found, other) if inside is not None]
+        return min(known, key=lambda inside: inside.cost, default=None)
+
+    @property
+    def _task(self) -> DesignTask:
+        """The task on the plant without clamps."""
+        return self.limited.level.task
+
+
+def _is_progress(before: InsideControl, after: InsideControl) -> bool:
+    """Check whether a control costs clearly less than another one."""
+    return after.cost < before.cost - LEAST_PROGRESS * abs(before.cost)
