@@ -47,6 +47,6 @@ class ShortSteps:
 
         is_short = gamma <= SHORT
         self._are_short.append(is_short)
-        shortest = 10.0**-MOST_OF_ONE_STEP
-        self._decades -= math.log10(max(gamma, shortest)) if is_short else self._decades
+        missing = -math.log10(max(gamma, 10.0**-MOST_OF_ONE_STEP))
+        self._decades = self._decades + missing if is_short else 0.0
         return self._decades >= MOST_DECADES or sum(self._are_short) >= MOST_IN_WINDOW
