@@ -227,8 +227,10 @@ class _Search:
                 result = replace(result, history=extended(result.history, [row]))
                 yield DesignEvent(start=result.name, row=row)
 
-                has_short_steps = steps.hold_up(row.gamma, row.mu) and self.order.until_held_up
-                is_held_up = has_short_steps or self._is_too_slow(result.cost)
+                # Later stages of the barrier bring an iterate back inside the limits.
+                has_short_steps = steps.hold_up(row.gamma, row.mu) and iterate.feasible
+                is_held_up = has_short_steps and self.order.until_held_up
+                is_held_up = is_held_up or self._is_too_slow(min(row.cost, result.cost))
                 result = replace(result, is_held_up=is_held_up)
                 if is_held_up or self.budget.stop.requested:
                     break
@@ -239,7 +241,11 @@ class _Search:
         return replace(result, status=self._final_status(result, status), earlier=earlier)
 
     def _is_too_slow(self, cost: float) -> bool:
-        """Check whether the search has not reached the cost that it should have reached by now."""
+        """Check whether a search has not reached a cost that it should have reached by now.
+
+        Args:
+            cost: The lowest cost so far, or that of the present iterate, inside limits or not.
+        """
         is_late = self.order.budget.used > PATIENCE_WITHOUT_PROGRESS
         return is_late and cost > self.order.cost_to_beat
 
