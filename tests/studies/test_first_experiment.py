@@ -93,6 +93,25 @@ DOUBLE = """
 </mujoco>
 """
 
+FALLING = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="cage" pos="0 0 1">
+      <joint name="lift" type="slide" axis="0 0 1" range="-1 1"/>
+      <geom type="box" size="0.1 0.1 0.1" mass="1" contype="0" conaffinity="0"/>
+      <body name="arm">
+        <joint name="arm" axis="0 1 0" damping="0.05"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.5" contype="0"
+              conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="arm" joint="arm" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
 PENDULUM = """
 <mujoco>
   <option timestep="{timestep}" gravity="0 0 {gravity}"/>
@@ -440,6 +459,31 @@ def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path:
     proposal, _ = proposed(path, tmp_path)
     assert any("amplifies small disturbances" in remark for remark in proposal.remarks)
     assert 0.4 * proposal.times.period < proposal.times.horizon < 2.9 * proposal.times.period
+
+
+@pytest.mark.slow
+def test_the_horizon_ends_before_a_falling_robot_leaves_a_limit(tmp_path: Path) -> None:
+    """A robot that no control holds falls one metre, to the end of its range, in 0.45 s."""
+    path = tmp_path / "falling.xml"
+    path.write_text(FALLING, encoding="utf-8")
+    proposal = propose_experiment(path, tmp_path)
+    assert 0.3 < proposal.times.horizon < 0.45
+    [remark] = [text for text in proposal.remarks if "leaves a limit by itself" in text]
+    assert "position of lift is" in remark
+
+    experiment = Experiment(**proposal.values(), directory=tmp_path)
+    task = DesignTask.resolve(experiment)
+    assert verify(task, task.initial).is_feasible
+
+
+@pytest.mark.slow
+def test_a_horizon_that_the_user_wants_stays_and_the_limit_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "falling.xml"
+    path.write_text(FALLING, encoding="utf-8")
+    proposal = propose_experiment(path, tmp_path, Wishes(horizon=0.6))
+    assert proposal.times.horizon == pytest.approx(0.6)
+    [warning] = [text for text in proposal.remarks if text.startswith("Warning")]
+    assert "no motion about this start keeps all limits: position of lift is" in warning
 
 
 def test_wishes_are_fulfilled(tmp_path: Path) -> None:

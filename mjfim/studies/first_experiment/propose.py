@@ -16,6 +16,7 @@ from mjfim.errors import ExperimentError, MjfimError, ModelError, SimulationDive
 from mjfim.excitation.design_memory import design_bytes, require_memory_for_design
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import verify
+from mjfim.excitation.violations import violations_of
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.memory import fits_memory
@@ -66,6 +67,14 @@ WITHOUT_ROOM = ("control",)
 # break contacts are predictable for a short time only.
 LARGEST_AMPLIFICATION = 100.0
 SHORTEST_MOTION = 0.5
+
+# Shortest horizon of a robot that falls out of its limits [characteristic periods], and the share
+# of the time until then that the horizon uses.
+SHORTEST_FALL = 0.1
+BEFORE_VIOLATION = 0.9
+
+# Begin of the remark about a start that cannot be used.
+NO_MOTION = "no motion about this start keeps all limits"
 
 # Wishes of a user who has none.
 NO_WISHES = Wishes()
@@ -312,6 +321,11 @@ def _unnamed(model: Any) -> list[str]:
     ]
 
 
+def _with_amplitudes(draft: Proposal, amplitudes: Array) -> Proposal:
+    """The draft with other amplitudes, (nu,), of the chirp."""
+    return replace(draft, amplitudes=dict(zip(draft.amplitudes, amplitudes.tolist(), strict=True)))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Refinement:
     """Test of a draft by the package itself: feasible amplitudes and identifiable parameters.
@@ -334,17 +348,19 @@ class _Refinement:
         require_memory_for_design(system, draft.times.samples)
         rest = self._begins_at_rest(system, lean)
 
+        remarks: list[str] = []
         amplitudes = np.array(list(draft.amplitudes.values()))
-        kept = largest_feasible(amplitudes, lambda a: self._room(system, lean, a) >= ROOM)
+        kept = self._kept_amplitudes(system, lean, amplitudes)
         if kept is None:
-            kept = largest_feasible(amplitudes, lambda a: self._room(system, lean, a) >= 0.0)
-        remarks = []
-        if kept is None:
-            kept = rounded(amplitudes * SHRINKING**TRIALS)
-            remarks.append(
-                "Warning: no motion about this start keeps all limits; choose another start."
-            )
-        moved = replace(draft, amplitudes=dict(zip(draft.amplitudes, kept.tolist(), strict=True)))
+            smallest = rounded(amplitudes * SHRINKING**TRIALS)
+            draft, remark = self._within_limits(system, draft, smallest)
+            remarks.append(remark)
+
+            # During a shorter horizon, the motion may be larger.
+            shorter = replace(lean, times=draft.times)
+            kept = self._kept_amplitudes(system, shorter, amplitudes)
+            kept = smallest if kept is None else kept
+        moved = _with_amplitudes(draft, kept)
         if not draft.start.held:
             remarks.append(
                 "Note: no control holds the start; the robot moves from the first moment."
@@ -364,6 +380,56 @@ class _Refinement:
                 "Note: the motion amplifies small disturbances, so the horizon is short."
             )
         return self._with_parameters(replace(moved, rest=rest), remarks)
+
+    def _kept_amplitudes(self, system: System, draft: Proposal, amplitudes: Array) -> Array | None:
+        """(nu,) largest amplitudes that keep all limits, if possible with some room; or None."""
+        for least in (ROOM, 0.0):
+
+            def has_room(tried: Array, least: float = least) -> bool:
+                """Whether the chirp with some amplitudes keeps this distance from the limits."""
+                return self._room(system, draft, tried) >= least
+
+            kept = largest_feasible(amplitudes, has_room)
+            if kept is not None:
+                return kept
+        return None
+
+    def _within_limits(
+        self, system: System, draft: Proposal, smallest: Array
+    ) -> tuple[Proposal, str]:
+        """Let the experiment end before a robot that nothing holds leaves a limit.
+
+        Args:
+            system: The system.
+            draft: The draft, none of whose amplitudes keep all limits.
+            smallest: (nu,) the smallest amplitudes.
+
+        Returns:
+            The draft, with a shorter horizon where that helps, and a remark that names the limit.
+        """
+        still = replace(draft, chosen=draft.chosen[:1])
+        still = _with_amplitudes(still, smallest)
+        try:
+            task = self._task(system, still)
+            first = next(iter(violations_of(task, verify(task, task.initial))), None)
+        except SimulationDivergedError:
+            first = None
+        if first is None:
+            return draft, f"Warning: {NO_MOTION}; choose another start."
+
+        # A horizon that the user wants stays.
+        times = draft.times
+        samples = int(BEFORE_VIOLATION * first.since * times.rate)
+        is_long_enough = samples >= max(SHORTEST_FALL * times.period * times.rate, 2.0)
+        if is_long_enough and self.wishes.horizon is None:
+            shorter = replace(times, samples=samples)
+            if self._room(system, replace(still, times=shorter), smallest) >= 0.0:
+                remark = (
+                    f"Note: the horizon ends before the robot leaves a limit by itself: {first}."
+                )
+                return replace(draft, times=shorter), remark
+
+        return draft, f"Warning: {NO_MOTION}: {first}; choose another start."
 
     def released(self, draft: Proposal, length: float) -> Proposal:
         """The draft of a model without actuators, with a release that keeps all limits.
@@ -433,8 +499,7 @@ class _Refinement:
 
         It is relative to half of the range, and negative where a limit is broken.
         """
-        names = list(draft.amplitudes)
-        trial = replace(draft, amplitudes=dict(zip(names, amplitudes.tolist(), strict=True)))
+        trial = _with_amplitudes(draft, amplitudes)
         try:
             task = self._task(system, trial)
             found = verify(task, task.initial)
