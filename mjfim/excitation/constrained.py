@@ -227,9 +227,10 @@ class _Search:
                 result = replace(result, history=extended(result.history, [row]))
                 yield DesignEvent(start=result.name, row=row)
 
-                # Later stages of the barrier bring an iterate back inside the limits.
-                has_short_steps = steps.hold_up(row.gamma, row.mu) and iterate.feasible
-                is_held_up = has_short_steps and self.order.until_held_up
+                # Later stages of the barrier bring a good iterate back inside the limits.
+                has_short_steps = steps.hold_up(row.gamma, row.mu) and self.order.until_held_up
+                is_hopeless = iterate.feasible or row.cost > self.order.cost_to_beat
+                is_held_up = has_short_steps and is_hopeless
                 is_held_up = is_held_up or self._is_too_slow(min(row.cost, result.cost))
                 result = replace(result, is_held_up=is_held_up)
                 if is_held_up or self.budget.stop.requested:

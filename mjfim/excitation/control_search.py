@@ -115,10 +115,15 @@ class ControlSearch:
         return results
 
     def _is_rough(self, control: Array) -> bool:
-        """Check whether derivatives fail somewhere along a control, if it is the initial one."""
+        """Check whether derivatives may mislead along a control, if it is the initial one.
+
+        Dry friction is enough, wherever the initial motion reverses.
+        """
         task = self.stage.task
         if control is not task.control or self.first.trajectory is None:
             return False
+        if self.limited is not None and self.limited.level.task.system.variant.smoothing_speeds:
+            return True
 
         model = task.system.model_at(task.theta)
         found = roughness(

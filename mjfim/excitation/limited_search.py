@@ -25,7 +25,7 @@ from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 
 # Share of the time for random controls before a descent whose derivatives may mislead.
-PROBE_SHARE = 0.05
+PROBE_SHARE = 0.1
 
 # Share of the time that is left for random changes of a control, between two descents, and for the
 # report of the design after the last changes.

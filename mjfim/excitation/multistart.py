@@ -121,7 +121,7 @@ class Multistart:
         # The survivors are chosen by their cost on the stated plant.
         results, candidates = self._compare_on_stated_plant(results, starts)
         survivors = self._choose_survivors(candidates)
-        if not survivors:
+        if not survivors or self._are_beaten([candidates[i] for i in survivors]):
             return results
 
         results = _discard_others(results, candidates, survivors)
@@ -372,6 +372,10 @@ class Multistart:
     def _cost_on_stated_plant(self, control: Array) -> float:
         """J of a control: (N, nu); infinite where it violates a limit on the stated plant."""
         return self._limited_cost(control)
+
+    def _are_beaten(self, candidates: Sequence[RunResult]) -> bool:
+        """Check whether all candidates are held up where random controls cost less."""
+        return all(each.is_held_up and each.cost > self.cost_to_beat for each in candidates)
 
     def _choose_survivors(self, candidates: Sequence[RunResult]) -> list[int]:
         """Indices of the candidates for the second round, the best one first."""

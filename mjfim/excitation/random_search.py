@@ -24,7 +24,8 @@ from mjfim.excitation.evaluation import UNSTABLE_GROWTH, growth_along
 from mjfim.records.design import HistoryRow
 from mjfim.records.events import DesignEvent
 
-# Random controls of each bandwidth with which a search begins.
+# Bandwidths of the first random controls. Neighbours differ much, because a search may end early.
+FIRST_BANDWIDTHS = (0.6, 0.15, 1.0, 0.35, 0.06)
 CONTROLS_PER_BANDWIDTH = 2
 
 # Size of a random change relative to the control, at first and within bounds, and the factors by
@@ -73,7 +74,9 @@ class RandomSearch:
 
         # Bandwidths of random controls that have not been tried yet; None stands for the first
         # control, as large as the limits allow.
-        self._untried: deque[float | None] = deque((None, *CONTROLS_PER_BANDWIDTH * BANDWIDTHS))
+        self._untried: deque[float | None] = deque(
+            (None, *CONTROLS_PER_BANDWIDTH * FIRST_BANDWIDTHS)
+        )
 
     @cached_property
     def largest_growth(self) -> float:
@@ -180,7 +183,9 @@ class RandomSearch:
         widths = self.cost.constraints.control.bounds.scale
         wanted = trials.fitted(widths * noise / np.abs(noise).max(axis=0))
         found = trials.largest(best.about, wanted)
-        return None if found is None else trials.enlarged(found)
+        if found is None or found.cost >= best.cost:
+            return found
+        return trials.enlarged(found)
 
     def _as_large_as_possible(
         self, best: InsideControl, trials: ControlsWithinLimits

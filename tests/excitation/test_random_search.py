@@ -54,7 +54,7 @@ def search_of(task: DesignTask) -> tuple[RandomSearch, ControlsWithinLimits]:
 @pytest.fixture(name="few")
 def few_controls(monkeypatch: pytest.MonkeyPatch) -> None:
     """A search that tries the enlarged start and a single random control."""
-    monkeypatch.setattr(random_search, "BANDWIDTHS", (0.6,))
+    monkeypatch.setattr(random_search, "FIRST_BANDWIDTHS", (0.6,))
     monkeypatch.setattr(random_search, "CONTROLS_PER_BANDWIDTH", 1)
 
 
