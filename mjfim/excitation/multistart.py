@@ -49,6 +49,9 @@ FIRST_ROUND_SHARE = 0.5
 # Share of the time that is reserved for runs within tighter limits.
 RESERVED_SHARE = 0.05
 
+# Time after a request to stop in which a result may still be moved inside the limits [s].
+SECONDS_AFTER_STOP = 2.0
+
 # Largest number of runs within tighter limits.
 MAX_TIGHTENED_RUNS = 3
 
@@ -182,16 +185,19 @@ class Multistart:
         """Make sure that the best result keeps all limits of the unmodified model.
 
         A winner that violates a limit is replaced by the best feasible control that its start has
-        seen, or counts as infeasible; then the next best result has to be feasible.
+        seen, or counts as infeasible; then the next best result has to be feasible. After a request
+        to stop this ends with the waiting time.
         """
         results = list(results)
-        while True:
+        waiting = Budget(seconds=SECONDS_AFTER_STOP)
+        while not (self.budget.stop.requested and waiting.exhausted):
             violated = self._violated_by_winner(results)
             if violated is None:
                 return results
 
             winner, _ = violated
             results[winner] = self._best_feasible(results[winner])
+        return results
 
     def _best_feasible(self, result: RunResult) -> RunResult:
         """A result with its best feasible control: a shrunk one, or that of an earlier stage."""
@@ -395,7 +401,7 @@ class Multistart:
         Returns:
             Index of the best result and its relative margins; None where it keeps all limits.
         """
-        if not results or self.budget.stop.requested:
+        if not results:
             return None
 
         winner = min(range(len(results)), key=lambda i: results[i].cost)

@@ -812,6 +812,13 @@ def test_a_design_that_comes_too_close_between_its_samples_is_corrected(
     # A result of tighter limits is an iterate; a control that was shrunk is none.
     assert (final.cost in [row.cost for row in final.history]) is has_time
 
+    # A search that was stopped keeps what it gained as well.
+    stopped = Budget()
+    stopped.stop.request()
+    (kept,) = consume(replace(search, budget=stopped).tighten_winner([first]), None)
+    assert nearest(task, kept.control) >= 0.15
+    assert kept.cost < search.fine.problem.point(task.initial).cost
+
 
 @pytest.mark.slow
 def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
