@@ -309,3 +309,15 @@ def test_lines_end_at_spaces_and_in_names_at_separators(
 def test_symbols_and_paths_at_the_begin_of_a_verdict_stay_as_they_are() -> None:
     for begin, shown in (("done", "Done"), ("σ falls", "σ falls"), ("a/b.toml is", "a/b.toml is")):
         assert printed(Summary(title="", outcome=begin, parts=()), 80) == [shown]
+
+
+def test_a_prediction_without_error_has_no_ratio() -> None:
+    """A log that was simulated without noise may be predicted exactly by both models."""
+    found = an_estimate(MANY[:3])
+    (first, *_) = found.predictions
+    exact = replace(first.nominal, rms=np.zeros(12), mae=np.zeros(12))
+    predictions = (replace(first, nominal=exact, identified=exact),)
+
+    summary = describe(replace(found, predictions=predictions))
+    text = "\n".join(line for line, _ in render(summary, verbose=True).lines(120))
+    assert "nan" not in text.lower()

@@ -193,7 +193,9 @@ def _prediction_details(predictions: Sequence[Prediction]) -> SummaryTable:
         for j, output in enumerate(identified.outputs):
             if not np.isfinite(identified.rms[j]):
                 continue
-            errors = (identified.rms[j], nominal.rms[j], identified.rms[j] / nominal.rms[j])
+            # Logs of a simulation without noise may be predicted without any error.
+            ratio = identified.rms[j] / nominal.rms[j] if nominal.rms[j] > 0.0 else np.nan
+            errors = (identified.rms[j], nominal.rms[j], ratio)
             quantities = (Quantity(value=float(error)) for error in errors)
             rows.append(Row(cells=(_marked(prediction), output, *quantities)))
 
