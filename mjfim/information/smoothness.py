@@ -117,7 +117,9 @@ def roughness(
     between = derivatives.sensitivity(theta, trajectory, medium * SENSITIVITY_STEP)
     if between is not None:
         smaller = disagreement(G, noise.whiten(between.G))[:, visible]
-        if only_curved(smaller.max(axis=0), error.max(axis=0)):
+        # Dry friction may switch between the shorter steps as well, however little they disagree.
+        tolerated = 0.0 if np.any(model.dof_frictionloss) else DISAGREEMENT_TOLERANCE
+        if only_curved(smaller.max(axis=0), error.max(axis=0), tolerated):
             return None
 
     first = int(np.argmax(error[:, worst] > DISAGREEMENT_TOLERANCE))
@@ -131,16 +133,15 @@ def roughness(
     )
 
 
-def only_curved(medium: Array, longer: Array) -> bool:
+def only_curved(medium: Array, longer: Array, tolerated: float) -> bool:
     """Whether disagreements decrease with the step as those of derivatives that exist.
-
-    Those below `DISAGREEMENT_TOLERANCE` count as agreement; they may be round-off.
 
     Args:
         medium: (p,) disagreement of the shorter and the medium step.
         longer: (p,) disagreement of the shorter and the longer step.
+        tolerated: Disagreement of the medium step that counts as agreement; it may be round-off.
     """
-    allowed = np.maximum(longer / SMOOTH_DECREASE, DISAGREEMENT_TOLERANCE)
+    allowed = np.maximum(longer / SMOOTH_DECREASE, tolerated)
     return bool((medium <= allowed).all())
 
 

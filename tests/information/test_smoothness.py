@@ -243,7 +243,8 @@ def test_a_model_that_diverges_under_the_longer_step_is_infinitely_rough(
 
 def test_disagreements_below_the_tolerance_need_not_decrease() -> None:
     # The first derivative exists, although the longer step reaches the end of a joint's range.
-    assert only_curved(np.array([6e-5, 5e-9]), np.array([0.87, 2.6e-8]))
-    assert only_curved(np.array([0.12, 8e-3]), np.array([0.79, 0.037]))
-    assert not only_curved(np.array([0.5, 5e-9]), np.array([0.87, 2.6e-8]))
-    assert not only_curved(np.array([6e-5, 0.02]), np.array([0.87, 2.6e-8]))
+    assert only_curved(np.array([6e-5, 5e-9]), np.array([0.87, 2.6e-8]), 0.01)
+    assert not only_curved(np.array([6e-5, 5e-9]), np.array([0.87, 2.6e-8]), 0.0)
+    assert only_curved(np.array([0.12, 8e-3]), np.array([0.79, 0.037]), 0.01)
+    assert not only_curved(np.array([0.5, 5e-9]), np.array([0.87, 2.6e-8]), 0.01)
+    assert not only_curved(np.array([6e-5, 0.02]), np.array([0.87, 2.6e-8]), 0.01)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,9 @@ import numpy as np
 
 # Files of which only the presence is compared: views hold random identifiers, and pictures times.
 NOT_COMPARED = (".rrd", ".png")
+
+# A measured time in a report, such as `18.2 s`.
+DURATION = re.compile(r"\d[\d.]*(e[-+]\d+)? (s|min|h)\b")
 
 
 def without_times(value: Any) -> Any:
@@ -27,6 +31,8 @@ def contents_of(file: Path) -> Any:
         return file.suffix
     if file.suffix == ".json":
         return without_times(json.loads(file.read_text(encoding="utf-8")))
+    if file.suffix == ".html":
+        return DURATION.sub("", file.read_text(encoding="utf-8"))
     if file.suffix != ".npz":
         return file.read_bytes()
 
