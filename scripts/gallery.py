@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -28,6 +26,7 @@ from typing import Literal
 from PIL import Image
 
 from scripts.rerun_screenshot import screenshot
+from scripts.verbs import call_verb
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -258,17 +257,9 @@ def show_robot(robot: Robot, folder: Path) -> Iterator[Shown]:
 def _call(step: Step, values: dict[str, str]) -> Shown:
     """Call a verb as a user does."""
     words = [word.format(**values) if "{" in word else word for word in step.words]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": str(COLUMNS)}
+    variables = {"PYTHONPATH": str(ROOT), "COLUMNS": str(COLUMNS)}
     begun = time.perf_counter()
-    ended = subprocess.run(
-        [sys.executable, "-m", "mjfim", step.verb, *words],
-        env=environment,
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        timeout=PATIENCE,
-        check=False,
-    )
+    ended = call_verb([step.verb, *words], variables=variables, patience=PATIENCE)
     seconds = time.perf_counter() - begun
 
     command = " ".join(["mjfim", step.verb, *(_short(word) for word in words)])

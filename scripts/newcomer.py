@@ -15,7 +15,6 @@ import argparse
 import copy
 import importlib.util
 import json
-import os
 import subprocess
 import sys
 import time
@@ -28,6 +27,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import tomlkit
+
+from scripts.verbs import call_verb
 
 # Difference between the parameters of the simulated robot and those of the model, relative to them.
 DIFFERENCE = 0.05
@@ -156,19 +157,10 @@ def _run(found: Walk, folder: Path, verb: str, *words: str) -> int | None:
     """Call a verb as a user does; keep its output, exit code and duration."""
     specification = importlib.util.find_spec("mjfim")
     home = Path(str(specification and specification.origin)).parents[1]
-    environment = {**os.environ, "PYTHONPATH": str(home)}
+    variables = {"PYTHONPATH": str(home)}
     begun = time.perf_counter()
     try:
-        ended = subprocess.run(
-            [sys.executable, "-m", "mjfim", verb, *words],
-            cwd=folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            encoding="utf-8",
-            timeout=PATIENCE,
-            check=False,
-        )
+        ended = call_verb([verb, *words], variables=variables, patience=PATIENCE, folder=folder)
     except subprocess.TimeoutExpired:
         code, said, result = None, f"no end after {PATIENCE:g} s", ""
     else:

@@ -246,9 +246,7 @@ def write_check_folder(
         picture_format: Format of the pictures.
     """
     check.save(folder)
-    write_tables(folder, check)
-    run_optional(lambda: write_report(folder, Check))
-    run_optional(lambda: _write_figures(folder, check, picture_format))
+    _write_views(folder, check, picture_format)
 
 
 def write_robustness_folder(
@@ -267,9 +265,7 @@ def write_robustness_folder(
     """
     result.save_archive(folder)
     write_json(folder / "playback.json", {**result.summary(), "seconds": seconds})
-    write_tables(folder, result)
-    run_optional(lambda: write_report(folder, Robustness))
-    run_optional(lambda: _write_figures(folder, result, picture_format))
+    _write_views(folder, result, picture_format)
 
 
 def write_comparison_folder(
@@ -294,9 +290,7 @@ def write_comparison_folder(
     for row in comparison.rows:
         if row.control is not None:
             archive.write_control(folder / _control_name(row.method), row.control, system)
-    write_tables(folder, comparison)
-    run_optional(lambda: write_report(folder, Comparison))
-    run_optional(lambda: _write_figures(folder, comparison, picture_format))
+    _write_views(folder, comparison, picture_format)
 
 
 def write_estimate_folder(
@@ -363,9 +357,14 @@ def write_study_folder(
     """
     study.save(folder)
 
-    write_tables(folder, study)
-    run_optional(lambda: write_report(folder, MonteCarloStudy))
-    run_optional(lambda: _write_figures(folder, study, picture_format))
+    _write_views(folder, study, picture_format)
+
+
+def _write_views(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
+    """Write the tables, the report and the figures of a result, from its files and its record."""
+    write_tables(folder, record)
+    run_optional(lambda: write_report(folder, type(record)))
+    run_optional(lambda: _write_figures(folder, record, picture_format))
 
 
 def write_tables(folder: Path, record: ShownRecord) -> None:

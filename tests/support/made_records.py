@@ -61,9 +61,9 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
     )
 
 
-def make_design(dofs: int = 2, count: int = 3) -> Design:
-    """Make a design of ten iterations from a small to a large motion."""
-    rows = tuple(
+def ten_iterates() -> tuple[HistoryRow, ...]:
+    """Ten iterates, each with half of the cost of the one before."""
+    return tuple(
         HistoryRow(
             iteration=i,
             cost=2.0**-i,
@@ -76,6 +76,11 @@ def make_design(dofs: int = 2, count: int = 3) -> Design:
         )
         for i in range(10)
     )
+
+
+def make_design(dofs: int = 2, count: int = 3) -> Design:
+    """Make a design of ten iterations from a small to a large motion."""
+    rows = ten_iterates()
     return Design(
         status=Status.CONVERGED,
         parameters=tuple(f"link_{j}.damping" for j in range(count)),

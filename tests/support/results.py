@@ -11,7 +11,6 @@ from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodRe
 from mjfim.records.design import (
     Design,
     Evaluation,
-    HistoryRow,
     LimitUsage,
     Status,
 )
@@ -27,6 +26,7 @@ from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
 from mjfim.records.trajectory import Trajectory
+from tests.support.made_records import ten_iterates
 
 # Names of the parameters of all results.
 PARAMETERS = ("mass", "length", "damping")
@@ -87,19 +87,7 @@ def evaluation(size: float, samples: int) -> Evaluation:
 
 def design(name: str = "hinge", samples: int = 50, **changes: object) -> Design:
     """A design of ten iterations within a limit of the position."""
-    history = tuple(
-        HistoryRow(
-            iteration=i,
-            cost=2.0**-i,
-            criterion=2.0**-i,
-            min_eigenvalue=2.0**i,
-            slope=-(4.0**-i),
-            gamma=1.0,
-            seconds=0.1 * i,
-            steps=100 * i,
-        )
-        for i in range(10)
-    )
+    history = ten_iterates()
     final = evaluation(1.0, samples)
     share = 0.9 * final.trajectory.qpos[:, 0]
     fields: dict[str, object] = {

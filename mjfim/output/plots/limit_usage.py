@@ -11,6 +11,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.constraints import SUBSTEP_KINDS
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import LENGTH, per_second
+from mjfim.output.limit_curves import largest_share, would_be_solid
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     GRID_COLOUR,
@@ -58,8 +59,6 @@ NAMED_CURVES = 3
 # Characters to which the names of curves are shortened, in the panels and in the legend.
 CURVE_NAME_WIDTH, LEGEND_NAME_WIDTH = 18, 24
 
-# Number of turning points above which a curve would be a solid area; its envelope is drawn instead.
-MAX_TURNS = 120
 
 # Number of intervals of time of which an envelope shows the smallest and the largest value.
 ENVELOPE_INTERVALS = 150
@@ -88,7 +87,7 @@ def limits(design: Design, labels: Labels) -> Figure:
         _draw_bounds(axes, curves, one_sided=kind == "clearance")
         _label(axes, curves, _margin_in_words(design, kind, labels), panel_width(columns))
         axes.set_xlabel("time [s]" if i + columns >= len(kinds) else "")
-        has_envelope |= any(_would_be_solid(usage) for usage in curves)
+        has_envelope |= any(would_be_solid(usage) for usage in curves)
 
     note = (
         "All engine steps of the stated model. ±100 %: at the upper and at the lower bound; grey: "
@@ -124,7 +123,7 @@ def joint_colours(design: Design) -> dict[str, str]:
     """
     largest: dict[str, float] = {}
     for usage in design.usage:
-        largest[usage.name] = max(largest.get(usage.name, 0.0), _largest_share(usage))
+        largest[usage.name] = max(largest.get(usage.name, 0.0), largest_share(usage))
 
     closest = sorted(largest, key=lambda name: -largest[name])[: len(JOINT_COLOURS)]
     shown = [name for name in largest if name in closest]
@@ -134,26 +133,14 @@ def joint_colours(design: Design) -> dict[str, str]:
 # ---- curves
 
 
-def _largest_share(usage: LimitUsage) -> float:
-    """Return the largest share of a limit that is used at any time; above 1 it is violated."""
-    return float(np.abs(usage.share).max())
-
-
-def _would_be_solid(usage: LimitUsage) -> bool:
-    """Return whether a curve turns so often that its line would fill an area."""
-    change = np.diff(usage.share)
-    rising = np.sign(change[change != 0.0])
-    return int(np.count_nonzero(np.diff(rising))) > MAX_TURNS
-
-
 def _draw_curves(axes: Axes, curves: list[LimitUsage], colours: dict[str, str]) -> None:
     """Draw the curves of one kind; those closest to a bound are strong and on top."""
-    closest_first = sorted(curves, key=lambda usage: -_largest_share(usage))
+    closest_first = sorted(curves, key=lambda usage: -largest_share(usage))
     for rank, usage in enumerate(closest_first):
         colour = colours.get(usage.name, MUTED_COLOUR)
         strong = rank < NAMED_CURVES
         order = 3.0 - rank / len(curves)
-        if not _would_be_solid(usage):
+        if not would_be_solid(usage):
             width = 1.4 if strong else 0.7
             axes.plot(usage.t, 100.0 * usage.share, color=colour, linewidth=width, zorder=order)
             continue
@@ -177,7 +164,7 @@ def _envelope(usage: LimitUsage) -> tuple[Array, Array, Array]:
 
 def _draw_bounds(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
     """Draw the bounds at 100 % and, unless there is only one, at -100 %; beyond them is grey."""
-    largest = 100.0 * max(_largest_share(usage) for usage in curves)
+    largest = 100.0 * max(largest_share(usage) for usage in curves)
     reach = max(112.0, 1.05 * largest)
     axes.set_ylim(0.0 if one_sided else -reach, reach)
     for side in (1.0,) if one_sided else (1.0, -1.0):
@@ -190,9 +177,9 @@ def _draw_bounds(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
 
 def _label(axes: Axes, curves: list[LimitUsage], margin: str, width: float) -> None:
     """Write the margin of a kind, and the curves that come closest to a bound, above a panel."""
-    closest = sorted(curves, key=lambda usage: -_largest_share(usage))[:NAMED_CURVES]
+    closest = sorted(curves, key=lambda usage: -largest_share(usage))[:NAMED_CURVES]
     shares = [
-        f"{shorten(usage.name, CURVE_NAME_WIDTH)} {whole_percent(_largest_share(usage))}"
+        f"{shorten(usage.name, CURVE_NAME_WIDTH)} {whole_percent(largest_share(usage))}"
         for usage in closest
     ]
     format_axes(axes, ylabel="share of the limit [%]")
@@ -201,7 +188,7 @@ def _label(axes: Axes, curves: list[LimitUsage], margin: str, width: float) -> N
     size = SMALL_FONT - 1.0
     while len(shares) > 1 and text_width(", ".join(shares), size) > width - text_width("largest: "):
         shares.pop()
-    violated = any(_largest_share(usage) > 1.0 for usage in closest)
+    violated = any(largest_share(usage) > 1.0 for usage in closest)
     axes.set_title(
         margin,
         loc="left",

@@ -57,7 +57,7 @@ MAX_TICKS = 4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Curves:
-    """What is drawn of one recording.
+    """Everything that is drawn of one recording.
 
     Attributes:
         recording: The recording.

@@ -9,6 +9,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import complete_labels
+from mjfim.output.limit_curves import largest_share, would_be_solid
 from mjfim.output.report.correlations import correlation_of
 from mjfim.output.report.curves import (
     axis,
@@ -46,9 +47,8 @@ NEAR_BOUND = 1.0
 # Largest number of curves of one kind of limit; of more, those that come closest to a bound.
 MAX_LIMIT_CURVES = 8
 
-# Number of turns of a curve above which it would be solid ink, so that an envelope is drawn, and
-# number of intervals of the envelope.
-MAX_TURNS, ENVELOPE_INTERVALS = 120, 150
+# Number of intervals of the envelope of a curve that would be a solid area.
+ENVELOPE_INTERVALS = 150
 
 # Colours of the curves of limits, in the order of their closeness to a bound.
 LIMIT_ROLES = tuple(f"series{i}" for i in range(MAX_LIMIT_CURVES))
@@ -278,19 +278,19 @@ def _limit_plots(design: Design) -> PlotGroup:
 
 def _limit_panel(design: Design, kind: str, usages: list[LimitUsage]) -> Panel:
     """Return the plot of one kind of limit; the curves closest to a bound are drawn."""
-    closest_first = sorted(usages, key=lambda usage: -float(np.abs(usage.share).max()))
+    closest_first = sorted(usages, key=lambda usage: -largest_share(usage))
     shown = closest_first[:MAX_LIMIT_CURVES]
-    is_dense = any(_turns(usage.share) > MAX_TURNS for usage in shown)
+    is_dense = any(would_be_solid(usage) for usage in shown)
     traces, keys = [], []
     for usage, role in zip(shown, LIMIT_ROLES, strict=False):
         percent = 100.0 * usage.share
-        name = f"{usage.name} {float(np.abs(percent).max()):.0f} %"
+        name = f"{usage.name} {100.0 * largest_share(usage):.0f} %"
         times, values = _envelope(usage.t, percent) if is_dense else (usage.t, percent)
         traces.append(curve(times, values, name, role, width=1.3))
         keys.append(Key(name=name, role=role))
 
     # A clearance has one bound, and an envelope shows the closer one.
-    largest = 100.0 * float(np.abs(closest_first[0].share).max())
+    largest = 100.0 * largest_share(closest_first[0])
     one_sided = is_dense or kind == "clearance"
     reach = max(112.0, 1.08 * largest)
     shapes = [level(100.0, "bound"), band(100.0, reach, "forbidden")]
@@ -319,13 +319,6 @@ def _limit_title(kind: str, *, is_dense: bool) -> str:
     if kind == "clearance":
         return "required / actual distance [%]"
     return "largest use in short intervals [%]" if is_dense else "place in the range [%]"
-
-
-def _turns(values: Array) -> int:
-    """Return how often a curve turns up or down."""
-    slopes = np.sign(np.diff(values))
-    slopes = slopes[slopes != 0.0]
-    return int(np.count_nonzero(np.diff(slopes)))
 
 
 def _envelope(t: Array, values: Array) -> tuple[Array, Array]:

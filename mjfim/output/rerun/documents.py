@@ -111,7 +111,7 @@ def log_design(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _DesignContent:
-    """What design.rrd shows of a design, computed once for the layout and for the data.
+    """Everything that design.rrd shows of a design, computed once for the layout and for the data.
 
     Attributes:
         model: The model.

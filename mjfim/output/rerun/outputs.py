@@ -88,16 +88,14 @@ def held_out_plots(model: mujoco.MjModel, estimate: Estimate) -> list[OutputPlot
         estimate: The estimate.
     """
     found = []
-    held_out = [shown for shown in estimate.predictions if shown.recording is not None]
-    for k, prediction in enumerate(held_out, start=1):
-        if prediction.recording is None:
-            continue
+    recorded = [(p, p.recording) for p in estimate.predictions if p.recording is not None]
+    for k, (prediction, recording) in enumerate(recorded, start=1):
         predicted = {
             "identified": prediction.identified_outputs,
             "nominal": prediction.nominal_outputs,
         }
-        pairs = _pairs(model, f"held out {k}", prediction.recording, predicted, estimate.sigma)
-        name = f"held out: {Path(prediction.recording.name).name}"
+        pairs = _pairs(model, f"held out {k}", recording, predicted, estimate.sigma)
+        name = f"held out: {Path(recording.name).name}"
         found.append(OutputPlots(name=name, pairs=pairs))
     return found
 

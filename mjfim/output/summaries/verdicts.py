@@ -125,12 +125,12 @@ def _accuracy(design: Design) -> str:
 
 @next_steps.register
 def _(design: Design) -> tuple[str, ...]:
-    """What follows a design."""
+    """Return the next steps after a design."""
     return tuple(_steps_after_design(design))
 
 
 def _steps_after_design(design: Design) -> Iterator[str]:
-    """Yield what follows a design."""
+    """Yield the next steps after a design."""
     if not design.within_limits:
         yield "Widen the limit that is violated, or begin with an initial control that is smaller."
         return
@@ -209,12 +209,12 @@ def _worst_estimate(estimate: Estimate) -> str:
 
 @next_steps.register
 def _(estimate: Estimate) -> tuple[str, ...]:
-    """What follows an estimate."""
+    """Return the next steps after an estimate."""
     return tuple(_steps_after_estimate(estimate))
 
 
 def _steps_after_estimate(estimate: Estimate) -> Iterator[str]:
-    """Yield what follows an estimate."""
+    """Yield the next steps after an estimate."""
     for term in estimate.missing_terms[:1]:
         yield (
             f"Add the term that explains most of the residuals, {term.description}: "
@@ -258,7 +258,7 @@ def _(check: Check) -> Verdict:
 
 @next_steps.register
 def _(check: Check) -> tuple[str, ...]:
-    """What follows a check."""
+    """Return the next steps after a check."""
     if check.refused or check.missing:
         return ()
     if check.not_separable:
@@ -284,7 +284,7 @@ def _(comparison: Comparison) -> Verdict:
 
 @next_steps.register
 def _(comparison: Comparison) -> tuple[str, ...]:
-    """What follows a comparison."""
+    """Return the next steps after a comparison."""
     if not comparison.beating:
         return ("Play the control of the best method; every control is a table beside this file.",)
     name = comparison.beating[0].title
@@ -331,7 +331,7 @@ def _reaches_bound(trials: TrialStatistics) -> bool:
 
 @next_steps.register
 def _(study: MonteCarloStudy) -> tuple[str, ...]:
-    """What follows a Monte Carlo study."""
+    """Return the next steps after a Monte Carlo study."""
     if verdict_of(study).level is Level.GOOD:
         return ("Play the design on the robot: `mjfim export DESIGN_FOLDER --to player -o FILE`.",)
     return (
@@ -355,7 +355,7 @@ def _(result: Robustness) -> Verdict:
 
 @next_steps.register
 def _(result: Robustness) -> tuple[str, ...]:
-    """What follows a robustness study."""
+    """Return the next steps after a robustness study."""
     if result.reserve():
         *_, advice = robustness_sentences(result)
         return (_as_sentence(advice),)
@@ -378,7 +378,7 @@ def _(campaign: Campaign) -> Verdict:
 
 @next_steps.register
 def _(campaign: Campaign) -> tuple[str, ...]:
-    """What follows a campaign."""
+    """Return the next steps after a campaign."""
     if campaign.status is CampaignStatus.WAITING:
         return (
             "Play the last design on the robot, record it, and repeat the call with "
