@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 
@@ -12,6 +14,7 @@ from mjfim import interruption as module
 from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import NoResultError
 from mjfim.interruption import Interruption, hurried, run_optional
+from tests.support.paths import ROOT
 
 
 @pytest.fixture
@@ -100,3 +103,40 @@ def test_the_second_press_follows_by_itself(
     run_optional(draw_for_ever)
     assert sentences == [module.FIRST_SENTENCE]
     assert interruption.incomplete
+
+
+# A computation that does not look at the request to stop, and is pressed twice.
+DEAF = """
+import signal
+import time
+
+from mjfim import interruption
+
+interruption.LAST_SECONDS = 0.05
+
+
+class Ignored:
+    def request(self):
+        pass
+
+
+with interruption.Interruption(lambda text: print(text, flush=True)) as handler:
+    with handler.computing(Ignored()):
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+        time.sleep(60.0)
+"""
+
+
+def test_two_presses_end_work_that_does_not_return() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", DEAF],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+        timeout=30.0,
+    )
+    assert ended.returncode == module.INTERRUPTED_CODE, ended.stderr
+    assert ended.stdout.splitlines() == [module.FIRST_SENTENCE, module.LAST_SENTENCE]
+    assert not ended.stderr

@@ -147,7 +147,7 @@ def design(
         )
     say_written(output, f"\nto see the motion: mjfim replay {output}")
     if is_elsewhere(as_json) and not result.success:
-        errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
+        errors.print(f"mjfim: {'; '.join([result.outcome, *result.warnings])}", markup=False)
     if not result.separable:
         errors.print(f"mjfim: {_inseparable(result)}", markup=False)
     _say_if_default_ended(result, has_default)

@@ -235,7 +235,7 @@ def design_with_reserve(
     write_design(folder, design, task.system)
     keep_result(folder)
     margins = ", ".join(f"{kind} {margin:.3g}" for kind, margin in design.limits.items())
-    errors.print(f"designed in {design.seconds:.0f} s: {design.status.value}", markup=False)
+    errors.print(f"designed in {design.seconds:.0f} s: {design.outcome}", markup=False)
     errors.print(f"margins to the tightened limits: {margins}", markup=False)
     for warning in design.warnings:
         errors.print(f"warning: {warning}", markup=False)

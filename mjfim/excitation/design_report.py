@@ -17,7 +17,14 @@ from mjfim.information.identifiability import Identifiability
 from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
 from mjfim.plant.active_constraints import saturated_actuators
-from mjfim.records.design import Design, Evaluation, ScaledStart, Status, without_motions
+from mjfim.records.design import (
+    Design,
+    Evaluation,
+    ScaledStart,
+    Status,
+    improvement_per_iteration,
+    without_motions,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,4 +149,5 @@ class DesignReport:
             labels=labels_of_system(task.system),
             sizes=parameters.sizes(task.theta),
             motions=motions,
+            improvement=improvement_per_iteration(history, self.stage.problem.size(self.final)),
         )

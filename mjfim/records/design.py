@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, ClassVar
@@ -16,6 +16,12 @@ from mjfim.records.labels import Labels
 from mjfim.records.serialization import SavedRecord
 from mjfim.records.shown import ShownRecord
 from mjfim.records.trajectory import Trajectory
+
+# Number of iterations at the end of a search over which its improvement is measured.
+IMPROVEMENT_WINDOW = 10
+
+# Smallest improvement per iteration that is stated as a number.
+LEAST_IMPROVEMENT = 1e-4
 
 # Fields of a trajectory whose names are also names of arrays in design.npz.
 TRAJECTORY_ARRAYS = ("t", "qpos", "qvel", "act", "ctrl")
@@ -176,6 +182,37 @@ def without_motions(
     rows = extended((), history)
     motions = [(row.iteration, row.motion) for row in rows if row.motion is not None]
     return tuple(replace(row, motion=None) for row in rows), IterateMotions.of(motions)
+
+
+def improvement_per_iteration(history: Sequence[HistoryRow], size: float) -> float:
+    """Share by which the last iterations of a search lowered the cost, per iteration.
+
+    Only iterates at the last sample rate count, and under hard limits only those inside.
+
+    Args:
+        history: The iterates.
+        size: Size of the final cost, to which its change is relative.
+
+    Returns:
+        A number from 0 to 1, by which an iteration reduces the cost; NaN where fewer than two
+        iterates count.
+    """
+    counted = [row for row in history if row.rate == history[-1].rate and not row.margin < 0.0]
+    counted = [row for row in counted if np.isfinite(row.cost)]
+    if not counted or not 0.0 < size < np.inf:
+        return float("nan")
+
+    # The best iterate before the window; the first one where the search was shorter.
+    end = counted[-1].iteration
+    before = [row for row in counted if row.iteration <= end - IMPROVEMENT_WINDOW]
+    before = before or counted[:1]
+
+    # A new stage of the barrier begins with the last iterate of the stage before.
+    iterations = end - before[-1].iteration
+    if iterations == 0:
+        return float("nan")
+    fall = min(row.cost for row in before) - min(row.cost for row in counted)
+    return float(1.0 - (1.0 + fall / size) ** (-1.0 / iterations))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -381,6 +418,8 @@ class Design(ShownRecord):
             the whole vectors or tensors of which they are entries [theta-unit]. Default: the
             magnitudes of the values.
         motions: Thinned motions of at most `MAX_MOTIONS` iterates; None if none was kept.
+        improvement: Share by which each of the last iterations lowered the cost; for D-optimality
+            relative to one nat per parameter. NaN where it is unknown.
     """
 
     status: Status
@@ -407,6 +446,7 @@ class Design(ShownRecord):
     labels: Labels | None = None
     sizes: Array = field(default_factory=lambda: np.zeros(0))
     motions: IterateMotions | None = None
+    improvement: float = float("nan")
 
     file_stem: ClassVar[str] = "design"
     made_by: ClassVar[str] = "`mjfim design EXPERIMENT -o DIR`"
@@ -421,6 +461,17 @@ class Design(ShownRecord):
     def wanted(self) -> tuple[int, ...]:
         """Indices of the parameters that are not nuisance parameters."""
         return tuple(j for j, name in enumerate(self.parameters) if name not in self.nuisance)
+
+    @property
+    def outcome(self) -> str:
+        """How the optimisation ended, in a sentence; at its budget, with the last improvement."""
+        if self.status is not Status.MAX_ITERATIONS or not np.isfinite(self.improvement):
+            return self.status.value
+
+        share = f"still improving by {min(100.0 * self.improvement, 99.0):.2g} % per iteration"
+        if self.improvement < LEAST_IMPROVEMENT:
+            share = "hardly improving any more"
+        return self.status.value.replace(" before convergence", f", {share}")
 
     @property
     def success(self) -> bool:
@@ -469,7 +520,8 @@ class Design(ShownRecord):
         """Return the contents of design.json, except for the name of the experiment file."""
         return {
             "status": self.status.name.lower(),
-            "message": self.status.value,
+            "message": self.outcome,
+            "improvement": self.improvement,
             "iterations": self.iterations,
             "seconds": self.seconds,
             "slope": self.slope,

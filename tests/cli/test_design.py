@@ -13,6 +13,7 @@ import pytest
 from typer.testing import Result
 
 import mjfim
+from mjfim.cli import design as design_verb
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.output.manifest import MANIFEST
@@ -101,6 +102,26 @@ def test_design_that_stops_at_its_budget(tmp_path: Path, lines: dict[str, str]) 
     assert result.exit_code == 0
     assert "Stopped at its budget" in result.stdout
     assert "stopped at its budget" in result.stderr
+
+    # How much a longer search may gain is said, too.
+    said = " ".join(result.stderr.split())
+    assert re.search(r"still improving by [\d.]+ % per iteration; for a better result", said)
+
+
+@pytest.mark.usefixtures("no_files")
+@pytest.mark.parametrize("stated", [False, True])
+def test_design_that_states_no_time_ends_at_the_default_time_and_says_so(
+    stated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert design_verb.DEFAULT_SECONDS == 120.0
+    monkeypatch.setattr(design_verb, "DEFAULT_SECONDS", 1e-3)
+    most = "100000\nseconds = 1e-3" if stated else "100000"
+    path = write_experiment(tmp_path, tolerance="1e-12", max_iterations=most)
+    result = run("design", path, "-o", tmp_path / "out")
+    said = " ".join(result.stderr.split())
+    assert "stopped at its budget" in said
+    sentence = "the design ended after 0.001 s, the default time; `seconds` in the table [descent]"
+    assert (sentence in said) is not stated
 
 
 @pytest.mark.usefixtures("no_files")

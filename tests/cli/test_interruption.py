@@ -20,8 +20,9 @@ from mjfim.interruption import NOTHING_SENTENCE
 from mjfim.output import archive, plots
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.design import Status
-from mjfim.records.events import DesignEvent, FitEvent
+from mjfim.records.events import DesignEvent, FitEvent, StudyEvent
 from mjfim.studies import derivative_test
+from mjfim.studies import monte_carlo as trials
 from tests.support.cli import (
     DESIGN,
     ESTIMATE_DATA,
@@ -83,6 +84,35 @@ def test_two_presses_during_an_estimation_keep_its_data(
     assert names(tmp_path / "fit") == {*ESTIMATE_DATA, MANIFEST}
     assert "holds only a part of the results" in result.stderr
     assert "interrupted" in read(tmp_path / "fit" / "estimate.json")["status"]
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_a_press_during_trials_keeps_those_that_are_done(
+    study: Path, archived: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """12 trials are stepped in chunks of 4; the press comes in the second or third one."""
+    monkeypatch.setattr(trials, "MIN_CHUNK", 4)
+    show = ProgressDisplay._show_study
+
+    def press_once(display: ProgressDisplay, event: StudyEvent) -> None:
+        show(display, event)
+        if event.share > 0.5 and not pressed:
+            pressed.append(event.part)
+            interrupt()
+
+    pressed: list[str] = []
+    monkeypatch.setattr(ProgressDisplay, "_show_study", press_once)
+    out = tmp_path / "mc"
+    result = run("montecarlo", study, archived, "-o", out, "--trials", 12)
+    assert (result.exit_code, type(result.exception)) == (1, SystemExit)
+    assert pressed == ["initial"]
+
+    data = read(out / "montecarlo.json")
+    done = data["initial"]["trials"]
+    assert done in (4, 8)
+    assert "final" not in data
+    assert f"interrupted; only {done} of 12 trials of initial are finished" in result.stderr
+    assert mjfim.MonteCarloStudy.load(out).sets["initial"].trials == done
 
 
 def test_an_interrupted_check_is_written_and_marked_as_incomplete(

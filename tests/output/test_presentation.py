@@ -149,6 +149,18 @@ def test_a_figure_is_drawn_and_shown_as_png(record: ShownRecord) -> None:
     assert 300.0 < options["width"] < 1800.0
 
 
+def test_a_result_is_a_few_short_lines_and_can_be_saved_and_loaded(
+    record: ShownRecord, tmp_path: Path
+) -> None:
+    """In a terminal, the text of a design had 122,394 characters."""
+    lines = repr(record).splitlines()
+    assert lines[0] == f"{type(record).__name__}("
+    assert max(map(len, lines)) < 100 and len(lines) < 60
+
+    record.save(tmp_path)
+    assert repr(type(record).load(tmp_path)) == repr(record)
+
+
 def test_an_unknown_figure_is_an_error_that_lists_the_names(design: Design) -> None:
     with pytest.raises(MjfimError, match=r"trajectorys.*did you mean 'trajectories'"):
         design.plot("trajectorys")

@@ -17,6 +17,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.studies import derivative_test
 from mjfim.studies.check import check_task
 from tests.support import stiff_servos
+from tests.support.numerics import cart_task
 from tests.support.stiff_servos import stiff_arm_experiment, stiff_arm_task
 
 # Changes of the experiment that a design refuses, and a part of its message.
@@ -160,3 +161,22 @@ def test_a_check_refuses_iterations_of_hours_in_the_words_of_a_design(
     with pytest.raises(ExperimentError, match="one iteration would take about 2 hours") as error:
         announcements.announce_design(system, is_default=True)
     assert str(error.value) == refused
+
+
+@pytest.mark.parametrize(("angle", "grows"), [(0.0, True), (3.0, False)], ids=["up", "down"])
+def test_a_check_warns_of_growing_disturbances_in_the_words_of_a_design(
+    angle: float, grows: bool, tmp_path: Path
+) -> None:
+    """A pendulum that begins upright; near hanging, small disturbances do not grow."""
+    control = {"kind": "sine", "amplitude": 0.01, "frequency": 1.0}
+    task = cart_task(
+        tmp_path,
+        rate=50.0,
+        horizon=2.5,
+        initial={"qpos": (0.0, angle), "control": control},
+        descent={"max_iterations": 0, "coarse": 1},
+    )
+    found, design = check_task(task), design_task(task)
+    said = [text for text in found.verdict if "a small disturbance grows up to" in text]
+    assert len(said) == grows
+    assert said == [text for text in design.warnings if "a small disturbance grows" in text]

@@ -440,7 +440,7 @@ def convergence(design: Design) -> Figure:
     ]
     if relative_slope is not None:
         handles.append(Line2D([], [], color=MUTED_COLOUR, linestyle=":", label="slope / J"))
-    note = as_sentence(design.status.value)
+    note = as_sentence(design.outcome)
     if has_barrier:
         note += (
             " Dashed lines: a new barrier stage begins; with limits, the slope is that of log J "

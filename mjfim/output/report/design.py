@@ -352,7 +352,7 @@ def _history_plots(design: Design) -> PlotGroup:
         title = "worst margin [% of half of the range]"
         panels.append(_history_panel(title, iterations, margins, logarithmic=False))
 
-    note = f"{design.status.value[:1].upper()}{design.status.value[1:]}."
+    note = f"{design.outcome[:1].upper()}{design.outcome[1:]}."
     is_other = history and not np.isclose(history[0].cost, design.initial.cost, rtol=1e-9, atol=0.0)
     rates = list(dict.fromkeys(row.rate for row in history if row.rate > 0.0))
     if is_other and design.found_by != "initial control":

@@ -90,7 +90,7 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
     parts.append(eigenvalue_table(design))
     return Summary(
         title="Designed experiment",
-        outcome=design.status.value,
+        outcome=design.outcome,
         parts=tuple(parts),
         warnings=design.warnings,
     )

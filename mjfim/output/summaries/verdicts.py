@@ -85,7 +85,7 @@ def _(design: Design) -> Verdict:
         return Verdict(text=text, level=Level.BAD)
 
     if not design.sound:
-        return Verdict(text=f"The design is not ready: {design.status.value}.", level=Level.BAD)
+        return Verdict(text=f"The design is not ready: {design.outcome}.", level=Level.BAD)
 
     kept = "It keeps all limits" if design.limits else "No limits were stated"
     if not design.separable:
