@@ -85,7 +85,7 @@ def test_the_terminal_and_markdown_show_the_same_numbers(task: DesignTask, desig
             assert column.detail or all(text in terminal for text in shown)
     assert "Eigenvalues of the Fisher information" in markdown
     assert "Eigenvalues of the Fisher information" not in terminal
-    assert capitalised(design.status.value) in terminal
+    assert capitalised(design.outcome) in terminal
 
 
 def test_an_estimate_names_units_bounds_and_warnings(estimate: Estimate) -> None:
