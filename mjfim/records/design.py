@@ -465,13 +465,14 @@ class Design(ShownRecord):
     @property
     def outcome(self) -> str:
         """How the optimisation ended, in a sentence; at its budget, with the last improvement."""
+        sentence: str = self.status.value
         if self.status is not Status.MAX_ITERATIONS or not np.isfinite(self.improvement):
-            return self.status.value
+            return sentence
 
         share = f"still improving by {min(100.0 * self.improvement, 99.0):.2g} % per iteration"
         if self.improvement < LEAST_IMPROVEMENT:
             share = "hardly improving any more"
-        return self.status.value.replace(" before convergence", f", {share}")
+        return sentence.replace(" before convergence", f", {share}")
 
     @property
     def success(self) -> bool:
