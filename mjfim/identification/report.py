@@ -369,8 +369,9 @@ def _warnings(findings: _Findings) -> Iterator[str]:
         yield f"sloppy: {name} {remark}"
 
     channels = result.task.system.channels
-    for recording in result.task.recordings:
-        for remark in plausibility_remarks(channels, recording):
+    data = zip(result.task.recordings, findings.quality.predicted, strict=True)
+    for recording, predicted in data:
+        for remark in plausibility_remarks(channels, recording, predicted):
             yield f"poor data in {Path(recording.name).name}: {remark}"
 
 

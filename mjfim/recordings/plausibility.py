@@ -1,4 +1,4 @@
-"""Remarks about the quality of measured data before any fit.
+"""Remarks about the quality of measured data.
 
 They concern noise, spikes, and columns that contradict each other.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.signal import medfilt
+from scipy.ndimage import median_filter
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import scalar_joints
@@ -24,7 +24,8 @@ MEDIAN_ROWS = 7
 # Length of the shortest column that is inspected [rows].
 MIN_ROWS = 4 * MEDIAN_ROWS
 
-# A measured column is rough if the running median removes more than this fraction of its variance.
+# A measured column is rough if the running median removes more than this fraction of its variance,
+# and a fitted model does not explain this part.
 MAX_ROUGH_SHARE = 0.1
 
 # A deviation counts only if it exceeds this number of stated standard deviations of the noise.
@@ -52,19 +53,24 @@ MAX_DISAGREEMENT = 0.1
 COMPARISON_TIME = 0.2
 
 
-def plausibility_remarks(channels: Channels, recording: Recording) -> tuple[str, ...]:
+def plausibility_remarks(
+    channels: Channels, recording: Recording, predicted: Array | None = None
+) -> tuple[str, ...]:
     """Describe properties of a recording that make its data implausible.
 
     Args:
         channels: Names, ranges and noise of the recording's columns.
         recording: The measured data.
+        predicted: (M, m) outputs of a fitted model at the rows of the recording, in the order of
+            the channels; None before a fit. A motion that is quick at the rate of the recording
+            is rough, too, and only a model tells it from noise.
 
     Returns:
         One sentence per remark; empty if the data are plausible.
     """
     return (
         *_control_remarks(channels, recording.ctrl[:MAX_ROWS]),
-        *_roughness_remarks(channels, recording),
+        *_roughness_remarks(channels, recording, predicted),
         *_contradiction_remarks(channels, recording),
     )
 
@@ -107,23 +113,30 @@ def _range_remarks(name: str, u: Array, limits: Array) -> Iterator[str]:
         )
 
 
-def _roughness_remarks(channels: Channels, recording: Recording) -> Iterator[str]:
+def _roughness_remarks(
+    channels: Channels, recording: Recording, predicted: Array | None
+) -> Iterator[str]:
     """Remarks about outputs whose jumps are large compared with both their noise and motion."""
     sigma = _sigma_by_name(channels)
 
     for i, name in enumerate(recording.outputs):
         y = recording.y[:MAX_ROWS, i]
-        y = y[np.isfinite(y)]
+        present = np.isfinite(y)
+        y = y[present]
         if not _moves(y):
             continue
 
-        share = _rough_share(y)
+        share, explanation = _rough_share(y), "is too quick for a smooth motion"
+        if predicted is not None and name in channels.outputs:
+            motion = predicted[:MAX_ROWS, channels.outputs.index(name)][present]
+            share = min(share, _unexplained_share(y, motion))
+            explanation = "is not explained by the identified motion"
+
         rough_std = np.sqrt(share * np.var(y))
         if share > MAX_ROUGH_SHARE and rough_std > SIGNIFICANT_SIGMAS * sigma.get(name, 0.0):
             yield (
                 f"{name} is rough: {100 * share:.0f} % of its variance lies within {MEDIAN_ROWS} "
-                "rows, which is impossible for a smooth motion; noise, spikes or steps hide the "
-                "motion of the robot"
+                f"rows and {explanation}; noise, spikes or steps hide the motion of the robot"
             )
 
 
@@ -215,7 +228,18 @@ def _moves(x: Array) -> bool:
 
 def _rough_share(x: Array) -> float:
     """Fraction of the variance of x: (M,) that a running median removes."""
-    return float(np.var(x - medfilt(x, MEDIAN_ROWS)) / np.var(x))
+    return float(np.var(_rough_part(x)) / np.var(x))
+
+
+def _unexplained_share(y: Array, motion: Array) -> float:
+    """Fraction of the variance of y: (M,) that is rough and not part of a motion: (M,)."""
+    return float(np.var(_rough_part(y) - _rough_part(motion)) / np.var(y))
+
+
+def _rough_part(x: Array) -> Array:
+    """(M,) what a running median removes from x: (M,); beyond its ends, x keeps its last values."""
+    smooth: Array = median_filter(x, size=MEDIAN_ROWS, mode="nearest")
+    return x - smooth
 
 
 def _lag_one_correlation(x: Array) -> float:

@@ -147,3 +147,33 @@ def test_poor_data_are_described_and_good_data_are_not(base: mjfim.Experiment) -
             Recording(t=swung.t, ctrl=swung.ctrl, y=y, outputs=swung.outputs, name="x"),
         )
     )
+
+
+def test_a_quick_motion_of_a_drone_is_not_taken_for_noise() -> None:
+    """Rotors that switch every third row shake the drone; only a model tells this from noise."""
+    stated = mjfim.Experiment.from_file(ROOT / "models" / "quadrotor.toml")
+    system = DesignTask.resolve(stated.replace(noise={"state": 1e-3})).system
+    rows = np.arange(120)
+    roll = np.where((rows // 3) % 2 == 0, 1.0, -1.0)
+    ctrl = 0.4905 + 0.05 * roll[:, None] * np.array([1.0, -1.0, 1.0, -1.0])
+    theta = system.parameters.true
+    trajectory = system.plant.simulate(theta, ctrl)
+    flight = simulate_system(system, trajectory, seed=0)
+    outputs, _ = system.plant.measure(theta[None], ctrl)
+
+    def remarks(recording: Recording, predicted: np.ndarray | None) -> str:
+        """Remarks about rough outputs."""
+        found = plausibility_remarks(system.channels, recording, predicted)
+        return "; ".join(each for each in found if "is rough" in each)
+
+    assert "qvel:base.rx is rough" in remarks(flight, None)
+    assert not remarks(flight, outputs[0])
+
+    # Spikes are found beside the same motion, in any unit of the output.
+    i = flight.outputs.index("qvel:base.rx")
+    y = np.array(flight.y)
+    y[::20, i] += 5.0 * np.nanstd(y[:, i])
+    spoilt = Recording(t=flight.t, ctrl=flight.ctrl, y=y, outputs=flight.outputs, name="x")
+    found = remarks(spoilt, outputs[0])
+    assert found.startswith("qvel:base.rx is rough") and found.count("is rough") == 1
+    assert "not explained by the identified motion" in found
