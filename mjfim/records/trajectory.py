@@ -7,6 +7,7 @@ dx/dtheta, `I` Fisher information. The sizes are N samples; nq, nv, na and nu as
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -105,3 +106,11 @@ class Sensitivity:
 
     def __post_init__(self) -> None:
         freeze(self, "psi", "G")
+
+    def of_parameters(self, chosen: Sequence[int]) -> Sensitivity:
+        """The derivatives with respect to some of the parameters.
+
+        Args:
+            chosen: Indices of the parameters, in their new order.
+        """
+        return Sensitivity(psi=self.psi[:, :, chosen], G=self.G[:, :, chosen])
