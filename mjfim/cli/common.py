@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import os
 import sys
 import threading
 import time
@@ -96,16 +97,27 @@ class MessageConsole(Console):
 # Console for messages and progress. Brackets and colons in file names are no markup and no emoji.
 errors = MessageConsole(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
-# Width of the lines of results that do not go to a terminal [characters]; tables fit into it.
-FILE_WIDTH = 110
+# Width of the lines of results in a file or a pipe [characters], unless COLUMNS states another one,
+# and the smallest width into which tables are fitted.
+FILE_WIDTH = 80
+LEAST_WIDTH = 20
+
+
+def width_of_results() -> int | None:
+    """Width of the lines of results [characters]; None for that of the terminal.
+
+    A file or a pipe has the width that the environment states, not that of the terminal in which
+    the verb was started, so that the result is the same everywhere.
+    """
+    if sys.stdout.isatty():
+        return None
+    stated = os.environ.get("COLUMNS", "")
+    width = int(stated) if stated.isdecimal() else FILE_WIDTH
+    return width if width >= LEAST_WIDTH else FILE_WIDTH
+
 
 # Console for results.
-out = Console(
-    highlight=False,
-    width=None if sys.stdout.isatty() else FILE_WIDTH,
-    markup=False,
-    emoji=False,
-)
+out = Console(highlight=False, width=width_of_results(), markup=False, emoji=False)
 
 # Files that the running verb wrote, and how many it may write at most.
 _written: list[Path] = []

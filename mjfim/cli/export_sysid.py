@@ -56,4 +56,4 @@ def export_sysid(
 
     keep_result(output)
     sysid_comparison.write_sysid_comparison(output, result)
-    out.print(f"wrote {output}: comparison.json, sysid_report.html", markup=False)
+    out.print(f"wrote {output}: comparison.json, sysid_report.html", soft_wrap=True)

@@ -78,7 +78,7 @@ def init(
     errors.print(f"wrote {file}", markup=False)
     for remark in proposal.remarks:
         errors.print(remark, markup=False)
-    out.print(f"next: mjfim check {file}", markup=False)
+    out.print(f"next: mjfim check {file}", soft_wrap=True)
 
 
 def _groups(text: str) -> list[Group]:

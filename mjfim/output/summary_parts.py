@@ -71,11 +71,13 @@ class Column:
         heading: Its heading.
         left: True for text that is aligned to the left.
         detail: True where a short form leaves it out.
+        optional: True where a short form leaves it out if names would be folded otherwise.
     """
 
     heading: str | Name
     left: bool = False
     detail: bool = False
+    optional: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +198,10 @@ class Summary:
 
 
 def columns(
-    *headings: str | Name, left: Sequence[str] = (), details: Sequence[str] = ()
+    *headings: str | Name,
+    left: Sequence[str] = (),
+    details: Sequence[str] = (),
+    optional: Sequence[str] = (),
 ) -> tuple[Column, ...]:
     """Return the heads of columns.
 
@@ -204,9 +209,16 @@ def columns(
         headings: Heading of each column; the first column holds text.
         left: Headings of further columns that hold text.
         details: Headings of columns that a short form leaves out.
+        optional: Headings of columns that a short form leaves out if names would be folded
+            otherwise.
     """
     return tuple(
-        Column(heading=heading, left=i == 0 or heading in left, detail=heading in details)
+        Column(
+            heading=heading,
+            left=i == 0 or heading in left,
+            detail=heading in details,
+            optional=heading in optional,
+        )
         for i, heading in enumerate(headings)
     )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rich.cells import cell_len, chop_cells
 
@@ -57,10 +57,12 @@ class TableText:
     Attributes:
         head: Lines with the headings; empty where each row is a paragraph.
         rows: The rows.
+        left_out: Headings of optional columns that are not shown.
     """
 
     head: tuple[str, ...]
     rows: tuple[TableRow, ...]
+    left_out: tuple[str, ...] = ()
 
     def as_one(self) -> TableText:
         """The table with all its rows as one, none of which can be left out."""
@@ -68,7 +70,9 @@ class TableText:
         return TableText(head=self.head, rows=(TableRow(lines=lines, emphasis=Emphasis.NORMAL),))
 
 
-def table_text(table: SummaryTable, width: int, *, verbose: bool, rule: str = "─") -> TableText:
+def table_text(
+    table: SummaryTable, width: int, *, verbose: bool, rule: str = "─", narrow: bool = False
+) -> TableText:
     """Lay out a table.
 
     Args:
@@ -76,18 +80,49 @@ def table_text(table: SummaryTable, width: int, *, verbose: bool, rule: str = "�
         width: Width of the terminal [characters].
         verbose: Whether details are shown, too.
         rule: Character of the line below the headings.
+        narrow: Whether optional columns are left out where names would be folded otherwise.
     """
-    grid = _Grid.of(table, verbose=verbose)
+    shown = [k for k, column in enumerate(table.columns) if verbose or not column.detail]
+    left_out: tuple[str, ...] = ()
+    if narrow:
+        shown, left_out = _without_optional(table, shown, width)
+
+    grid = _Grid.of(table, shown)
     widths = grid.widths(width)
     if widths is not None:
-        return grid.laid_out(widths, rule)
+        return replace(grid.laid_out(widths, rule), left_out=left_out)
 
     if len(grid.rows) <= MAX_TRANSPOSED:
         transposed = grid.transposed()
         widths = transposed.widths(width)
         if widths is not None:
-            return transposed.laid_out(widths, rule).as_one()
-    return TableText(head=(), rows=grid.paragraphs(width))
+            return replace(transposed.laid_out(widths, rule).as_one(), left_out=left_out)
+    return TableText(head=(), rows=grid.paragraphs(width), left_out=left_out)
+
+
+def _without_optional(
+    table: SummaryTable, shown: Sequence[int], width: int
+) -> tuple[list[int], tuple[str, ...]]:
+    """Leave out optional columns, the last one first, while names are folded.
+
+    Args:
+        table: The table.
+        shown: Indices of the columns that the short form shows.
+        width: Width of the terminal [characters].
+
+    Returns:
+        Indices of the columns, and the headings of those that are left out.
+    """
+    kept = list(shown)
+    left_out: list[str] = []
+    for k in reversed(shown):
+        if not table.columns[k].optional:
+            continue
+        if not _Grid.of(table, kept).folds_text(width):
+            break
+        kept.remove(k)
+        left_out.append(_heading(table, k))
+    return kept, tuple(reversed(left_out))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,9 +142,8 @@ class _Grid:
     emphases: tuple[Emphasis, ...]
 
     @classmethod
-    def of(cls, table: SummaryTable, *, verbose: bool) -> _Grid:
-        """Choose the columns of a table; units have a column of their own."""
-        shown = [k for k, column in enumerate(table.columns) if verbose or not column.detail]
+    def of(cls, table: SummaryTable, shown: Sequence[int]) -> _Grid:
+        """The columns `shown` of a table; units have a column of their own."""
         headings: list[str] = []
         is_left: list[bool] = []
         for k in shown:
@@ -159,6 +193,20 @@ class _Grid:
             spare = room - sum(widths)
             widths[k] += min(natural[k] - widths[k], spare)
         return widths
+
+    def folds_text(self, available: int) -> bool:
+        """Whether cells do not fit into one line each.
+
+        Args:
+            available: Width of the terminal [characters].
+        """
+        widths = self.widths(available)
+        if widths is None:
+            return True
+        cells = [
+            max((cell_len(row[k]) for row in self.rows), default=0) for k in range(len(widths))
+        ]
+        return any(width < cell for width, cell in zip(widths, cells, strict=True))
 
     def transposed(self) -> _Grid:
         """The table with its columns as rows; the first cells become headings."""

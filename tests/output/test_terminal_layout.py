@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rich.cells import cell_len
 
+from mjfim.output.condensed import condensed
 from mjfim.output.presentation import describe
 from mjfim.output.summary_parts import (
     Emphasis,
@@ -216,6 +217,45 @@ def test_the_short_form_is_short_and_cuts_nothing(
     # It begins with the verdict, and shows the first parameter or method.
     assert letters("".join(lines)).startswith(letters(summary.outcome)[1:], 1)
     assert any(line.startswith(BEGINS) for line in lines)
+
+
+@pytest.mark.parametrize("make", [a_check, an_estimate])
+def test_ten_parameters_are_shown_beside_long_sentences(
+    make: Callable[[tuple[str, ...]], ShownRecord],
+) -> None:
+    """As on an arm with servos: names of 24 characters, and a verdict of four lines."""
+    names = tuple(f"Wrist_Pitch_frictionlos{j}" for j in range(10))
+    remark = "dry friction of Elbow, dry friction of Jaw"
+    verdict = WARNING.replace("; σ and", f" (t = 1.9 s; {remark}); σ and")
+    summary = replace(describe(make(names)), outcome=verdict)
+    lines = printed(summary, 80)
+    assert len(lines) <= MAX_LINES
+    assert [line.split()[0] for line in lines if line.startswith("Wrist")] == list(names)
+
+    # The short form says that something is missing, and the long form has it.
+    assert letters(lines[0]) in letters(verdict.capitalize())
+    shown = " ".join(lines)
+    assert "column" in shown and "ends of sentences" in shown and remark not in shown
+    long = printed(summary, 80, verbose=True)
+    assert letters(remark) in letters("".join(long))
+
+
+@pytest.mark.parametrize(
+    ("sentence", "most", "shown"),
+    [
+        ("short enough (with a remark); with a clause", 2, None),
+        ("The worst of all is m (largest for the arm, 15 times). It keeps all limits", 1,
+         "The worst of all is m. It keeps all limits"),
+        ("The result is not smooth at the sample 17 (t = 1 s); σ is unreliable, because of it", 1,
+         "The result is not smooth at the sample 17 (t = 1 s)"),
+        ("a list of some members\n  of a group that stays as it is", 1, None),
+        ("unbreakable words only, which have neither clause nor remark and stay whole", 1, None),
+    ],
+)  # fmt: skip
+def test_sentences_lose_remarks_and_then_clauses(
+    sentence: str, most: int, shown: str | None
+) -> None:
+    assert condensed(sentence, 60, most) == (shown or sentence)
 
 
 @pytest.mark.parametrize("width", [80, 120])

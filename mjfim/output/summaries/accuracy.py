@@ -64,6 +64,7 @@ def accuracy_table(design: Design, units: Sequence[str]) -> SummaryTable:
             "relative σ",
             "change of σ",
             details=[RELATIVE_INITIAL],
+            optional=["value"],
         ),
         rows=tuple(rows),
     )

@@ -77,6 +77,7 @@ def _check_table(check: Check) -> SummaryTable:
             "repetitions",
             "time",
             details=["time"],
+            optional=["value", "wanted σ"],
         ),
         rows=tuple(_check_row(row) for row in check.rows),
     )

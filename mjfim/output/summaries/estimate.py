@@ -30,6 +30,9 @@ MAX_DIGITS = 9
 # Heading of the standard deviation that is right if the model and the noise are.
 FORMAL = "formal σ"
 
+# Heading of the standard deviation that allows for residuals that are not white.
+HONEST = "honest σ"
+
 # Heading of the column that marks estimates at a bound.
 AT_BOUND = "at bound"
 
@@ -119,7 +122,7 @@ def _estimate_table(estimate: Estimate) -> SummaryTable:
         emphasis = Emphasis.WARNING if name in estimate.at_bound else Emphasis.NORMAL
         rows.append(Row(cells=cells, emphasis=emphasis))
 
-    headings = ["parameter", NOMINAL.word, IDENTIFIED.word, FORMAL, "honest σ", "95 % low", "high"]
+    headings = ["parameter", NOMINAL.word, IDENTIFIED.word, FORMAL, HONEST, "95 % low", "high"]
     if estimate.at_bound:
         headings.append(AT_BOUND)
     else:
@@ -127,7 +130,7 @@ def _estimate_table(estimate: Estimate) -> SummaryTable:
     return SummaryTable(
         key="estimates",
         title="Estimates with their 95 % intervals",
-        columns=columns(*headings, details=[FORMAL, AT_BOUND]),
+        columns=columns(*headings, details=[FORMAL, AT_BOUND], optional=[NOMINAL.word, HONEST]),
         rows=tuple(rows),
     )
 

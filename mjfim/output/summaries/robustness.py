@@ -68,6 +68,7 @@ def _unknown_table(result: Robustness) -> SummaryTable:
             "σ formal",
             "rms error",
             f"in 95 % interval, of {result.runs}",
+            optional=["error of guess", "σ formal"],
         ),
         rows=tuple(rows),
     )
