@@ -18,17 +18,18 @@ from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.combinations import ParameterGroup
 from mjfim.records.estimate import NORMAL_95, Uncertainty
 
-# Half width of an interval over the value, above which a parameter is poorly known.
+# Half width of an interval over the size of the value (an entry of a vector or tensor has the size
+# of the whole), above which a parameter is poorly known.
 POORLY_KNOWN_SHARE = 0.25
 
-# Half width of an interval over the value, above which the parameter is practically unknown.
+# Half width of an interval over that size, above which the parameter is practically unknown.
 UNKNOWN_SHARE = 10.0
 
 # Correlation above which another parameter is named as confounded.
 CONFOUNDED_CORRELATION = 0.5
 
-# The width of an interval is compared with the estimated value, or with this share of the
-# parameter's magnitude where the value is smaller.
+# The width of an interval is compared with the size of the estimated value, or with this share of
+# the parameter's magnitude where the value is smaller.
 SMALLEST_RELATIVE_SIZE = 1e-3
 
 # Smallest variance in a denominator.
@@ -264,12 +265,13 @@ def _poorly_known(
     parameters = system.parameters
     variance = np.diag(covariance)
     is_known = np.isfinite(variance)
+    sizes = parameters.sizes(theta)
     std = np.sqrt(np.maximum(np.where(is_known, variance, 1.0), SMALLEST_VARIANCE))
 
     for j in parameters.interest:
         half_width = 0.5 * float(interval[j, 1] - interval[j, 0])
         smallest = SMALLEST_RELATIVE_SIZE * float(parameters.magnitude[j])
-        size = max(abs(float(theta[j])), smallest)
+        size = max(float(sizes[j]), smallest)
         if not np.isfinite(half_width) or half_width <= POORLY_KNOWN_SHARE * size:
             continue
 

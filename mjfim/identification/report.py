@@ -299,6 +299,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         trace=_trace(result),
         nominal=_nominal_outputs(result),
         segments=_beginnings(problem),
+        sizes=parameters.sizes(result.theta),
         restart=result.restart,
     )
 

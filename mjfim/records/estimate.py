@@ -57,7 +57,7 @@ class Estimate(ShownRecord):
         whiteness: Tests of the residuals of each output.
         worst_residual: Interval in which the residuals are largest; None if the fit is good.
         predictions: Prediction errors on data that were not fitted.
-        sloppy: Names of the parameters whose interval is wide compared with their value.
+        sloppy: Names of the parameters whose interval is wide compared with their size.
         missing_terms: Terms missing in the model that would explain the residuals.
         per_recording: Values for each recording of the parameters that differ between recordings;
             `theta` holds their values for the first recording.
@@ -75,6 +75,8 @@ class Estimate(ShownRecord):
         nominal: Outputs of the model at the initial guess, with the fitted initial states, for each
             recording, (M, ny) [unit of the output]; empty where it diverges.
         segments: Times at which the segments of each recording begin [s].
+        sizes: (p,) sizes of which relative numbers are a share: magnitudes of the values, or of the
+            whole vector or tensor of an entry [theta-unit].
     """
 
     parameters: tuple[str, ...]
@@ -118,6 +120,7 @@ class Estimate(ShownRecord):
     trace: Array = field(default_factory=lambda: np.zeros((0, 0)))
     nominal: tuple[Array, ...] = ()
     segments: tuple[Array, ...] = ()
+    sizes: Array = field(default_factory=lambda: np.zeros(0))
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -145,11 +148,22 @@ class Estimate(ShownRecord):
             object.__setattr__(self, "between_recordings", np.zeros(count))
         if len(self.prior) != count:
             object.__setattr__(self, "prior", np.zeros((count, count)))
+        if len(self.sizes) != count:
+            object.__setattr__(self, "sizes", np.abs(self.theta))
         if len(self.units) != count:
             object.__setattr__(self, "units", ("",) * count)
 
         freeze(self, "theta", "std", "covariance", "initial_theta", "data", "prior")
-        freeze(self, "std_sandwich", "interval", "between_recordings", "trace")
+        freeze(self, "std_sandwich", "interval", "between_recordings", "trace", "sizes")
+
+    @property
+    def guess_sizes(self) -> Array:
+        """(p,) sizes of the guess, of which its difference from the estimate is a share.
+
+        They are zero for a single number whose guess is zero [theta-unit].
+        """
+        is_single = self.sizes == np.abs(self.theta)
+        return np.where(is_single, np.abs(self.initial_theta), self.sizes)
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of estimate.json."""
@@ -161,6 +175,7 @@ class Estimate(ShownRecord):
             "std": self.std,
             "covariance": self.covariance,
             "initial_theta": self.initial_theta,
+            "sizes": self.sizes,
             "chi2": self.chi2,
             "dof": self.dof,
             "status": self.status,

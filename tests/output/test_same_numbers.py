@@ -102,6 +102,29 @@ def test_a_design_and_its_check_state_the_same_accuracy(
     assert missing([f"a σ of {worst}"], report) == []
 
 
+def test_a_share_of_a_whole_vector_is_the_same_in_table_verdict_and_figure(design: Design) -> None:
+    of_vectors = replace(design, sizes=10.0 * design.sizes)
+    std = design.final.std.tolist()
+    shares = [str(relative(*pair)) for pair in zip(std, of_vectors.sizes.tolist(), strict=True)]
+
+    for text in (in_terminal(of_vectors), texts_of(of_vectors.plot("standard_deviations"))):
+        assert missing(shares, text) == []
+        assert "share of the magnitude of the whole" in " ".join(text.split())
+
+
+def test_the_accuracy_of_an_entry_of_a_vector_is_a_share_of_the_whole(estimate: Estimate) -> None:
+    sizes = np.array([10.0, 1.0, 1.0]) * np.abs(estimate.theta)
+    of_vectors = replace(estimate, sizes=sizes)
+    half = 0.5 * np.diff(estimate.interval, axis=1)[:, 0]
+
+    (share,) = re.findall(r"± (\S+ %)", describe(of_vectors).outcome)
+    assert share == str(relative(float((half / sizes).max()), 1.0))
+
+    # The difference from the guess is a share of the same size.
+    np.testing.assert_array_equal(of_vectors.guess_sizes[0], sizes[0])
+    np.testing.assert_array_equal(of_vectors.guess_sizes[1:], np.abs(estimate.initial_theta[1:]))
+
+
 def test_an_estimate_states_the_same_accuracy_everywhere(
     estimate: Estimate, tmp_path: Path
 ) -> None:

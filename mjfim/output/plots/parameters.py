@@ -23,14 +23,13 @@ from mjfim.output.plots.style import (
     add_title,
     format_axes,
     format_number,
-    format_percent,
     format_with_uncertainty,
     new_figure,
     own_style,
     shorten,
     shorten_label,
 )
-from mjfim.output.summaries.accuracy import BEST_CASE
+from mjfim.output.summaries.accuracy import BEST_CASE, improvement, relative, size_sentence
 from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
@@ -59,13 +58,13 @@ class _Accuracies:
 
     Attributes:
         names: n names with units.
-        values: (n,) values [theta-unit].
+        sizes: (n,) sizes of which standard deviations are a share [theta-unit].
         std_initial: (n,) standard deviations along the initial trajectory [theta-unit].
         std_final: (n,) standard deviations along the designed trajectory [theta-unit].
     """
 
     names: list[str]
-    values: Array
+    sizes: Array
     std_initial: Array
     std_final: Array
 
@@ -109,6 +108,8 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     note = BEST_CASE
     if not np.isfinite(stds).all():
         note += " ∞: the parameter is not identifiable alone from this trajectory."
+    if of_size := size_sentence(design.theta, design.sizes):
+        note += f" {of_size}"
     add_title(figure, "Predicted accuracy (Cramér–Rao)", handles, note)
     return figure
 
@@ -120,12 +121,12 @@ def _accuracies(design: Design, labels: Labels) -> _Accuracies:
     names = [shorten_label(labels.parameter(j)) for j in wanted]
     names += [shorten(combination.expression) for combination in combined]
 
-    values = [*design.theta[wanted], *(combination.value for combination in combined)]
+    sizes = [*design.sizes[wanted], *(abs(combination.value) for combination in combined)]
     initial = [*design.initial.std[wanted], *(c.std_initial for c in combined)]
     final = [*design.final.std[wanted], *(c.std_final for c in combined)]
     return _Accuracies(
         names=names,
-        values=np.array(values),
+        sizes=np.array(sizes),
         std_initial=np.array(initial),
         std_final=np.array(final),
     )
@@ -187,23 +188,17 @@ def _draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
 
 
 def _write_columns(axes: Axes, accuracies: _Accuracies) -> None:
-    """Write three columns beside the bars: both relative standard deviations, and their ratio."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative_initial = np.abs(accuracies.std_initial / accuracies.values)
-        relative_final = np.abs(accuracies.std_final / accuracies.values)
-        ratio = accuracies.std_initial / accuracies.std_final
-
-    initial_texts = [format_percent(value) for value in relative_initial]
-    final_texts = [format_percent(value) for value in relative_final]
-    ratio_texts = [
-        f"{format_number(value)}×" if np.isfinite(value) else format_number(value)
-        for value in ratio
-    ]
+    """Write three columns beside the bars: both relative standard deviations, and the change."""
+    sizes = accuracies.sizes.tolist()
+    initial, final = accuracies.std_initial.tolist(), accuracies.std_final.tolist()
+    initial_texts = [str(relative(*pair)) for pair in zip(initial, sizes, strict=True)]
+    final_texts = [str(relative(*pair)) for pair in zip(final, sizes, strict=True)]
+    changes = [improvement(*pair) for pair in zip(initial, final, strict=True)]
 
     # Right edge of each column [points], behind the right end of the axis.
-    _write_column(axes, 62.0, "σ / value", initial_texts, INITIAL_COLOUR)
-    _write_column(axes, 122.0, "σ / value", final_texts, DESIGNED_COLOUR)
-    _write_column(axes, 178.0, "ratio", ratio_texts, TEXT_COLOUR)
+    _write_column(axes, 62.0, "relative σ", initial_texts, INITIAL_COLOUR)
+    _write_column(axes, 122.0, "relative σ", final_texts, DESIGNED_COLOUR)
+    _write_column(axes, 178.0, "change", changes, TEXT_COLOUR)
 
 
 def _write_column(axes: Axes, right: float, heading: str, texts: list[str], colour: str) -> None:
@@ -272,16 +267,16 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     """
     count = len(estimate.theta)
     labels.check(parameters=count)
-    relative = _relative_to_guess(estimate)
+    difference = _difference_from_guess(estimate)
     row_height = 0.42 if count <= MAX_HIGH_ROWS else 0.27
 
     figure = new_figure(1.9 + row_height * count)
     axes = figure.subplots()
-    axes.set(xlim=_interval_limits(relative), ylim=(count - 0.4, -0.6))
+    axes.set(xlim=_interval_limits(difference), ylim=(count - 0.4, -0.6))
     axes.axvline(0.0, color=NOMINAL_COLOUR, linewidth=1.6)
     for j, name in enumerate(estimate.parameters):
-        if np.isfinite(relative.centre[j]):
-            _draw_interval(axes, relative, j, at_bound=name in estimate.at_bound)
+        if np.isfinite(difference.centre[j]):
+            _draw_interval(axes, difference, j, at_bound=name in estimate.at_bound)
         axes.text(
             1.02,
             j,
@@ -292,17 +287,18 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
             color=TEXT_COLOUR,
         )
 
-    format_axes(axes, "difference from the guess [% of the guess]")
+    format_axes(axes, f"difference from the {NOMINAL.word} value [%]")
     axes.set_yticks(range(count), [shorten_label(labels.parameter(j)) for j in range(count)])
-    note = _interval_note(estimate, guess_of_zero=bool(np.isnan(relative.centre).any()))
+    note = _interval_note(estimate, guess_of_zero=bool(np.isnan(difference.centre).any()))
     add_title(figure, "Estimated parameters", _interval_handles(), note)
     return figure
 
 
-def _relative_to_guess(estimate: Estimate) -> _RelativeEstimate:
-    """Express estimates and intervals as percent of the guess."""
+def _difference_from_guess(estimate: Estimate) -> _RelativeEstimate:
+    """Express estimates and intervals as percent of the size of the guess."""
     guess = estimate.initial_theta
-    percent = np.where(guess == 0.0, np.nan, np.abs(guess)) / 100.0
+    sizes = estimate.guess_sizes
+    percent = np.where(sizes > 0.0, sizes, np.nan) / 100.0
     return _RelativeEstimate(
         centre=(estimate.theta - guess) / percent,
         formal_half_width=QUANTILE_95 * estimate.std / percent,
@@ -310,11 +306,11 @@ def _relative_to_guess(estimate: Estimate) -> _RelativeEstimate:
     )
 
 
-def _interval_limits(relative: _RelativeEstimate) -> tuple[float, float]:
+def _interval_limits(difference: _RelativeEstimate) -> tuple[float, float]:
     """Return the limits of the axis [%]; few very wide intervals do not widen it."""
-    known = np.isfinite(relative.centre)
-    centre = relative.centre[known]
-    reach = np.abs(relative.interval - relative.centre[:, None])[known]
+    known = np.isfinite(difference.centre)
+    centre = difference.centre[known]
+    reach = np.abs(difference.interval - difference.centre[:, None])[known]
 
     # Few intervals that are much wider than the others are cut off.
     finite = reach[np.isfinite(reach)]
@@ -330,21 +326,21 @@ def _interval_limits(relative: _RelativeEstimate) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _draw_interval(axes: Axes, relative: _RelativeEstimate, j: int, *, at_bound: bool) -> None:
+def _draw_interval(axes: Axes, difference: _RelativeEstimate, j: int, *, at_bound: bool) -> None:
     """Draw one estimate with its formal interval (thick) and its honest one (thin).
 
     Arrows mark where the axis cuts an interval off.
     """
     low, high = axes.get_xlim()
-    centre = float(relative.centre[j])
-    half = float(relative.formal_half_width[j])
+    centre = float(difference.centre[j])
+    half = float(difference.formal_half_width[j])
     if np.isfinite(half):
         formal = (max(centre - half, low), min(centre + half, high))
         axes.plot(
             formal, (j, j), color=IDENTIFIED_COLOUR, linewidth=5.0, solid_capstyle="butt", alpha=0.3
         )
 
-    left, right = (float(end) for end in relative.interval[j])
+    left, right = (float(end) for end in difference.interval[j])
     shown_left, shown_right = max(left, low), min(right, high)
     axes.plot(
         (shown_left, shown_right),
@@ -420,6 +416,8 @@ def _interval_note(estimate: Estimate, *, guess_of_zero: bool) -> str:
             " Here the residuals are not explained by noise: "
             "no interval covers the bias of a wrong model."
         )
+    if not np.array_equal(np.abs(estimate.theta), estimate.sizes):
+        note += " The difference of an entry of a vector or tensor is a share of the whole."
     if guess_of_zero:
         note += " For a guess of 0 there is no relative difference: see the text."
     return note

@@ -115,7 +115,8 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
     ]
     note = (
         "The interval allows for residuals that are not white noise and for recordings that "
-        "disagree. A nominal value of 0 has no relative difference; see the table."
+        "disagree. The difference of an entry of a vector or tensor is a share of the magnitude of "
+        "the whole; a nominal value of 0 has no relative difference, see the table."
     )
     yield PlotGroup(title="", panels=panels, keys=keys, note=note)
     for part in summary.parts:
@@ -126,7 +127,8 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
 def _interval_panel(estimate: Estimate, names: Sequence[str]) -> Panel:
     """Return the plot of the estimates with their intervals, relative to the nominal values."""
     guess = estimate.initial_theta
-    percent = np.where(guess == 0.0, np.nan, np.abs(guess)) / 100.0
+    sizes = estimate.guess_sizes
+    percent = np.where(sizes > 0.0, sizes, np.nan) / 100.0
     centre = (estimate.theta - guess) / percent
     low, high = (estimate.interval.T - guess) / percent
     rows = np.arange(len(names), dtype=np.float64)

@@ -187,9 +187,9 @@ def _why_not_reliable(estimate: Estimate) -> str:
 
 
 def _worst_estimate(estimate: Estimate) -> str:
-    """The parameter whose interval is widest compared with its value, in words."""
+    """The parameter whose interval is widest compared with its size, in words."""
     half_widths = 0.5 * (estimate.interval[:, 1] - estimate.interval[:, 0])
-    sizes = np.abs(estimate.theta)
+    sizes = estimate.sizes
     shares = half_widths / np.where(sizes > 0.0, sizes, np.nan)
 
     # A share of a value that may be zero says nothing.
