@@ -303,6 +303,7 @@ class _Search:
             rate=1.0 / self.task.dt,
             mu=iterate.mu,
             margin=min(margins.values(), default=np.nan),
+            margins=margins,
             motion=IterateMotion.of(values.trajectory),
         )
 

@@ -243,4 +243,5 @@ class RandomSearch:
             steps=0,
             rate=1.0 / self.cost.level.task.dt,
             margin=min(margins.values(), default=np.nan),
+            margins=margins,
         )

@@ -88,10 +88,9 @@ class Release:
         return min(self.margins.values(), default=np.inf)
 
     @property
-    def margin_of_limits(self) -> float:
-        """Smallest relative margin of the limits; NaN without limits."""
-        limits = [margin for kind, margin in self.margins.items() if kind != GROWTH]
-        return min(limits, default=np.nan)
+    def margins_of_limits(self) -> dict[str, float]:
+        """Smallest relative margin of the limits of each kind."""
+        return {kind: margin for kind, margin in self.margins.items() if kind != GROWTH}
 
     @property
     def rank(self) -> tuple[bool, float]:
@@ -337,7 +336,8 @@ class ReleaseSearch:
             seconds=self.budget.seconds_used,
             steps=task.plant.engine_steps - self._steps_before,
             rate=1.0 / task.dt,
-            margin=release.margin_of_limits,
+            margin=min(release.margins_of_limits.values(), default=np.nan),
+            margins=release.margins_of_limits,
             motion=IterateMotion.of(release.point.trajectory),
         )
 

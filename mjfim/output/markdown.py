@@ -1,8 +1,9 @@
-"""Tables of results as Markdown, for texts and wikis."""
+"""Tables of results as Markdown, for texts, wikis and the text panel of the viewer."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 
 from mjfim.output.summary_parts import Cell, Column, Summary, SummaryTable
 from mjfim.output.vocabulary import shown_word
@@ -26,16 +27,27 @@ def render_tables(summary: Summary) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def render_table(table: SummaryTable) -> str:
+def render_table(table: SummaryTable, *, details: bool = True) -> str:
     """Render a table; Markdown has no headings above several columns, so each column names them.
 
     Args:
         table: The table.
+        details: False to leave out the columns that a short form has no room for.
     """
-    headings = [_heading(table, i, column) for i, column in enumerate(table.columns)]
-    rules = [":--" if column.left else "--:" for column in table.columns]
-    rows = [[_text(cell) for cell in row.cells] for row in table.rows]
+    shown = [i for i, column in enumerate(table.columns) if details or not column.detail]
+    headings = [_heading(table, i, table.columns[i]) for i in shown]
+    rules = [":--" if table.columns[i].left else "--:" for i in shown]
+    rows = [[_text(row.cells[i]) for i in shown] for row in table.rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (headings, rules, *rows))
+
+
+def render_list(sentences: Iterable[str]) -> str:
+    """Render sentences as a list.
+
+    Args:
+        sentences: The sentences.
+    """
+    return "\n".join(f"- {escape(sentence)}" for sentence in sentences)
 
 
 def escape(text: str) -> str:

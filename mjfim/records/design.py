@@ -136,6 +136,7 @@ class HistoryRow:
         rate: Sample rate of the plant of this iterate [Hz]; lower than stated on a coarse plant.
         mu: Weight of the barrier of hard limits; 0 without limits.
         margin: Worst margin divided by half of its range; NaN without limits.
+        margins: The same for the limits of each kind, such as "position".
         motion: Thinned motion of the iterate; None where it diverged, or where the search no longer
             keeps it. In a `Design` they stand in `motions` instead.
     """
@@ -151,6 +152,7 @@ class HistoryRow:
     rate: float = 0.0
     mu: float = 0.0
     margin: float = float("nan")
+    margins: dict[str, float] = field(default_factory=dict, hash=False)
     motion: IterateMotion | None = field(default=None, compare=False, repr=False)
 
 

@@ -15,6 +15,7 @@ import pytest
 from tests.support.paths import ROOT, SHARED_MODELS
 
 pytest.importorskip("rerun")
+import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
 from mjfim.arrays import Array
@@ -24,10 +25,20 @@ from mjfim.model.coordinates import output_label
 from mjfim.output.rerun import log_design, log_estimate, log_trajectories, show
 from mjfim.output.rerun.camera import place_camera
 from mjfim.output.rerun.history import history_series
-from mjfim.output.rerun.iterates import POSES
-from mjfim.output.rerun.panels import dof_positions
+from mjfim.output.rerun.iterates import POSES, IterateCurves
+from mjfim.output.rerun.limits import usage_plots
+from mjfim.output.rerun.outputs import output_plots, recording_tabs
+from mjfim.output.rerun.panels import dof_positions, fit_in_a_row, grid_tabs
 from mjfim.output.rerun.scene import body_poses, entity_path
-from mjfim.output.rerun.series import LARGEST_ZOOM, Curve, SeriesPlot, padded
+from mjfim.output.rerun.series import (
+    LARGEST_ZOOM,
+    ROOM,
+    TIME_ROOM,
+    Curve,
+    SeriesPlot,
+    padded,
+    with_two_numbers,
+)
 from mjfim.output.rerun.shapes import INFINITE_REACH, OUTLINE, SOLID
 from mjfim.output.rerun.strips import round_logarithms, round_numbers
 from mjfim.records.design import Design, Evaluation, HistoryRow, LimitUsage, StartResult, Status
@@ -39,6 +50,7 @@ from mjfim.records.trajectory import Trajectory
 MODELS = {
     "cart": ROOT / "models" / "cart_pendulum.xml",
     "quadrotor": ROOT / "models" / "quadrotor.xml",
+    "release": ROOT / "models" / "free_pendulum.xml",
     "acrobot": SHARED_MODELS / "dmc_acrobot" / "acrobot.xml",
     "panda": SHARED_MODELS / "menagerie_panda" / "panda_nomesh.xml",
     "panda without geoms": SHARED_MODELS / "menagerie_panda" / "panda_nohand_nomesh.xml",
@@ -72,6 +84,9 @@ ZOO = """
   </worldbody>
 </mujoco>
 """
+
+# Ends of the paths of entities that show nothing by themselves.
+BESIDE = (f"/{ROOM}", "/lower\\ limit", "/upper\\ limit", "/band")
 
 
 def load(name: str) -> mujoco.MjModel:
@@ -246,26 +261,53 @@ def ranges_of_views(path: Path) -> dict[str, tuple[float, float]]:
 
 
 def shown_on_timelines(path: Path) -> dict[str, set[str]]:
-    """Return the timelines on which each entity has data that can be drawn, or "static"."""
+    """Return the timelines on which each entity has data that can be drawn, or "static".
+
+    Limits, the edges of bands and the room behind the last sample are nothing by themselves.
+    """
     drawn = ("Scalars:scalars", "LineStrips", "Points2D:positions", "half_sizes", "Mesh3D")
     shown: dict[str, set[str]] = {}
     for chunk in RrdReader(path).stream().to_chunks():
         names = chunk.to_record_batch().schema.names
+        if str(chunk.entity_path).endswith(BESIDE):
+            continue
         if any(word in name for word in drawn for name in names) or "TextDocument:text" in names:
             timelines = {"static"} if chunk.is_static else {"sim_time", "iteration"} & set(names)
             shown.setdefault(str(chunk.entity_path), set()).update(timelines)
     return shown
 
 
+def panels_without_data(path: Path, timelines: tuple[str, ...]) -> list[tuple[str, str, str]]:
+    """Return class, origin and timeline of each view that would be empty on a timeline."""
+    shown = shown_on_timelines(path)
+    empty = []
+    for view, origin in origins_of_views(path):
+        for timeline in timelines:
+            permitted = {timeline} if view == "TimeSeries" else {timeline, "static"}
+            if not any(
+                permitted & found
+                for entity, found in shown.items()
+                if entity == origin or entity.startswith(f"{origin}/")
+            ):
+                empty.append((view, origin, timeline))
+    return empty
+
+
 def series_of(path: Path) -> dict[str, Array]:
-    """Return the values of every series on `sim_time`, by entity."""
+    """Return the values of every series on `sim_time`, by entity.
+
+    Behind the last sample of each plot there are two without a value, for the numbers of the axis.
+    """
     series: dict[str, list[Any]] = {}
     for chunk in RrdReader(path).stream().to_chunks():
         batch = chunk.to_record_batch()
         if {"Scalars:scalars", "sim_time"} <= set(batch.schema.names):
             rows = batch.column("Scalars:scalars").to_pylist()
             series.setdefault(str(chunk.entity_path), []).extend(rows)
-    return {entity: np.array(rows) for entity, rows in series.items()}
+    found = {entity: np.array(rows) for entity, rows in series.items()}
+    rooms = {entity for entity in found if entity.endswith(f"/{ROOM}")}
+    assert all(np.isnan(found[entity]).all() and len(found[entity]) == 2 for entity in rooms)
+    return {entity: values for entity, values in found.items() if entity not in rooms}
 
 
 def assert_series_show(path: Path, sources: dict[tuple[str, ...], Array]) -> None:
@@ -483,16 +525,71 @@ class TestDesign:
         assert entity_path(at) not in entities(file)
 
     def test_every_panel_has_something_to_show_on_each_timeline(self, file: Path) -> None:
-        shown = shown_on_timelines(file)
-        for view, origin in origins_of_views(file):
-            for timeline in ("sim_time", "iteration"):
-                found = {
-                    path
-                    for path, timelines in shown.items()
-                    if (path == origin or path.startswith(f"{origin}/"))
-                    and (timeline in timelines or (view != "TimeSeries" and "static" in timelines))
-                }
-                assert found, (view, origin, timeline)
+        assert not panels_without_data(file, ("sim_time", "iteration"))
+
+    def test_limits_of_each_kind_have_their_own_curve_over_the_iterations(
+        self, cart: mujoco.MjModel, design: Design
+    ) -> None:
+        (position,) = design.usage
+        force = replace(position, kind="force", name="motor")
+        usage = (position, force, replace(force, kind="clearance", lower=0.1))
+        margins = [{"position": 0.5, "force": 0.1 * k, "clearance": 1.0} for k in range(3)]
+        rows = [
+            replace(row, margins=each) for row, each in zip(design.history, margins, strict=True)
+        ]
+        iterates = IterateCurves.of(cart, design)
+        plots = usage_plots(replace(design, usage=usage, history=tuple(rows)), iterates)
+        shares = [plot.curves[-1].values for plot in plots]
+        np.testing.assert_allclose(shares, [[50.0] * 3, [100.0, 90.0, 80.0], [50.0] * 3])
+
+        # Without margins, that of a position is read from the motions; a force is not in them.
+        plots = usage_plots(replace(design, usage=usage[:2]), iterates)
+        assert design.motions is not None
+        slide = np.abs(design.motions.qpos[:, :, 0]).max(axis=1) / 1.5
+        np.testing.assert_allclose(plots[0].curves[-1].values, 100.0 * slide, rtol=1e-6)
+        assert np.ptp(plots[1].curves[-1].values) == 0.0
+        assert plots[1].curves[-1].legend == ("largest of the designed trajectory",)
+
+    def test_limits_name_the_curves_that_are_closest_to_a_bound(
+        self, cart: mujoco.MjModel, design: Design
+    ) -> None:
+        (used,) = design.usage
+        uses = tuple(
+            replace(used, name=f"joint{k}", share=np.full(len(used.t), 0.1 * k)) for k in range(9)
+        )
+        (plot,) = usage_plots(replace(design, usage=uses), None)
+        named = {name for curve in plot.curves[:-1] for name in curve.names}
+        assert named == {"others", "joint5, 50 %", "joint6, 60 %", "joint7, 70 %", "joint8, 80 %"}
+
+    def test_in_the_view_of_both_robots_the_initial_one_is_translucent(self, file: Path) -> None:
+        looks = blueprint_column(file, "Ellipsoids3D:colors")
+        (path,) = [entity for entity in looks if "/initial/bodies/bob/bob/" in entity]
+        opacity = int(looks[path][0]) & 255
+        _, (colours,) = column(
+            file, ("robots", "initial", "bodies", "bob", "bob"), None, "Ellipsoids3D:colors"
+        )
+        assert 0 < opacity < int(colours[0]) & 255
+        assert not [entity for entity in looks if "designed" in entity]
+
+    def test_the_last_number_of_the_time_has_room(self, file: Path, design: Design) -> None:
+        times, values = column(
+            file, ("positions", "hinge [rad]", ROOM), "sim_time", "Scalars:scalars"
+        )
+        end = design.trajectory.t[-1]
+        np.testing.assert_allclose(times * 1e-9, [end, (1.0 + TIME_ROOM) * end], rtol=1e-9)
+        assert np.isnan(values).all()
+
+    @pytest.mark.parametrize("kept", [("motions",), ("history",), ()])
+    def test_panels_have_data_without_motions_or_history(
+        self, cart: mujoco.MjModel, design: Design, tmp_path: Path, kept: tuple[str, ...]
+    ) -> None:
+        motions = design.motions if "motions" in kept else None
+        history = design.history if "history" in kept else ()
+        path = tmp_path / "design.rrd"
+        shown = replace(design, motions=motions, history=history)
+        log_design(path, cart, shown, labels_of_model(cart))
+        timelines = ("sim_time", "iteration") if history else ("sim_time",)
+        assert not panels_without_data(path, timelines)
 
     def test_every_plot_of_series_has_a_range(self, file: Path, design: Design) -> None:
         ranges = ranges_of_views(file)
@@ -505,7 +602,7 @@ class TestDesign:
     def test_summary_holds_outcome_accuracy_warnings_and_starts(self, file: Path) -> None:
         text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
         assert "Stopped at its budget (max_iterations" in text
-        assert "| mass | 2 | 0.5 | 25 % | 0.0312 | 1.6 % | ÷ 16.0 |" in text
+        assert "| mass | 2 | 0.5 | 0.0312 | 1.6 % | ÷ 16.0 |" in text
         assert "Limits are violated: position" in text
         assert "nearly confounded" in text
         assert "Best of 2 starts: multisine 2" in text
@@ -594,15 +691,16 @@ class TestFreeBody:
         assert len(places) == 3 and len(set(places) - set(tracked)) == 1
 
 
-@pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo"])
+@pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo", "release"])
 class TestAnyModel:
-    """Recordings of other models than the paper's."""
+    """Recordings of other models than the paper's, two of them without actuators."""
 
     def test_design_of_any_model_is_logged(self, name: str, tmp_path: Path) -> None:
         model = load(name)
         path = tmp_path / "design.rrd"
         log_design(path, model, designed(model), labels_of_model(model))
         logged = entities(path)
+        assert not panels_without_data(path, ("sim_time", "iteration"))
         assert not [entry for entry in logged if "__warnings" in entry]
         for key in ("initial", "designed"):
             bodies = [model.body(b).name or f"body{b}" for b in range(1, model.nbody)]
@@ -782,6 +880,23 @@ class TestEstimate:
         assert not [entry for entry in entities(path) if "hinge_angle" in entry and "band" in entry]
         names = blueprint_column(path, "ContainerBlueprint:display_name")
         assert ["held out: run 7"] in names.values()
+        assert not panels_without_data(path, ("sim_time",))
+
+    def test_a_band_that_would_cover_the_curves_is_drawn_beside_the_residuals_only(
+        self, cart: mujoco.MjModel
+    ) -> None:
+        trajectory = simulated(cart, 2.0)
+        estimate = replace(estimated(cart, trajectory), sigma={"qpos:slide": 1e-4})
+        shown, residual = output_plots(cart, estimate)[0].pairs[0]
+        drawn = [{c.name for c in p.curves if c.finite.any()} for p in (shown, residual)]
+        assert "band" not in drawn[0] and "band" in drawn[1]
+
+    def test_many_recordings_share_two_tabs(self, cart: mujoco.MjModel) -> None:
+        recordings = output_plots(cart, estimated(cart, simulated(cart, 2.0)))
+        others = ["positions", "velocities", "controls"]
+        assert len(recording_tabs(recordings, [], others)) == 2
+        many = recording_tabs(4 * recordings, recordings, others)
+        assert [tab.name for tab in many] == ["recordings", "held out"]
 
     @pytest.mark.parametrize("speed", ["measured", "partly measured", "not measured"])
     def test_series_vary_where_their_sources_do(
@@ -793,6 +908,7 @@ class TestEstimate:
         measured = replace(identified, qvel=qvel)
         labels = labels_of_model(cart)
         log_estimate(path, cart, estimated(cart, identified), measured, identified, labels)
+        assert not panels_without_data(path, ("sim_time",))
         sources = {
             **state_sources(cart, "identified", identified),
             **state_sources(cart, "measured", measured),
@@ -813,6 +929,7 @@ class TestEstimate:
             addition="see the report",
         )
         assert not [entry for entry in entities(path) if entry.startswith("/robots/measured")]
+        assert not panels_without_data(path, ("sim_time",))
         text = str(column(path, ("summary",), None, "TextDocument:text")[1][0, 0])
         assert "not explained by noise: the formal σ underestimates the errors" in text
         assert "see the report" in text
@@ -851,11 +968,56 @@ class TestLabels:
         assert plots[0].range[1] > 2.0 and plots[0].full_title == "slide [m]"
         assert plots[1].range[1] < 2.0 and plots[1].full_title == f"slide [m], limits {far:.3g}"
 
+    def test_every_range_has_at_least_two_and_at_most_the_permitted_numbers(self) -> None:
+        rng = np.random.default_rng(0)
+        for _ in range(200):
+            low = rng.normal() * 10.0 ** rng.uniform(-3.0, 3.0)
+            high = low + 10.0 ** rng.uniform(-6.0, 6.0)
+            most = int(rng.integers(4, 9))
+            assert 2 <= len(round_numbers(low, high, most)) <= most
+        assert len(round_numbers(-0.41, 0.41, 4)) == 3
+
+    def test_a_low_plot_has_two_numbers_beside_its_axis(self) -> None:
+        """The viewer writes multiples of a power of ten that are far enough from each other."""
+        assert with_two_numbers(-0.3, 8.2, 100.0) == (-0.3, pytest.approx(10.0, abs=0.5))
+        assert with_two_numbers(11.0, 19.0, 100.0) == pytest.approx((10.0, 20.0), abs=0.5)
+        for height in (170.0, 280.0):
+            assert with_two_numbers(-0.3, 0.25, height) == (-0.3, 0.25)
+        assert with_two_numbers(-4.9, 4.9, 100.0) == (-4.9, 4.9), "it would be too low then"
+
+    def test_the_legend_stands_where_it_covers_least(self) -> None:
+        t = np.linspace(0.0, 1.0, 50)
+        for values, corner in (
+            (1.0 - t, rrb.Corner2D.RightTop),
+            (t, rrb.Corner2D.LeftTop),
+            (1.0 - 0.2 * np.abs(t - 0.5), rrb.Corner2D.LeftBottom),
+        ):
+            curves = [
+                Curve(name="a", t=t, values=values, colour=(0, 0, 0)),
+                Curve(name="low", t=t, values=np.where(t == t[-1], -1.0, np.nan), colour=(0, 0, 0)),
+            ]
+            plot = SeriesPlot(parts=("a",), title="a", curves=curves)
+            assert plot.emptiest_corner == corner
+
+    def test_names_of_tabs_fit_beside_each_other(self) -> None:
+        views: list[rrb.View] = [rrb.TimeSeriesView(origin=f"/{k}") for k in range(20)]
+        (tab,) = grid_tabs("positions", views)
+        assert tab.name == "positions"
+        assert [page.name for page in tab.contents] == [
+            "1 to 5 of 20",
+            "6 to 10 of 20",
+            "11 to 15 of 20",
+            "16 to 20 of 20",
+        ]
+        assert grid_tabs("positions", []) == []
+        groups = ["positions", "velocities", "controls", "limits", "information"]
+        assert fit_in_a_row([*groups, "sensitivities ψ", "optimiser", "iterates"])
+
     def test_numbers_beside_axes_are_round(self) -> None:
         np.testing.assert_allclose(round_numbers(-0.1, 4.2, 4), [0.0, 2.0, 4.0])
-        np.testing.assert_allclose(round_numbers(2.41, 2.63, 4), [2.5, 2.6])
-        np.testing.assert_allclose(10.0 ** round_logarithms(-0.1, 1.1, 3), [1.0, 2.0, 5.0, 10.0])
-        np.testing.assert_allclose(10.0 ** round_logarithms(-5.2, 0.1, 3), [1e-4, 1e-2, 1.0])
+        np.testing.assert_allclose(round_numbers(2.41, 2.63, 4), [2.45, 2.5, 2.55, 2.6])
+        np.testing.assert_allclose(10.0 ** round_logarithms(-0.1, 1.1, 4), [1.0, 2.0, 5.0, 10.0])
+        np.testing.assert_allclose(10.0 ** round_logarithms(-5.2, 0.1, 4), [1e-4, 1e-2, 1.0])
 
     def test_rotations_become_rotation_vectors(self) -> None:
         model = load("zoo")

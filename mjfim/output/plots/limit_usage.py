@@ -7,11 +7,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from mjfim.arrays import Array
 from mjfim.excitation.constraints import SUBSTEP_KINDS
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import LENGTH, per_second
-from mjfim.output.limit_curves import largest_share, would_be_solid
+from mjfim.output.limit_curves import (
+    closest_to_bounds,
+    envelope,
+    largest_share,
+    whole_percent,
+    would_be_solid,
+)
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     GRID_COLOUR,
@@ -58,10 +63,6 @@ NAMED_CURVES = 3
 
 # Characters to which the names of curves are shortened, in the panels and in the legend.
 CURVE_NAME_WIDTH, LEGEND_NAME_WIDTH = 18, 24
-
-
-# Number of intervals of time of which an envelope shows the smallest and the largest value.
-ENVELOPE_INTERVALS = 150
 
 
 @own_style
@@ -121,12 +122,9 @@ def joint_colours(design: Design) -> dict[str, str]:
     Args:
         design: A design with limits.
     """
-    largest: dict[str, float] = {}
-    for usage in design.usage:
-        largest[usage.name] = max(largest.get(usage.name, 0.0), largest_share(usage))
-
-    closest = sorted(largest, key=lambda name: -largest[name])[: len(JOINT_COLOURS)]
-    shown = [name for name in largest if name in closest]
+    closest = closest_to_bounds(design.usage)[: len(JOINT_COLOURS)]
+    in_order = dict.fromkeys(usage.name for usage in design.usage)
+    shown = [name for name in in_order if name in closest]
     return dict(zip(shown, JOINT_COLOURS, strict=False))
 
 
@@ -145,21 +143,12 @@ def _draw_curves(axes: Axes, curves: list[LimitUsage], colours: dict[str, str]) 
             axes.plot(usage.t, 100.0 * usage.share, color=colour, linewidth=width, zorder=order)
             continue
 
-        t, low, high = _envelope(usage)
+        t, low, high = envelope(usage)
         axes.fill_between(
             t, low, high, color=colour, alpha=0.25 if strong else 0.08, linewidth=0.0, zorder=order
         )
         for end in (low, high):
             axes.plot(t, end, color=colour, linewidth=0.9 if strong else 0.4, zorder=order)
-
-
-def _envelope(usage: LimitUsage) -> tuple[Array, Array, Array]:
-    """Return times [s], and smallest and largest shares [%], of successive intervals."""
-    starts = np.unique(np.linspace(0, len(usage.t), ENVELOPE_INTERVALS, endpoint=False).astype(int))
-    percent = 100.0 * usage.share
-    low, high = np.minimum.reduceat(percent, starts), np.maximum.reduceat(percent, starts)
-    ends = np.append(starts[1:], len(usage.t)) - 1
-    return 0.5 * (usage.t[starts] + usage.t[ends]), low, high
 
 
 def _draw_bounds(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
@@ -205,18 +194,6 @@ def _label(axes: Axes, curves: list[LimitUsage], margin: str, width: float) -> N
         color=MUTED_COLOUR,
         va="bottom",
     )
-
-
-def whole_percent(share: float) -> str:
-    """Write a share in whole percents; one within the bound is never rounded to 100 %.
-
-    Args:
-        share: The share, 1 at the bound.
-    """
-    percent = round(100.0 * share)
-    if share < 1.0 and percent == 100:
-        return "> 99 %"
-    return f"{percent} %"
 
 
 def _words(kind: str) -> str:

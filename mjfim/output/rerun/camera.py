@@ -31,7 +31,7 @@ EDGE_ON = 0.3
 
 # A free body is followed if it travels farther than this multiple of the size of the robot around
 # it; the followed robot is then seen with free space around it, as a multiple of its size.
-FOLLOW_RATIO, FOLLOW_ROOM = 2.0, 2.0
+FOLLOW_RATIO, FOLLOW_ROOM = 2.0, 1.5
 
 # Vectors from the scene towards the camera: for a motion in the x-z plane, in the y-z plane, and in
 # space.

@@ -31,8 +31,8 @@ from mjfim.output.rerun.layout import (
     separate_and_overlaid,
 )
 from mjfim.output.rerun.limits import limits_of_design, limits_of_model, usage_plots
-from mjfim.output.rerun.outputs import held_out_plots, output_plots
-from mjfim.output.rerun.panels import grid_tabs
+from mjfim.output.rerun.outputs import held_out_plots, output_plots, recording_tabs
+from mjfim.output.rerun.panels import grid_tabs, pages_of
 from mjfim.output.rerun.phase_plots import PhasePlot, parameters_with_phase_plot
 from mjfim.output.rerun.scene import (
     BodyPoses,
@@ -41,6 +41,7 @@ from mjfim.output.rerun.scene import (
     entity_path,
     log_end_path,
     log_robot,
+    pale_shapes,
 )
 from mjfim.output.rerun.series import Curve, SeriesPlot, views_of
 from mjfim.output.rerun.shapes import RobotStyle
@@ -73,6 +74,9 @@ INITIAL_ROOT = ("robots", vocabulary.INITIAL.word)
 DESIGNED_ROOT = ("robots", vocabulary.DESIGNED.word)
 HISTORY_STYLES = (DESIGNED,) * 4
 
+# Colours of the curves over time on the timeline `iteration`.
+LEGEND_OF_ITERATES = {vocabulary.INITIAL.word: INITIAL.accent, "iterate": DESIGNED.accent}
+
 # Title of the view with several robots.
 OVERLAY = "overlay"
 
@@ -100,7 +104,8 @@ def log_design(
         f"{term.word} ({term.colour_name})": ("robots", term.word)
         for term in (vocabulary.INITIAL, vocabulary.DESIGNED)
     }
-    robots = _robots(model, list(content.poses.values()), titles, ASPECT_WITH_TEXT)
+    poses = list(content.poses.values())
+    robots = _robots(model, poses, titles, (INITIAL, DESIGNED), ASPECT_WITH_TEXT)
     layout = arrange(robots, content.tabs(labels))
 
     units = labels.parameter_units or ("",) * len(design.parameters)
@@ -173,7 +178,7 @@ class _DesignContent:
             },
             states=states,
             series={
-                "limits": usage_plots(design.usage, design.history),
+                "limits": usage_plots(design, iterates),
                 "information": [_information_plot(design, evaluations)],
             },
             phase_plots=[
@@ -185,7 +190,7 @@ class _DesignContent:
             history_plots=history_plots(design.history, HISTORY_STYLES, design.found_by),
         )
 
-    def tabs(self, labels: Labels) -> list[rrb.Grid]:
+    def tabs(self, labels: Labels) -> list[rrb.Container]:
         """Return the tabs of all signals.
 
         Args:
@@ -237,8 +242,11 @@ class _DesignContent:
         trajectory = self.evaluations[vocabulary.INITIAL.word].trajectory
         still = IterateCurves.of_one(self.model, trajectory)
         log_poses_of_iterates(rec, INITIAL_ROOT, still, INITIAL, None)
-        for plot in self.iterate_plots:
+        first = {page.start for page in pages_of(len(self.iterate_plots))}
+        for k, plot in enumerate(self.iterate_plots):
             plot.log(rec, self.iterates.iterations, INITIAL, DESIGNED)
+            if k in first:
+                plot.plot.log_legend(rec, LEGEND_OF_ITERATES)
 
 
 def _information_plot(design: Design, evaluations: Mapping[str, Evaluation]) -> SeriesPlot:
@@ -300,16 +308,17 @@ def log_estimate(
         each.name: body_poses(model, each.trajectory.t, each.trajectory.qpos) for each in shown
     }
     camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
-    recordings = [*output_plots(model, estimate), *held_out_plots(model, estimate)]
+    fitted, held_out = output_plots(model, estimate), held_out_plots(model, estimate)
     states = state_plots(model, labels, shown, limits_of_model(model))
-    tabs = [tab for recording in recordings for tab in recording.tabs()]
+    tabs = recording_tabs(fitted, held_out, list(states.groups))
     followed = ("robots", vocabulary.IDENTIFIED.word)
     view = robot_views(model, camera, {title: ("robots",)}, followed=followed)[0]
     layout = arrange(view, [*tabs, *states.tabs()])
 
     with open_recording(path, model, "estimate", layout) as rec:
         _log_text(rec, estimate_text(estimate, addition))
-        for plot in chain(states.plots, *(recording.plots for recording in recordings)):
+        outputs = (recording.plots for recording in (*fitted, *held_out))
+        for plot in chain(states.plots, *outputs):
             plot.log(rec)
         for each in shown:
             log_robot(rec, model, ("robots", each.name), poses[each.name], each.style)
@@ -355,7 +364,8 @@ def log_trajectories(
     ]
     states = state_plots(model, labels, shown, limits_of_model(model))
     titles = {name: ("robots", name) for name in trajectories}
-    robots = _robots(model, list(poses.values()), titles, ASPECT_WITHOUT_TEXT)
+    shown_styles = [styles[name] for name in trajectories]
+    robots = _robots(model, list(poses.values()), titles, shown_styles, ASPECT_WITHOUT_TEXT)
     layout = arrange(robots, states.tabs(), text=False)
 
     with open_recording(path, model, "replay", layout) as rec:
@@ -386,14 +396,18 @@ def _robots(
     model: mujoco.MjModel,
     motions: Sequence[BodyPoses],
     titles: Mapping[str, tuple[str, ...]],
+    styles: Sequence[RobotStyle],
     aspect: float,
 ) -> rrb.Container:
     """Return the views of several robots: separate, and in another tab overlaid.
+
+    Where they are overlaid, all but the last one are translucent, so that it is seen among them.
 
     Args:
         model: The model.
         motions: Poses along each trajectory.
         titles: Entity of each robot, by the title of its view.
+        styles: Style of each robot.
         aspect: Width over height of the region of the robots.
     """
     camera = place_camera(model, motions, views=len(motions), aspect=aspect)
@@ -401,7 +415,10 @@ def _robots(
 
     # The camera of a view that is opened later, while a body flies, would begin in a wrong place.
     still = place_camera(model, motions, views=1, aspect=aspect, follow=False)
-    overlay = robot_views(model, still, {OVERLAY: ("robots",)})[0]
+    pale: dict[str, rrb.Visualizer] = {}
+    for root, style in list(zip(titles.values(), styles, strict=True))[:-1]:
+        pale |= pale_shapes(model, root, style)
+    overlay = robot_views(model, still, {OVERLAY: ("robots",)}, overrides=pale)[0]
     return separate_and_overlaid(views, camera, overlay)
 
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from mjfim.arrays import Array
 from mjfim.output.rerun.panels import dof_positions, plot_size
 from mjfim.output.rerun.scene import (
+    CAPSULES,
     BodyPoses,
     EndPoint,
     EntityParts,
@@ -40,9 +41,6 @@ POSES = 4
 # A plot reaches to the limits if its range is then at most this many times as large: less than in
 # plots that show no change of the curves.
 LARGEST_ZOOM = 3.0
-
-# Entity below a capsule that holds its poses.
-CAPSULES = "poses"
 
 # Thickness of the curve of the initial trajectory relative to that of an iterate.
 INITIAL_WIDTH = 0.6
@@ -100,6 +98,11 @@ class IterateCurves:
         """(m, n, nv) positions by degree of freedom [m or rad]."""
         qpos = np.asarray(self.motions.qpos, dtype=np.float64)
         return np.stack([dof_positions(self.model, each) for each in qpos])
+
+    @property
+    def controls(self) -> Array:
+        """(m, n, nu) controls [unit of the actuator]."""
+        return np.asarray(self.motions.ctrl, dtype=np.float64)
 
     @cached_property
     def velocities(self) -> Array:
@@ -334,17 +337,20 @@ def iterate_plots(
     """
     start = dof_positions(curves.model, initial.qpos)
     times = np.asarray(curves.motions.t, dtype=np.float64)
-    ctrl = np.asarray(curves.motions.ctrl, dtype=np.float64)
+    ctrl = curves.controls
 
     count = len(positions) + len(controls)
     plots = []
     for i, (label, limits) in enumerate(positions):
         known = (initial.t, start[:, i])
         values = curves.positions[:, :, i]
-        plots.append(_iterate_plot(label, limits, known, times, values, count))
+        size = plot_size(count, i)
+        plots.append(_iterate_plot(label, limits, known, times, values, size))
     for i, (label, limits) in enumerate(controls):
         known, values = (initial.t[:-1], initial.ctrl[:, i]), ctrl[:, :, i]
-        plots.append(_iterate_plot(_control_title(label), limits, known, times, values, count))
+        size = plot_size(count, len(positions) + i)
+        title = _control_title(label)
+        plots.append(_iterate_plot(title, limits, known, times, values, size))
     return plots
 
 
@@ -359,9 +365,9 @@ def _iterate_plot(
     initial: tuple[Array, Array],
     times: Array,
     values: Array,
-    count: int,
+    size: tuple[float, float],
 ) -> IteratePlot:
-    """The plot of one quantity out of several, with the same axes for all iterates."""
+    """The plot of one quantity, with the same axes for all iterates."""
     low = min(float(np.min(initial[1])), float(values.min()))
     high = max(float(np.max(initial[1])), float(values.max()))
     plot = StripPlot(
@@ -369,6 +375,6 @@ def _iterate_plot(
         title=f"{label} over time [s]",
         x=(0.0, float(times.max())),
         y=range_with_limits(low, high, limits, LARGEST_ZOOM),
-        size=plot_size(count),
+        size=size,
     )
     return IteratePlot(plot=plot, limits=limits, initial=initial, times=times, values=values)

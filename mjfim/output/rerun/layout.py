@@ -21,10 +21,10 @@ from mjfim.output.rerun.scene import EntityParts, entity_path, first_shape_parts
 BACKGROUND_COLOUR = (214, 219, 226)
 
 # Width over height of the region of the robots, with text below it and without.
-ASPECT_WITH_TEXT, ASPECT_WITHOUT_TEXT = 1.35, 0.75
+ASPECT_WITH_TEXT, ASPECT_WITHOUT_TEXT = 1.5, 0.75
 
 # Heights of robots and text, and widths of the left and the right side, relative to each other.
-ROBOTS_TO_TEXT = [3, 2]
+ROBOTS_TO_TEXT = [5, 4]
 LEFT_TO_RIGHT = [2, 3]
 
 
@@ -90,6 +90,7 @@ def robot_views(
     camera: Camera,
     roots: Mapping[str, EntityParts],
     followed: EntityParts | None = None,
+    overrides: Mapping[str, rrb.Visualizer] | None = None,
 ) -> list[rrb.View]:
     """Return 3D views of robots, all seen from the same camera.
 
@@ -99,6 +100,7 @@ def robot_views(
         roots: Entity of each view, by its title.
         followed: Entity of the robot that the camera follows, where it follows one; by default
             that of the view.
+        overrides: Appearance of entities in these views, by path.
     """
     grid_helps = not has_floor(model) and not camera.edge_on
     ground = rrb.LineGrid3D(visible=grid_helps)
@@ -113,6 +115,7 @@ def robot_views(
             eye_controls=camera.controls(tracked),
             line_grid=ground,
             background=BACKGROUND_COLOUR,
+            overrides=dict((overrides or {}).items()),
         )
         views.append(view)
     return views

@@ -13,10 +13,13 @@ import rerun.blueprint as rrb
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.model.coordinates import output_label
 from mjfim.output import vocabulary
-from mjfim.output.rerun.panels import PLOTS_PER_TAB
+from mjfim.output.rerun.panels import PLOTS_PER_PAGE, fit_in_a_row, row_height
 from mjfim.output.rerun.series import LIMIT_COLOUR, Curve, SeriesPlot
 from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
+
+# Largest number of outputs on one page, each with its residual beside it.
+PAIRS_PER_PAGE = PLOTS_PER_PAGE // 2
 
 # Largest number of samples of a recording in a file.
 MAX_SAMPLES = 20_000
@@ -25,8 +28,10 @@ MAX_SAMPLES = 20_000
 # measured dots.
 IDENTIFIED_WIDTH = 2.0
 
-# Half width of the band around a prediction [standard deviations of the noise].
-BAND = 2.0
+# Half width of the band around a prediction [standard deviations of the noise], and the least share
+# of the values of a plot that the whole band has to fill: the edges of a narrower one cover the
+# curves.
+BAND, LEAST_BAND = 2.0, 0.08
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,18 +52,29 @@ class OutputPlots:
         for pair in self.pairs:
             yield from pair
 
-    def tabs(self) -> list[rrb.Grid]:
-        """Return the tabs with two columns: outputs, and differences."""
-        rows = PLOTS_PER_TAB // 2
-        pages = [self.pairs[k : k + rows] for k in range(0, len(self.pairs), rows)]
-        tabs = []
-        for number, page in enumerate(pages, start=1):
-            views = []
-            for k, (shown, difference) in enumerate(page):
-                views += [shown.view(legend=not k), difference.view()]
-            name = self.name if len(pages) == 1 else f"{self.name} ({number})"
-            tabs.append(rrb.Grid(*views, grid_columns=2, name=name))
-        return tabs
+    def tabs(self) -> list[rrb.Container]:
+        """Return the tab, none without outputs; further pages are tabs in it."""
+        count = len(self.pairs)
+        pages = np.array_split(np.arange(count), max(-(-count // PAIRS_PER_PAGE), 1))
+        if not count:
+            return []
+        if len(pages) == 1:
+            return [self._grid(range(count), self.name, pages=1)]
+
+        grids = []
+        for page in pages:
+            name = f"{page[0] + 1} to {page[-1] + 1} of {count}"
+            grids.append(self._grid(page.tolist(), name, len(pages)))
+        return [rrb.Tabs(*grids, name=self.name, active_tab=0)]
+
+    def _grid(self, page: Sequence[int], name: str, pages: int) -> rrb.Grid:
+        """A page of several with two columns: outputs, and residuals."""
+        height = row_height(len(page), pages)
+        views = []
+        for place, k in enumerate(page):
+            shown, residual = (plot.with_height(height) for plot in self.pairs[k])
+            views += [shown.view(legend=not place), residual.view()]
+        return rrb.Grid(*views, grid_columns=2, name=name)
 
 
 def output_plots(model: mujoco.MjModel, estimate: Estimate) -> list[OutputPlots]:
@@ -100,6 +116,29 @@ def held_out_plots(model: mujoco.MjModel, estimate: Estimate) -> list[OutputPlot
     return found
 
 
+def recording_tabs(
+    fitted: Sequence[OutputPlots], held_out: Sequence[OutputPlots], others: Sequence[str]
+) -> list[rrb.Container]:
+    """Return the tabs of all recordings; those of many recordings are tabs in two common ones.
+
+    Args:
+        fitted: The fitted recordings.
+        held_out: The held-out recordings.
+        others: Names of the tabs beside them.
+    """
+    flat = [tab for recording in (*fitted, *held_out) for tab in recording.tabs()]
+    names = [recording.name for recording in (*fitted, *held_out)]
+    if fit_in_a_row([*names, *others]):
+        return flat
+
+    grouped: list[rrb.Container] = []
+    for name, recordings in (("recordings", fitted), ("held out", held_out)):
+        tabs = [tab for recording in recordings for tab in recording.tabs()]
+        if tabs:
+            grouped.append(rrb.Tabs(*tabs, name=name, active_tab=0))
+    return grouped
+
+
 def _pairs(
     model: mujoco.MjModel,
     name: str,
@@ -127,14 +166,16 @@ def _pairs(
         label = output_label(model, output)
         models = {word: values[rows, column] for word, values in predicted.items()}
         band = BAND * sigma.get(output, np.nan)
+        spread = float(np.nanmax(measured) - np.nanmin(measured))
+        shown_band = band if 2.0 * band >= LEAST_BAND * spread else np.nan
         shown = SeriesPlot(
             parts=("outputs", name, label),
             title=label,
-            curves=[_measured("measured", t, measured), *_predicted(t, models, band)],
+            curves=[_measured("measured", t, measured), *_predicted(t, models, shown_band)],
         )
         difference = SeriesPlot(
             parts=("residuals", name, label),
-            title=f"measured − identified, {label}",
+            title=f"residual of {label}",
             curves=[
                 _measured("difference", t, measured - models["identified"]),
                 _edges(t, np.zeros(len(t)), band, LIMIT_COLOUR),
@@ -161,5 +202,5 @@ def _predicted(t: Array, models: Mapping[str, Array], band: float) -> Iterator[C
 def _edges(t: Array, middle: Array, band: float, colour: tuple[int, int, int]) -> Curve:
     """The edges of a band of a half width around values; nothing where the width is unknown."""
     edges = np.column_stack([middle - band, middle + band])
-    words = (f"−{BAND:.0f} σ of the noise", f"+{BAND:.0f} σ of the noise")
+    words = (f"±{BAND:.0f} σ of the noise",) * 2
     return Curve(name="band", t=t, values=edges, colour=colour, look="edges", legend=words)

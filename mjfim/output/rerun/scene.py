@@ -10,13 +10,17 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.output.rerun.shapes import GeomType, RobotStyle, drawn_shapes
+from mjfim.output.rerun.shapes import GeomType, RobotStyle, drawn_shapes, translucent
 
 # Parts of the path of an entity, not escaped.
 EntityParts = tuple[str, ...]
+
+# Entity below a capsule that holds its poses on the timeline `iteration`.
+CAPSULES = "poses"
 
 # Thickness of the path of a robot's end [points].
 PATH_THICKNESS = 1.0
@@ -183,6 +187,30 @@ def log_robot(
             _log_motion(rec, entity_path(parts), poses, body)
         else:
             _log_fixed_pose(rec, entity_path(parts), poses, body)
+
+
+def pale_shapes(
+    model: mujoco.MjModel, root: EntityParts, style: RobotStyle
+) -> dict[str, rrb.Visualizer]:
+    """Return translucent shapes of the moving bodies of a robot, for a view with several robots.
+
+    Args:
+        model: The model.
+        root: Entity of the robot.
+        style: Style in which it is drawn.
+
+    Returns:
+        The appearance of each shape, by the path of its entity.
+    """
+    pale = {}
+    for body in filter(lambda b: is_moving(model, b), range(1, model.nbody)):
+        parts = body_parts(model, root, body)
+        for shape in drawn_shapes(model, body, style):
+            found = translucent(shape)
+            pale[entity_path((*parts, shape.name))] = found
+            if isinstance(shape.archetype, rr.Capsules3D):
+                pale[entity_path((*parts, shape.name, CAPSULES))] = found
+    return pale
 
 
 def log_end_path(

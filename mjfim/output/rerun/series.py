@@ -7,14 +7,15 @@ draws those of the timeline that is shown. Limits are drawn on both.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.output.rerun.panels import pages_of, plot_size
 from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
 
 # Width of curves, and size of dots [points].
@@ -26,15 +27,50 @@ MARGIN = 0.08
 # The range of a plot reaches to the limits if it is then at most this many times as large.
 LARGEST_ZOOM = 6.0
 
-# Width and colour (0..255) of lines of limits.
-LIMIT_WIDTH, LIMIT_COLOUR = 1.2, (150, 150, 150)
+# Width and colour (0..255) of lines of limits, and their name in the legend.
+LIMIT_WIDTH, LIMIT_COLOUR, LIMIT_NAME = 1.2, (150, 150, 150), "limit"
 
 # Width of the edges of a band, as a share of the width of a curve.
 EDGE_WIDTH = 0.5
 
+# Width and height of the smallest plot in a window of 1280 x 800 pixels, without its title and the
+# numbers beside its axes [points].
+LEAST_WIDTH, LEAST_HEIGHT = 345.0, 176.0
+
+# The viewer writes multiples of a power of ten that are at least this far from each other [points].
+NUMBER_SPACING = 20.0
+
+# A range is widened for a second number beside its axis at most by this factor.
+LARGEST_WIDENING = 1.4
+
+# Height of the numbers below a plot [points].
+NUMBERS_BELOW = 20.0
+
+# Free space behind the last sample, as a share of the time, in which the last number of the axis
+# has room.
+TIME_ROOM = 0.05
+
+# Width of a legend beside its names, of a character, and of its height per name and beside them
+# [points].
+LEGEND_ROOM, CHARACTER_WIDTH, LEGEND_ROW, LEGEND_EDGE = 36.0, 7.0, 23.0, 14.0
+
+# Largest number of samples of a curve that decide where the legend stands.
+LEGEND_SAMPLES = 400
+
+# Corners in which a legend may stand, the usual one first, with the place of each: right and top.
+CORNERS = {
+    rrb.Corner2D.LeftTop: (False, True),
+    rrb.Corner2D.RightTop: (True, True),
+    rrb.Corner2D.LeftBottom: (False, False),
+    rrb.Corner2D.RightBottom: (True, False),
+}
+
 # Range of values of a plot, or of a limited quantity; infinite without a bound.
 Range = tuple[float, float]
 NO_LIMITS: Range = (-np.inf, np.inf)
+
+# Entity of the samples without a value behind the last one.
+ROOM = "room"
 
 Timeline = Literal["sim_time", "iteration"]
 
@@ -53,6 +89,7 @@ class Curve:
         timeline: The timeline of `t`.
         legend: Names of the m series in the legend; by default `name`.
         width: Width of its lines relative to that of others.
+        sets_range: False where the range of the plot is chosen without it.
     """
 
     name: str
@@ -63,11 +100,17 @@ class Curve:
     timeline: Timeline = "sim_time"
     legend: tuple[str, ...] = ()
     width: float = 1.0
+    sets_range: bool = True
 
     @property
     def rows(self) -> Array:
         """(n, m) values, also of a single series."""
         return self.values[:, None] if self.values.ndim == 1 else self.values
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the m series in the legend."""
+        return self.legend or (self.name,) * self.rows.shape[1]
 
     @property
     def finite(self) -> Array:
@@ -95,7 +138,7 @@ class Curve:
     def _appearance(self) -> rr.SeriesLines | rr.SeriesPoints:
         """Colours, names and widths."""
         count = self.rows.shape[1]
-        names = list(self.legend or (self.name,) * count)
+        names = list(self.names)
         colours = [self.colour] * count
         if self.look == "dots":
             return rr.SeriesPoints(colors=colours, names=names, marker_sizes=[DOT_SIZE] * count)
@@ -118,6 +161,8 @@ class SeriesPlot:
         limits: Lower and upper limit of the plotted quantity, infinite without one.
         largest_zoom: The plot reaches to the limits if its range is then at most this many times as
             large.
+        own_legend: True for a plot whose names are not those of the plots beside it.
+        height: Height of the plot without its title in a window of 1280 x 800 pixels [points].
     """
 
     parts: EntityParts
@@ -125,6 +170,8 @@ class SeriesPlot:
     curves: Sequence[Curve]
     limits: Range = NO_LIMITS
     largest_zoom: float = LARGEST_ZOOM
+    own_legend: bool = False
+    height: float = LEAST_HEIGHT
 
     @property
     def is_empty(self) -> bool:
@@ -134,11 +181,12 @@ class SeriesPlot:
     @property
     def range(self) -> Range:
         """The range of values that is shown; it includes a limit that is near enough."""
-        values = [curve.rows[curve.finite].ravel() for curve in self.curves]
+        values = [curve.rows[curve.finite].ravel() for curve in self.curves if curve.sets_range]
         data = np.concatenate(values) if values else np.zeros(0)
         low, high = (float(data.min()), float(data.max())) if len(data) else (np.inf, -np.inf)
 
-        return range_with_limits(low, high, self.limits, self.largest_zoom)
+        shown = range_with_limits(low, high, self.limits, self.largest_zoom)
+        return with_two_numbers(*shown, self.height)
 
     @property
     def full_title(self) -> str:
@@ -151,6 +199,14 @@ class SeriesPlot:
         ]
         return f"{self.title}, limits {', '.join(outside)}" if outside else self.title
 
+    def with_height(self, height: float) -> SeriesPlot:
+        """Return the plot with a height below its title, numbers included [points].
+
+        Args:
+            height: The height.
+        """
+        return replace(self, height=height - NUMBERS_BELOW)
+
     def log(self, rec: rr.RecordingStream) -> None:
         """Log all curves, and the limits from the first to the last time of each timeline.
 
@@ -162,6 +218,7 @@ class SeriesPlot:
         for word, limit in zip(("lower limit", "upper limit"), self.limits, strict=True):
             if np.isfinite(limit):
                 self._log_limit(rec, word, limit)
+        self._log_room(rec)
 
     def view(self, *, legend: bool = False) -> rrb.TimeSeriesView:
         """Return the view of the plot.
@@ -169,7 +226,7 @@ class SeriesPlot:
         Args:
             legend: True to show the legend.
         """
-        corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
+        corner = rrb.PlotLegend(self.emptiest_corner, visible=legend)
         return rrb.TimeSeriesView(
             origin=entity_path(self.parts),
             name=self.full_title,
@@ -177,9 +234,74 @@ class SeriesPlot:
             axis_y=rrb.ScalarAxis(range=self.range, zoom_lock=False),
         )
 
+    @property
+    def emptiest_corner(self) -> rrb.Corner2D:
+        """The corner in which a legend covers the fewest samples of the curves over time."""
+        curves = [curve for curve in self.curves if curve.timeline == "sim_time"]
+        names = {name for curve in curves if curve.finite.any() for name in curve.names}
+        names |= {LIMIT_NAME for limit in self.limits if np.isfinite(limit)}
+        longest = max(map(len, names), default=0)
+        width = (LEGEND_ROOM + CHARACTER_WIDTH * longest) / LEAST_WIDTH
+        height = (LEGEND_EDGE + LEGEND_ROW * len(names)) / self.height
+
+        # (n, 2) samples as shares of the width and the height of the plot.
+        samples = np.concatenate([np.zeros((0, 2)), *map(self._as_shares, curves)])
+        covered = {}
+        for corner, (is_right, is_top) in CORNERS.items():
+            across = 1.0 - samples[:, 0] if is_right else samples[:, 0]
+            up = 1.0 - samples[:, 1] if is_top else samples[:, 1]
+            covered[corner] = int(np.count_nonzero((across < width) & (up < height)))
+        return min(covered, key=lambda corner: covered[corner])
+
+    @property
+    def _times(self) -> tuple[float, float]:
+        """First and last time of the curves over time [s]."""
+        times = [
+            np.asarray(curve.t)[curve.finite]
+            for curve in self.curves
+            if curve.timeline == "sim_time" and curve.finite.any()
+        ]
+        every = np.concatenate(times) if times else np.zeros(1)
+        return float(every.min()), float(every.max())
+
+    def _as_shares(self, curve: Curve) -> Array:
+        """Samples of a curve as shares of the width and the height of the plot, (n, 2)."""
+        rows = np.flatnonzero(curve.finite)
+        rows = rows[evenly_spread_indices(len(rows), LEGEND_SAMPLES)] if len(rows) else rows
+        t, values = np.asarray(curve.t, dtype=np.float64)[rows], curve.rows[rows]
+        if not len(t):
+            return np.zeros((0, 2))
+
+        low, high = self.range
+        first, last = self._times
+        across = (t - first) / ((1.0 + TIME_ROOM) * (last - first) or 1.0)
+        up = (values - low) / (high - low)
+        return np.column_stack([np.repeat(across, up.shape[1]), up.ravel()])
+
+    def _log_room(self, rec: rr.RecordingStream) -> None:
+        """Log two samples without a value, which make room behind the last one.
+
+        They have the name and the colour of a curve, so that the legend does not show them.
+        """
+        curves = [
+            curve
+            for curve in self.curves
+            if curve.timeline == "sim_time" and curve.look != "dots" and curve.finite.any()
+        ]
+        if not curves:
+            return
+
+        first, last = self._times
+        path = entity_path((*self.parts, ROOM))
+        line = rr.SeriesLines(colors=[curves[0].colour], names=[curves[0].names[0]])
+        rec.log(path, line, static=True, strict=True)
+        times = times_on("sim_time", np.array([last, last + TIME_ROOM * (last - first)]))
+        nothing = rr.Scalars.columns(scalars=[np.nan, np.nan])
+        rec.send_columns(path, [times], nothing, strict=True)
+
     def _log_limit(self, rec: rr.RecordingStream, word: str, limit: float) -> None:
         """Log a limit as a horizontal line, which the viewer does not draw for static data."""
-        line = rr.SeriesLines(colors=[LIMIT_COLOUR], names=[word], widths=[LIMIT_WIDTH])
+        line = rr.SeriesLines(colors=[LIMIT_COLOUR], names=[LIMIT_NAME], widths=[LIMIT_WIDTH])
         path = entity_path((*self.parts, word))
         rec.log(path, line, static=True, strict=True)
 
@@ -243,11 +365,44 @@ def padded(low: float, high: float) -> Range:
     return low - MARGIN * span, high + MARGIN * span
 
 
+def with_two_numbers(low: float, high: float, height: float) -> Range:
+    """Widen a range a little if the viewer then writes at least two numbers beside the axis.
+
+    The viewer writes multiples of a power of ten, as many as have room in a plot.
+
+    Args:
+        low: Lower end of the range.
+        high: Upper end of the range.
+        height: Height of the plot [points].
+    """
+    smallest = (high - low) * NUMBER_SPACING / height
+    step = 10.0 ** np.ceil(np.log10(smallest))
+    first, last = np.ceil(low / step), np.floor(high / step)
+    if last - first >= 1.0:
+        return low, high
+
+    # Without any number there is one below and one above; beside a single one, the nearer end of
+    # the range moves on to the next.
+    edge = 0.5 * MARGIN * (high - low)
+    if last < first:
+        wide = (float(last * step - edge), float(first * step + edge))
+    elif high - last * step >= first * step - low:
+        wide = (low, float((last + 1.0) * step + edge))
+    else:
+        wide = (float((first - 1.0) * step - edge), high)
+    return wide if wide[1] - wide[0] <= LARGEST_WIDENING * (high - low) else (low, high)
+
+
 def views_of(plots: Sequence[SeriesPlot]) -> list[rrb.View]:
-    """Return the views of plots that are not empty; the first one has a legend.
+    """Return the views of plots that are not empty; the first one of each page has a legend.
 
     Args:
         plots: The plots.
     """
     filled = [plot for plot in plots if not plot.is_empty]
-    return [plot.view(legend=k == 0) for k, plot in enumerate(filled)]
+    first = {page.start for page in pages_of(len(filled))}
+    views: list[rrb.View] = []
+    for k, plot in enumerate(filled):
+        sized = plot.with_height(plot_size(len(filled), k)[1])
+        views.append(sized.view(legend=plot.own_legend or k in first))
+    return views

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
@@ -19,6 +20,9 @@ SOLID, OUTLINE = rr.components.FillMode.Solid, rr.components.FillMode.MajorWiref
 
 # Opacity of the meshes of an outlined robot, which have no wire frame.
 OUTLINE_OPACITY = 0.3
+
+# Opacity of a robot beside which another one is drawn in the same view.
+PALE_OPACITY = 0.4
 
 # Share of white in the colour of an outlined robot.
 OUTLINE_WHITE = 0.4
@@ -102,6 +106,20 @@ class DrawnShape:
     rgba: list[int]
     length: float = 0.0
     radius: float = 0.0
+
+
+def translucent(shape: DrawnShape) -> rrb.Visualizer:
+    """Return the translucent look of a shape, which replaces its own one in some views.
+
+    Args:
+        shape: The shape.
+    """
+    rgba = [*shape.rgba[:3], round(PALE_OPACITY * shape.rgba[3])]
+    if isinstance(shape.archetype, rr.Mesh3D):
+        return rr.Mesh3D.from_fields(albedo_factor=rgba).visualizer()
+    kinds = (rr.Boxes3D, rr.Capsules3D, rr.Cylinders3D, rr.Ellipsoids3D)
+    kind = next(kind for kind in kinds if isinstance(shape.archetype, kind))
+    return kind.from_fields(colors=[rgba]).visualizer()
 
 
 # ---- geoms of a body

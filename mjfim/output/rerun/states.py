@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
-import numpy as np
 import rerun.blueprint as rrb
 
 from mjfim.arrays import Array
@@ -63,9 +62,9 @@ class StatePlots:
         """
         return [(plot.title, plot.limits) for plot in self.groups[group]]
 
-    def tabs(self) -> list[rrb.Grid]:
+    def tabs(self) -> list[rrb.Container]:
         """Return the tabs of all groups."""
-        tabs = []
+        tabs: list[rrb.Container] = []
         for name, plots in self.groups.items():
             tabs += grid_tabs(name, views_of(plots))
         return tabs
@@ -125,7 +124,7 @@ def _curve(shown: ShownTrajectory, group: str, positions: Array, column: int) ->
 def _extremes(iterates: IterateCurves, group: str, column: int) -> Curve:
     """Lowest and highest value of one column of each iterate."""
     if group == "controls":
-        values = np.asarray(iterates.motions.ctrl, dtype=np.float64)
+        values = iterates.controls
     else:
         values = iterates.positions if group == "positions" else iterates.velocities
     return iterates.extremes(values[:, :, column], vocabulary.DESIGNED.rgb)

@@ -5,7 +5,7 @@ The axes are drawn as well, because a 2D view of Rerun has none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from mjfim.output.rerun.series import LIMIT_COLOUR, NO_LIMITS, Range
 
 # Space for the numbers on the left, free space on the right and at the top, and space for the
 # numbers at the bottom [points].
-LEFT, RIGHT, TOP, BOTTOM = 58.0, 20.0, 14.0, 34.0
+LEFT, RIGHT, TOP, BOTTOM = 58.0, 20.0, 26.0, 34.0
 
 # Colours (0..255) of axes and of the numbers beside them.
 AXIS_COLOUR, NUMBER_COLOUR = (110, 110, 110), (205, 205, 205)
@@ -26,11 +26,18 @@ AXIS_COLOUR, NUMBER_COLOUR = (110, 110, 110), (205, 205, 205)
 # Thickness of axes, limits and curves [points].
 AXIS_THICKNESS, LIMIT_THICKNESS, CURVE_THICKNESS = 0.5, 0.6, 1.0
 
-# Largest numbers of intervals between the numbers beside the axes.
-INTERVALS_X, INTERVALS_Y = 4, 3
+# Width and height of a number beside an axis, with free space around it [points].
+NUMBER_WIDTH, NUMBER_HEIGHT = 70.0, 30.0
+
+# Smallest and largest of the largest numbers of numbers beside an axis. With four of them, every
+# range has at least two.
+LEAST_NUMBERS, MOST_NUMBERS = 4, 8
 
 # Sizes of the steps between the numbers, times a power of ten.
-STEPS = (1.0, 2.0, 5.0, 10.0)
+STEPS = (1.0, 2.0, 2.5, 5.0, 10.0, 20.0, 25.0, 50.0)
+
+# Width of the name of a curve in the legend [points].
+NAME_WIDTH = 64.0
 
 # Shift of the numbers away from the axes [points].
 SHIFT_LEFT, SHIFT_DOWN = 28.0, 8.0
@@ -136,6 +143,24 @@ class StripPlot:
             )
             rec.log(entity_path((*self.parts, "limits")), strips, static=True, strict=True)
 
+    def log_legend(self, rec: rr.RecordingStream, colours: Mapping[str, Sequence[int]]) -> None:
+        """Log the names of curves at the top right, each in its colour.
+
+        Args:
+            rec: The recording.
+            colours: Colour (0..255) of each curve by name.
+        """
+        count = len(colours)
+        across = self.width - NAME_WIDTH * (np.arange(count)[::-1] + 0.5)
+        names = rr.Points2D(
+            np.column_stack([across, np.full(count, -TOP)]),
+            labels=list(colours),
+            colors=list(colours.values()),
+            radii=rr.Radius.ui_points(0.0),
+            show_labels=True,
+        )
+        rec.log(entity_path((*self.parts, "legend")), names, static=True, strict=True)
+
     def view(self) -> rrb.Spatial2DView:
         """Return the view of the plot."""
         return rrb.Spatial2DView(
@@ -148,8 +173,9 @@ class StripPlot:
 
     def _log_numbers(self, rec: rr.RecordingStream) -> None:
         """Log the numbers beside the axes."""
-        across = round_numbers(*self.x, INTERVALS_X)
-        up = (round_logarithms if self.logarithmic else round_numbers)(*self.y, INTERVALS_Y)
+        across = round_numbers(*self.x, _count(self.width, NUMBER_WIDTH))
+        rounded = round_logarithms if self.logarithmic else round_numbers
+        up = rounded(*self.y, _count(self.height, NUMBER_HEIGHT))
         below = self.points(across, np.full(len(across), self.y[0]))
         beside = self.points(np.full(len(up), self.x[0]), up)
 
@@ -157,8 +183,8 @@ class StripPlot:
         below[:, 1] += SHIFT_DOWN
         beside -= (SHIFT_LEFT, 2.0 * SHIFT_DOWN)
 
-        texts = [f"{value:.4g}" for value in across]
-        texts += [f"{10.0**value if self.logarithmic else value:.3g}" for value in up]
+        texts = [f"{value:.6g}" for value in across]
+        texts += [f"{10.0**value if self.logarithmic else value:.6g}" for value in up]
         places = np.concatenate([below, beside])
         numbers = rr.Points2D(
             places,
@@ -170,45 +196,47 @@ class StripPlot:
         rec.log(entity_path((*self.parts, "numbers")), numbers, static=True, strict=True)
 
 
-def round_numbers(low: float, high: float, intervals: int) -> Array:
-    """Return round numbers in a range.
+def _count(length: float, room: float) -> int:
+    """Largest number of numbers beside an axis of a length, each of which needs room [points]."""
+    return int(np.clip(length // room, LEAST_NUMBERS, MOST_NUMBERS))
+
+
+def round_numbers(low: float, high: float, most: int) -> Array:
+    """Return round numbers in a range, as many as are permitted.
 
     Args:
         low: Lower end of the range.
         high: Upper end of the range.
-        intervals: Largest number of intervals between them.
+        most: Largest number of them.
     """
-    step = smallest = (high - low) / intervals
-    power = 10.0 ** np.floor(np.log10(smallest))
+    power = 10.0 ** np.floor(np.log10((high - low) / most))
     for size in STEPS:
         step = size * power
-        if step >= smallest * (1.0 - 1e-9):
+        first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
+        if last - first < most:
             break
-
-    first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
     numbers = step * np.arange(first, last + 1.0)
 
     # Round-off at zero is not shown.
     return np.where(np.abs(numbers) < 1e-9 * step, 0.0, numbers)
 
 
-def round_logarithms(low: float, high: float, intervals: int) -> Array:
+def round_logarithms(low: float, high: float, most: int) -> Array:
     """Return logarithms to base 10 of round numbers in a range of logarithms.
 
     Args:
         low: Lower end of the range.
         high: Upper end of the range.
-        intervals: Largest number of intervals between them.
+        most: Largest number of them.
     """
     decades = np.arange(np.floor(low), np.ceil(high) + 1.0)
     for sizes in ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,)):
         numbers = np.add.outer(decades, np.log10(sizes)).ravel()
         numbers = numbers[(numbers >= low) & (numbers <= high)]
-        if 2 <= len(numbers) <= intervals + 1:
+        if 2 <= len(numbers) <= most:
             return np.asarray(numbers)
 
     # Over many decades only some have a number; within a small part of one, any number has.
-    steps = np.unique(np.rint(round_numbers(low, high, intervals)))
-    if len(steps) >= 2:
-        return np.asarray(steps[(steps >= low) & (steps <= high)])
-    return round_numbers(low, high, intervals)
+    steps = np.unique(np.rint(round_numbers(low, high, most)))
+    steps = steps[(steps >= low) & (steps <= high)]
+    return np.asarray(steps) if len(steps) >= 2 else round_numbers(low, high, most)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from mjfim.output import vocabulary
+from mjfim.output.markdown import escape, render_list, render_table
 from mjfim.output.summaries.design import describe_design
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summary_parts import Emphasis, Listing, Part, Summary, SummaryTable, capitalised
@@ -60,45 +61,34 @@ def estimate_text(estimate: Estimate, addition: str = "") -> str:
 
 
 def render(summary: Summary, legend: str = "", addition: str = "") -> str:
-    """Render a summary as Markdown: outcome and warnings first, then tables and sentences.
+    """Render a summary as Markdown: outcome, first table, warnings, then all other parts.
+
+    The panel of the viewer is narrow, so that tables are short, and the colours come last.
 
     Args:
         summary: The summary.
-        legend: Sentences that explain the colours of the recording.
+        legend: Sentences that explain the colours of the recording, in Markdown.
         addition: Markdown to append.
     """
-    paragraphs = [f"## {summary.title}", f"**{capitalised(summary.outcome)}**", legend]
+    paragraphs = [
+        f"### {escape(summary.title)}",
+        f"**{escape(capitalised(summary.outcome))}**",
+    ]
+    parts = [_rendered(part) for part in summary.parts]
     if summary.warnings:
-        paragraphs += ["#### Warnings", _bullets(summary.warnings)]
-    paragraphs += [_rendered(part) for part in summary.parts]
-    return "\n\n".join(paragraph for paragraph in (*paragraphs, addition) if paragraph)
+        parts[1:1] = ["**Warnings**", render_list(summary.warnings)]
+    paragraphs += parts
+    return "\n\n".join(text for text in (*paragraphs, legend, addition) if text)
 
 
 def _rendered(part: Part) -> str:
     """Render one part of a summary."""
     if isinstance(part, SummaryTable):
-        title = f"#### {part.title}\n\n" if part.title else ""
-        note = f"\n\n{part.note}" if part.note else ""
-        header = [str(column.heading) for column in part.columns]
-        rows = [[str(cell) for cell in row.cells] for row in part.rows]
-        return f"{title}{_table(header, rows)}{note}"
+        title = f"**{escape(part.title)}**\n\n" if part.title else ""
+        note = f"\n\n{escape(part.note)}" if part.note else ""
+        return f"{title}{render_table(part, details=False)}{note}"
     if isinstance(part, Listing):
-        return f"**{part.title}**\n\n{_bullets(part.items)}"
+        return f"**{escape(part.title)}**\n\n{render_list(part.items)}"
     if part.emphasis in (Emphasis.STRONG, Emphasis.STRONG_WARNING):
-        return f"**{part.text}**"
-    return part.text
-
-
-def _bullets(sentences: Iterable[str]) -> str:
-    """Return sentences as a Markdown list."""
-    return "\n".join(f"- {sentence}" for sentence in sentences)
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    rendered = []
-    for cells in lines:
-        escaped = " | ".join(cell.replace("|", "\\|") for cell in cells)
-        rendered.append(f"| {escaped} |")
-    return "\n".join(rendered)
+        return f"**{escape(part.text)}**"
+    return escape(part.text)
