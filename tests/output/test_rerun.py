@@ -559,7 +559,7 @@ class TestDesign:
         )
         (plot,) = usage_plots(replace(design, usage=uses), None)
         named = {name for curve in plot.curves[:-1] for name in curve.names}
-        assert named == {"others", "joint5, 50 %", "joint6, 60 %", "joint7, 70 %", "joint8, 80 %"}
+        assert named == {"others", "joint6, 60 %", "joint7, 70 %", "joint8, 80 %"}
 
     def test_in_the_view_of_both_robots_the_initial_one_is_translucent(self, file: Path) -> None:
         looks = blueprint_column(file, "Ellipsoids3D:colors")

@@ -46,7 +46,7 @@ USE_COLOURS = (
 
 # Number of curves of a plot that are named, those closest to a bound; the others are thin and share
 # a name and a colour (0..255).
-NAMED_CURVES, OTHERS, THIN, OTHERS_COLOUR = 4, "others", 0.5, (120, 120, 120)
+NAMED_CURVES, OTHERS, THIN, OTHERS_COLOUR = 3, "others", 0.5, (120, 120, 120)
 
 # Kinds of limits whose use by an iterate can be read from its thinned motion.
 KINDS_OF_MOTIONS = ("position", "control")
