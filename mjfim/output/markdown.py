@@ -27,14 +27,16 @@ def render_tables(summary: Summary) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def render_table(table: SummaryTable, *, details: bool = True) -> str:
+def render_table(table: SummaryTable, *, details_last: bool = False) -> str:
     """Render a table; Markdown has no headings above several columns, so each column names them.
 
     Args:
         table: The table.
-        details: False to leave out the columns that a short form has no room for.
+        details_last: True to move the columns that a short form leaves out to the right.
     """
-    shown = [i for i, column in enumerate(table.columns) if details or not column.detail]
+    shown = list(range(len(table.columns)))
+    if details_last:
+        shown.sort(key=lambda i: table.columns[i].detail)
     headings = [_heading(table, i, table.columns[i]) for i in shown]
     rules = [":--" if table.columns[i].left else "--:" for i in shown]
     rows = [[_text(row.cells[i]) for i in shown] for row in table.rows]

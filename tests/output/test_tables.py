@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,6 +55,15 @@ def test_markdown_has_a_cell_for_every_column_and_escapes_marks() -> None:
     assert "initial: λ₁" in lines[0] and "designed: ×" in lines[0]
     assert r"a\|b\*c\`d\<e\>f_g\\h{i}" in lines[2]
     assert "| 1.65e-05 % | 0.25 % | ∞ | - |" in lines[2]
+
+
+def test_markdown_may_move_details_to_the_right() -> None:
+    table = made_table()
+    columns = tuple(replace(column, detail=i == 1) for i, column in enumerate(table.columns))
+    moved = markdown.render_table(replace(table, columns=columns), details_last=True)
+    first, _, _, last = moved.splitlines()
+    assert first.endswith("| initial: λ₁ |")
+    assert last == "| x_1 | · | 0.8 … 1.2 | −1 | – |"
 
 
 def test_latex_has_a_cell_for_every_column_and_escapes_marks() -> None:

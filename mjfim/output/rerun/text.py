@@ -63,7 +63,8 @@ def estimate_text(estimate: Estimate, addition: str = "") -> str:
 def render(summary: Summary, legend: str = "", addition: str = "") -> str:
     """Render a summary as Markdown: outcome, first table, warnings, then all other parts.
 
-    The panel of the viewer is narrow, so that tables are short, and the colours come last.
+    The panel of the viewer is narrow: columns with details are on the right of a table, which can
+    be scrolled, and the colours come last.
 
     Args:
         summary: The summary.
@@ -86,7 +87,7 @@ def _rendered(part: Part) -> str:
     if isinstance(part, SummaryTable):
         title = f"**{escape(part.title)}**\n\n" if part.title else ""
         note = f"\n\n{escape(part.note)}" if part.note else ""
-        return f"{title}{render_table(part, details=False)}{note}"
+        return f"{title}{render_table(part, details_last=True)}{note}"
     if isinstance(part, Listing):
         return f"**{escape(part.title)}**\n\n{render_list(part.items)}"
     if part.emphasis in (Emphasis.STRONG, Emphasis.STRONG_WARNING):
