@@ -47,6 +47,10 @@ class ModelWarning(UserWarning):
     """MuJoCo loads the model, but leaves out or changes something that the file states."""
 
 
+class UndrawnWarning(UserWarning):
+    """A fault of the program kept a picture or a page from being drawn; the result stands."""
+
+
 class RecordingError(MjfimError):
     """A recording, a control table or a design archive cannot be used."""
 

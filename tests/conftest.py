@@ -18,6 +18,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # the fixture `drawing`.
 os.environ["MUJOCO_GL"] = "disable"
 
+# A picture or a page that cannot be drawn is an error of the tests, also in processes they start.
+os.environ["PYTHONWARNINGS"] = "error:could not draw"
+
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Restore Python's handler of SIGINT.

@@ -89,10 +89,11 @@ def check(
     with progress("checking", expected=expected):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
 
-    print_result(as_json, result.summary(), describe(result), verbose=verbose)
+    values = archive.summary_with_origin(result, system, output)
+    print_result(as_json, values, describe(result), verbose=verbose)
     if output is not None:
         with writing(output) as results:
-            results.write_check_folder(output, result, pictures)
+            results.write_check_folder(output, result, system, pictures)
         say_written(output)
     if refused is not None:
         errors.print(f"mjfim: `mjfim design` refuses this experiment: {refused}", markup=False)

@@ -32,6 +32,7 @@ from mjfim.errors import (
     ModelWarning,
     NoResultError,
     RecordingError,
+    UndrawnWarning,
     UnfinishedError,
 )
 from mjfim.interruption import (
@@ -39,11 +40,11 @@ from mjfim.interruption import (
     NOTHING_SENTENCE,
     Interruption,
     current_interruption,
-    run_optional,
 )
+from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.progress_text import design_stage, design_text, fit_text, part_text
-from mjfim.output.report import REPORT
+from mjfim.output.report import OWN_REPORTS, REPORT, is_report
 from mjfim.output.summary_parts import Summary
 from mjfim.output.text import render
 from mjfim.output.video.record import NoVideoError, format_of, require_encoder
@@ -244,6 +245,9 @@ def claim_folder(
     check_folder(folder)
     guard = OutputGuard(inputs, force=force)
     guard.check(folder / name for name in _names)
+    if REPORT in _names:
+        # The pages of other results in the folder name this result, or give it their place.
+        guard.check(folder / name for name in OWN_REPORTS)
     _claims.enter_context(claimed(folder, guard, exclusive=True))
 
 
@@ -311,7 +315,7 @@ def write_wanted_video(video: Path | None, system: System, result: Filmed) -> No
             return
         errors.print(f"wrote {video}: {written.caption}", markup=False)
 
-    run_optional(write)
+    write_optional(str(video), write)
 
 
 def keep_result(folder: Path | None = None) -> None:
@@ -378,7 +382,8 @@ def say_written(folder: Path, remark: str = "") -> None:
         folder: Folder with the results.
         remark: What can be done with them; may be empty.
     """
-    report = f"; see {folder / REPORT}" if folder / REPORT in _written else ""
+    pages = [path for path in _written if path.parent == folder and is_report(path)]
+    report = f"; see {pages[-1]}" if pages else ""
     errors.print(f"wrote {folder}/{report}{remark}", markup=False)
 
 
@@ -470,13 +475,13 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
 
 @contextmanager
 def _worded_warnings() -> Iterator[None]:
-    """Print warnings about models as sentences, without the place in the code that warns."""
+    """Print warnings about models and drawings as sentences, without the place in the code."""
     with warnings.catch_warnings():
         usual = warnings.showwarning
 
         def show(message: Warning | str, category: type[Warning], *place: Any, **to: Any) -> None:
             """Print a warning."""
-            if issubclass(category, ModelWarning):
+            if issubclass(category, (ModelWarning, UndrawnWarning)):
                 errors.print(f"warning: {message}", markup=False)
             else:
                 usual(message, category, *place, **to)

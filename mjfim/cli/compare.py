@@ -28,6 +28,7 @@ from mjfim.cli.common import (
 from mjfim.errors import NoResultError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.input_files import input_files
+from mjfim.output import archive
 from mjfim.output.folders import comparison_files
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.presentation import describe
@@ -76,7 +77,8 @@ def compare(
 
     if not result.rows:
         raise NoResultError
-    print_result(as_json, result.summary(), describe(result), verbose=verbose)
+    values = archive.summary_with_origin(result, task.system, output)
+    print_result(as_json, values, describe(result), verbose=verbose)
     with writing(output) as results:
         results.write_comparison_folder(output, result, task.system, pictures)
     say_written(output)

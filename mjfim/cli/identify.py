@@ -35,6 +35,7 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
+from mjfim.output import archive
 from mjfim.output.folders import estimate_files, parts_of_identified
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.presentation import describe
@@ -107,7 +108,8 @@ def identify(
     if verbose:
         logs_read = describe_logs([log.summary for log in (*fitted, *predicted)])
         summary = replace(summary, parts=(*summary.parts, *logs_read.parts))
-    print_result(as_json, result.summary(), summary, verbose=verbose)
+    values = archive.summary_with_origin(result, system, output)
+    print_result(as_json, values, summary, verbose=verbose)
     with writing(output) as results:
         remarks = results.write_estimate_folder(output, result, system, pictures)
     for sentence in remarks:

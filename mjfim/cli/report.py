@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mjfim.cli.common import Force, claim_file, errors, verb
-from mjfim.output.report import REPORT
+from mjfim.output.report import is_report
 
 
 @verb
@@ -16,12 +16,14 @@ def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of results of any verb.")],
     force: Force = False,
 ) -> None:
-    """Write report.html of a folder of results again, without computing anything anew."""
+    """Write the reports of a folder of results again, without computing anything anew."""
     # The parts of a report take a while to import; other verbs need them only when they write.
-    from mjfim.output.report.build import newest_kind, rewrite_report
+    from mjfim.output.report.build import report_files, rewrite_reports
 
-    newest_kind(folder)
-    inputs = [path for path in sorted(folder.iterdir()) if path.name != REPORT]
-    claim_file(folder / REPORT, inputs, force=force)
+    files = report_files(folder)
+    inputs = [path for path in sorted(folder.iterdir()) if not is_report(path)]
+    for file in files.values():
+        claim_file(file, inputs, force=force)
 
-    errors.print(f"wrote {rewrite_report(folder)}", markup=False)
+    for file in rewrite_reports(folder):
+        errors.print(f"wrote {file}", markup=False)

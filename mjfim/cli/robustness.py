@@ -30,6 +30,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.input_files import input_files
+from mjfim.experiment.system import System
 from mjfim.model.limited_elements import KINDS as LIMIT_KINDS
 from mjfim.output.archive import write_design
 from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
@@ -148,7 +149,7 @@ def robustness(
 
     out.print(render(describe(result), verbose=verbose))
     with writing(output) as results:
-        results.write_robustness_folder(output, result, seconds, pictures)
+        results.write_robustness_folder(output, result, System.resolve(stated), seconds, pictures)
     say_written(output, f" ({result.runs} runs in {seconds:.0f} s)")
     if result.runs < runs:
         errors.print(f"mjfim: interrupted; only {result.runs} of {runs} robots are done")

@@ -21,6 +21,7 @@ from mjfim.output.playback import design_columns, reference_columns, simulate_pl
 from mjfim.records.design import TRAJECTORY_ARRAYS, Design
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import read_arrays, write_json
+from mjfim.records.shown import ShownRecord
 from mjfim.records.trajectory import Trajectory
 
 # Fewest rows of a trajectory that a design can have.
@@ -37,8 +38,8 @@ PERIOD_TOLERANCE = 1e-6
 def write_design(folder: Path, design: Design, system: System) -> None:
     """Write design.npz, design.csv, reference.csv and design.json, each complete or not at all.
 
-    `Design.load` reads the design back. design.json names the experiment file, relative to the
-    folder.
+    `Design.load` reads the design back. design.json names the experiment file and
+    its model, relative to the folder.
 
     Args:
         folder: Folder for the files; made if it does not exist.
@@ -51,9 +52,57 @@ def write_design(folder: Path, design: Design, system: System) -> None:
     write_table(folder / "design.csv", design_columns(playback, system))
     write_table(folder / "reference.csv", reference_columns(playback, system))
 
-    source = Path(system.experiment.source)
-    experiment = os.path.relpath(source.resolve(), folder.resolve()) if source.is_file() else None
-    write_json(folder / "design.json", {"experiment": experiment, **design.summary()})
+    write_json(folder / "design.json", {**origin_of(system, folder), **design.summary()})
+
+
+def save_with_origin(folder: Path, record: ShownRecord, system: System) -> None:
+    """Write the npz file of a result, and its JSON file with the experiment and the model.
+
+    Args:
+        folder: Folder for the files; made if it does not exist.
+        record: The result.
+        system: The experiment of the result.
+    """
+    record.save_archive(folder)
+    write_json(folder / f"{record.file_stem}.json", summary_with_origin(record, system, folder))
+
+
+def summary_with_origin(
+    record: ShownRecord, system: System, folder: Path | None
+) -> dict[str, object]:
+    """Return the contents of a result's JSON file, which `--json` prints as well.
+
+    Args:
+        record: The result.
+        system: The experiment of the result.
+        folder: Folder of results, relative to which files are named; without one, none are.
+    """
+    origin = {} if folder is None else origin_of(system, folder)
+    return {**origin, **record.summary()}
+
+
+def origin_of(system: System, folder: Path) -> dict[str, str | None]:
+    """Return the files of an experiment and of its model, relative to a folder of results.
+
+    Args:
+        system: The experiment.
+        folder: The folder.
+
+    Returns:
+        The paths, with slashes; None for an experiment that is no file.
+    """
+    files = {"experiment": Path(system.experiment.source), "model": system.model_path}
+    return {
+        name: _relative(file, folder) if file.is_file() else None for name, file in files.items()
+    }
+
+
+def _relative(file: Path, folder: Path) -> str:
+    """Return the path of a file relative to a folder; on another drive, the absolute path."""
+    try:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return file.resolve().as_posix()
 
 
 def write_table(path: Path, columns: Mapping[str, Array]) -> None:

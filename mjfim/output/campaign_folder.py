@@ -17,9 +17,8 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, RecordingError, first_ones, listed
 from mjfim.experiment.system import System
-from mjfim.interruption import run_optional
 from mjfim.output import plots
-from mjfim.output.archive import check_fits, write_design
+from mjfim.output.archive import check_fits, origin_of, write_design
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.campaign_settings import SETTINGS_FILE
 from mjfim.output.folders import (
@@ -31,6 +30,7 @@ from mjfim.output.folders import (
     write_tables,
 )
 from mjfim.output.mjcf.write import write_identified
+from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import Pictures
 from mjfim.output.plots.style import format_with_uncertainty
@@ -261,12 +261,12 @@ class CampaignFolder:
         """
         campaign.save_archive(self.path)
         write_json(self.path / "campaign.json", self._summary(campaign, simulated=simulated))
-        run_optional(lambda: write_report(self.path, Campaign))
+        write_optional(REPORT, lambda: write_report(self.path, Campaign))
         if campaign.estimate is None:
             return ""
 
         write_tables(self.path, campaign)
-        run_optional(lambda: self._write_figure(campaign, simulated=simulated))
+        self._write_figure(campaign, simulated=simulated)
         try:
             write_identified(self.path / IDENTIFIED, self.system, campaign.estimate.theta)
         except ModelError as error:
@@ -282,6 +282,7 @@ class CampaignFolder:
     def _summary(self, campaign: Campaign, *, simulated: bool) -> dict[str, Any]:
         """Return the contents of campaign.json."""
         return {
+            **origin_of(self.system, self.path),
             **campaign.summary(),
             "simulated": simulated,
             "units": list(self.system.units),

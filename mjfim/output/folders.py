@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
+
+from matplotlib.figure import Figure
 
 from mjfim.atomic_io import remove_earlier_result, replacing
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import measured_trajectory
-from mjfim.interruption import current_interruption, run_optional
+from mjfim.interruption import current_interruption
 from mjfim.output import archive, latex, markdown, plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.mjcf.edited_files import copies_of_included_files
 from mjfim.output.mjcf.write import write_identified
+from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import (
     Pictures,
@@ -208,9 +212,10 @@ def write_design_folder(
     archive.write_design(folder, design, system)
     write_tables(folder, design)
 
-    run_optional(lambda: write_report(folder, Design))
-    run_optional(lambda: _write_design_pictures(folder, design, system, picture_format))
-    run_optional(lambda: _add_video(folder, design, system))
+    write_optional(REPORT, lambda: write_report(folder, Design))
+    _write_figures(folder, design, picture_format)
+    write_optional("design.rrd", lambda: _write_design_log(folder, design, system))
+    write_optional("the video", lambda: _add_video(folder, design, system))
 
 
 def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
@@ -226,32 +231,31 @@ def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
     write_report(folder, type(result), video, sentence)
 
 
-def _write_design_pictures(
-    folder: Path, design: Design, system: System, picture_format: PictureFormat
-) -> None:
-    """Write the figures of a design and its Rerun file."""
-    _write_figures(folder, design, picture_format)
+def _write_design_log(folder: Path, design: Design, system: System) -> None:
+    """Write the Rerun file of a design."""
     labels = labels_of_system(system)
     rerun_log.log_design(folder / "design.rrd", system.model_at(system.theta), design, labels)
 
 
 def write_check_folder(
-    folder: Path, check: Check, picture_format: PictureFormat = PictureFormat.PNG
+    folder: Path, check: Check, system: System, picture_format: PictureFormat = PictureFormat.PNG
 ) -> None:
     """Write check.json, check.npz, report.html and a figure of accuracies and correlations.
 
     Args:
         folder: Folder for the results.
         check: The check.
+        system: The experiment that was checked.
         picture_format: Format of the pictures.
     """
-    check.save(folder)
+    archive.save_with_origin(folder, check, system)
     _write_views(folder, check, picture_format)
 
 
 def write_robustness_folder(
     folder: Path,
     result: Robustness,
+    system: System,
     seconds: float,
     picture_format: PictureFormat = PictureFormat.PNG,
 ) -> None:
@@ -260,11 +264,13 @@ def write_robustness_folder(
     Args:
         folder: Folder for the results.
         result: The study.
+        system: The experiment of the design.
         seconds: Time that the study took [s].
         picture_format: Format of the pictures.
     """
     result.save_archive(folder)
-    write_json(folder / "playback.json", {**result.summary(), "seconds": seconds})
+    values = {**archive.origin_of(system, folder), **result.summary(), "seconds": seconds}
+    write_json(folder / "playback.json", values)
     _write_views(folder, result, picture_format)
 
 
@@ -286,7 +292,7 @@ def write_comparison_folder(
         picture_format: Format of the pictures.
     """
     _clear(folder, r"control_[\w-]+\.csv")
-    comparison.save(folder)
+    archive.save_with_origin(folder, comparison, system)
     for row in comparison.rows:
         if row.control is not None:
             archive.write_control(folder / _control_name(row.method), row.control, system)
@@ -316,7 +322,7 @@ def write_estimate_folder(
         folder,
         rf"((fit|held_out)(_\d+)?|predictions|pairs|trace)\.({endings})|identified(_.*)?\.xml",
     )
-    estimate.save(folder)
+    archive.save_with_origin(folder, estimate, system)
     write_tables(folder, estimate)
 
     remarks = []
@@ -326,17 +332,15 @@ def write_estimate_folder(
     except ModelError as error:
         remarks.append(str(error))
 
-    run_optional(lambda: write_report(folder, Estimate))
-    run_optional(lambda: _write_estimate_pictures(folder, estimate, system, picture_format))
-    run_optional(lambda: _add_video(folder, estimate, system))
+    write_optional(REPORT, lambda: write_report(folder, Estimate))
+    _write_figures(folder, estimate, picture_format)
+    write_optional("estimate.rrd", lambda: _write_estimate_log(folder, estimate, system))
+    write_optional("the video", lambda: _add_video(folder, estimate, system))
     return remarks
 
 
-def _write_estimate_pictures(
-    folder: Path, estimate: Estimate, system: System, picture_format: PictureFormat
-) -> None:
-    """Write the figures of an estimate and its Rerun file."""
-    _write_figures(folder, estimate, picture_format)
+def _write_estimate_log(folder: Path, estimate: Estimate, system: System) -> None:
+    """Write the Rerun file of an estimate, if it holds a motion."""
     labels = labels_of_system(system)
     if estimate.motion is not None:
         measured = measured_trajectory(system, estimate.recordings[0])
@@ -346,42 +350,49 @@ def _write_estimate_pictures(
 
 
 def write_study_folder(
-    folder: Path, study: MonteCarloStudy, picture_format: PictureFormat = PictureFormat.PNG
+    folder: Path,
+    study: MonteCarloStudy,
+    system: System,
+    picture_format: PictureFormat = PictureFormat.PNG,
 ) -> None:
     """Write montecarlo.json, montecarlo.npz, report.html, tables and a histogram per parameter.
 
     Args:
         folder: Folder for the results.
         study: The Monte Carlo study.
+        system: The experiment that was studied.
         picture_format: Format of the pictures.
     """
-    study.save(folder)
-
+    archive.save_with_origin(folder, study, system)
     _write_views(folder, study, picture_format)
 
 
 def _write_views(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
     """Write the tables, the report and the figures of a result, from its files and its record."""
     write_tables(folder, record)
-    run_optional(lambda: write_report(folder, type(record)))
-    run_optional(lambda: _write_figures(folder, record, picture_format))
+    write_optional(REPORT, lambda: write_report(folder, type(record)))
+    _write_figures(folder, record, picture_format)
 
 
 def write_tables(folder: Path, record: ShownRecord) -> None:
-    """Write the tables of a result as Markdown and as LaTeX.
+    """Write the tables of a result as Markdown and as LaTeX, if that is possible.
 
     Args:
         folder: Folder for the results; pictures of tables that an earlier version wrote are
             removed.
         record: The result.
     """
+    write_optional(" and ".join(TABLE_FILES), lambda: _write_tables(folder, record))
+    _clear(folder, "|".join(re.escape(name) for name in EARLIER_TABLES))
+
+
+def _write_tables(folder: Path, record: ShownRecord) -> None:
+    """Write the tables of a result."""
     summary = describe(record)
     texts = (markdown.render_tables(summary), latex.render_tables(summary))
     for name, text in zip(TABLE_FILES, texts, strict=True):
         with replacing(folder / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
-
-    _clear(folder, "|".join(re.escape(name) for name in EARLIER_TABLES))
 
 
 def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
@@ -401,7 +412,13 @@ def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureForm
     _clear(folder, rf"({'|'.join(re.escape(name) for name in pictures)})\.({others})")
 
     for name, draw in pictures.items():
-        plots.save(draw(), folder / picture_format.file_of(name))
+        file = folder / picture_format.file_of(name)
+        write_optional(file.name, partial(_write_picture, draw, file))
+
+
+def _write_picture(draw: Callable[[], Figure], file: Path) -> None:
+    """Draw a picture and write it."""
+    plots.save(draw(), file)
 
 
 def _control_name(method: str) -> str:

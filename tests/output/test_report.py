@@ -14,16 +14,18 @@ import numpy as np
 import pytest
 
 from mjfim.errors import MjfimError, RecordingError
-from mjfim.output.report import REPORT
-from mjfim.output.report.build import page_of, rewrite_report, write_report
+from mjfim.output.report import REPORT, VERBS
+from mjfim.output.report.build import KINDS, page_of, rewrite_reports, write_report
 from mjfim.output.report.correlations import correlation_of
 from mjfim.output.report.curves import packed, points_per_curve, thinned
 from mjfim.output.report.page import PlotGroup
-from mjfim.output.report.render import no_video_in, rendered, video_in
+from mjfim.output.report.render import is_page_of, no_video_in, rendered, video_in
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
 from mjfim.output.video import Video
 from mjfim.records.campaign import CampaignStatus
+from mjfim.records.check import Check
 from mjfim.records.design import Design, LimitUsage, Status
+from mjfim.records.serialization import write_json
 from mjfim.records.shown import ShownRecord
 from tests.support import results
 
@@ -185,12 +187,23 @@ def test_an_estimate_shows_predictions_and_residuals() -> None:
         ({}, Level.GOOD, "σ of 1 % or less"),
         ({"limits": {"position": -0.1}}, Level.BAD, "violates limits (position)"),
         ({"status": Status.INFEASIBLE}, Level.BAD, "not ready"),
+        (
+            {"theta": np.array([2.0, 1.0, 1e-3])},
+            Level.DOUBTFUL,
+            "can be played, but it does not determine damping: σ is 500 % of its size",
+        ),
+        (
+            {"theta": np.array([2.0, 1e-3, 1e-3])},
+            Level.DOUBTFUL,
+            "does not determine length, damping: σ is 1000 % of its size for length",
+        ),
     ],
 )
 def test_the_verdict_on_a_design(changes: dict[str, Any], level: Level, words: str) -> None:
     design = results.design(**changes)
     assert verdict_of(design).level is level
     assert words in verdict_of(design).text
+    assert ("Ready to play" in verdict_of(design).text) is (level is Level.GOOD)
     assert next_steps(design)
 
 
@@ -355,13 +368,53 @@ def test_a_report_is_made_again_byte_for_byte(tmp_path: Path) -> None:
     design.save(tmp_path)
     first = write_report(tmp_path, Design, film("video/mp4")).read_bytes()
     (tmp_path / "design.json").touch()
-    assert rewrite_report(tmp_path).read_bytes() == first
+    assert [path.read_bytes() for path in rewrite_reports(tmp_path)] == [first]
     assert b"\r\n" not in first[:10_000]
+
+
+def test_every_result_of_a_folder_has_a_page(tmp_path: Path) -> None:
+    """A design takes the place of a check, which keeps a page of its own; both name the other."""
+    assert tuple(KINDS) == VERBS
+    results.check().save(tmp_path)
+    assert write_report(tmp_path, Check).name == REPORT
+
+    results.design().save(tmp_path)
+    first = write_report(tmp_path, Design, film("video/mp4"))
+    beside = tmp_path / "report_check.html"
+    assert first.name == REPORT
+    assert is_page_of(first.read_text(encoding="utf-8"), "Design of an experiment")
+    assert is_page_of(beside.read_text(encoding="utf-8"), "Check of an experiment")
+    assert '<a href="report_check.html">check</a>' in first.read_text(encoding="utf-8")
+    assert '<a href="report.html">design</a>' in beside.read_text(encoding="utf-8")
+
+    # A later check does not replace the page of the design, whose video remains.
+    pages = {path: path.read_bytes() for path in (first, beside)}
+    assert write_report(tmp_path, Check) == beside
+    assert pages == {path: path.read_bytes() for path in pages}
+    assert rewrite_reports(tmp_path) == [first, beside]
+    assert pages == {path: path.read_bytes() for path in pages}
+    assert video_in(first.read_text(encoding="utf-8")) == film("video/mp4")
+
+
+def test_a_report_has_the_name_of_its_experiment_wherever_it_is(tmp_path: Path) -> None:
+    """The JSON file of a result names experiment and model; the name of the folder is not shown."""
+    folders = [tmp_path / "one", tmp_path / "two"]
+    pages = []
+    for folder in folders:
+        record = results.check()
+        record.save_archive(folder)
+        origin = {"experiment": "../arm.toml", "model": "..\\models\\arm.xml"}
+        write_json(folder / "check.json", {**origin, **record.summary()})
+        pages.append(write_report(folder, Check).read_text(encoding="utf-8"))
+    assert pages[0] == pages[1]
+    assert "<h1><small>Check of an experiment</small>arm</h1>" in pages[0]
+    assert "<dt>experiment</dt><dd>arm.toml</dd>" in pages[0]
+    assert "<dt>model</dt><dd>arm.xml</dd>" in pages[0]
 
 
 def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"holds no result; .*design\.npz"):
-        rewrite_report(tmp_path)
+        rewrite_reports(tmp_path)
     with pytest.raises(RecordingError, match="no such folder"):
-        rewrite_report(tmp_path / "nowhere")
+        rewrite_reports(tmp_path / "nowhere")
     assert not (tmp_path / REPORT).exists()

@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.output import vocabulary
-from mjfim.output.video import NoVideoError, rendering
+from mjfim.output.video import NoVideoError, picture, rendering
 from mjfim.output.video.film import (
     Film,
     film_of_estimate,
@@ -69,6 +69,16 @@ def swinging(seconds: float, amplitude: float = 0.5) -> Trajectory:
     """A swing with a sample every 10 ms."""
     t = np.linspace(0.0, seconds, round(100 * seconds) + 1)
     return motion(t, amplitude * np.sin(3.0 * t)[:, None])
+
+
+def test_lines_cast_no_shadow(swing: mujoco.MjModel) -> None:
+    """The path of a robot and the floor are decoration, which MuJoCo leaves out of shadows."""
+    scene = mujoco.MjvScene(swing, 2)
+    scene.geoms[0].category = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
+    colour = np.ones(4, dtype=np.float32)
+    picture._add_line(scene, np.zeros(3), np.ones(3), 0.01, colour)
+    assert scene.ngeom == 1
+    assert scene.geoms[0].category == int(mujoco.mjtCatBit.mjCAT_DECOR)
 
 
 def drawn(film: Film, kind: str) -> Video:

@@ -57,7 +57,14 @@ VIDEO = re.compile(
 NO_VIDEO = re.compile(r'<p class="note no-video">(.*?)</p>', re.DOTALL)
 
 
-def rendered(page: Page, name: str = "", video: Video | None = None, no_video: str = "") -> str:
+def rendered(
+    page: Page,
+    name: str = "",
+    video: Video | None = None,
+    no_video: str = "",
+    *,
+    others: Mapping[str, str] | None = None,
+) -> str:
     """Return a report as one HTML file.
 
     Args:
@@ -65,6 +72,7 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
         name: Name of what was designed, identified or studied; may be empty.
         video: A video of the robot, or None.
         no_video: Sentence that says why there is no video; may be empty.
+        others: Pages of other results in the same folder, by their verbs.
     """
     # These libraries are slow to import, and only reports need them.
     from jinja2.utils import htmlsafe_json_dumps
@@ -83,6 +91,7 @@ def rendered(page: Page, name: str = "", video: Video | None = None, no_video: s
         name=name,
         video=video,
         no_video=no_video,
+        others=others or {},
         palettes=colours,
         panel_number=lambda panel: number_of[id(panel)],
         is_thinned=lambda group: _is_thinned(group, limit),
@@ -123,6 +132,16 @@ def _template(file: str) -> Template:
         without_bullet=lambda text: text.removeprefix("• "),
     )
     return environment.get_template(file)
+
+
+def is_page_of(html: str, kind: str) -> bool:
+    """Whether a report is that of a kind of result.
+
+    Args:
+        html: The report.
+        kind: The kind, as a page states it.
+    """
+    return f"<h1><small>{kind}</small>" in html
 
 
 def video_in(html: str) -> Video | None:

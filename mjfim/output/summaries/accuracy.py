@@ -97,7 +97,9 @@ def relative(std: float, size: float) -> Quantity:
     percent = 100.0 * std / size
 
     # Shares above 100 % are whole numbers, not powers of ten.
-    digits = int(np.clip(np.ceil(np.log10(max(percent, 1.0))), 2, MAX_DIGITS))
+    if percent > 100.0:
+        percent = float(np.round(percent))
+    digits = int(np.clip(np.floor(np.log10(max(percent, 1.0))) + 1, 2, MAX_DIGITS))
     return Quantity(value=percent, digits=digits, suffix=" %")
 
 

@@ -95,7 +95,35 @@ def _(design: Design) -> Verdict:
         )
         return Verdict(text=text, level=Level.DOUBTFUL)
 
+    reservation = _reservation(design)
+    if reservation:
+        text = f"This motion can be played, but {reservation}. {kept}."
+        return Verdict(text=text, level=Level.DOUBTFUL)
+
     return Verdict(text=f"Ready to play: {_accuracy(design)}. {kept}.", level=Level.GOOD)
+
+
+def _undetermined(design: Design) -> list[int]:
+    """Numbers of the wanted parameters whose standard deviation exceeds their size."""
+    std, sizes = design.final.std, design.sizes
+    return [j for j in design.wanted if not np.isfinite(std[j]) or 0.0 < sizes[j] < std[j]]
+
+
+def _reservation(design: Design) -> str:
+    """Say which parameters a design does not determine; empty where it determines all of them."""
+    found = _undetermined(design)
+    if not found:
+        return ""
+
+    std, sizes = design.final.std, design.sizes
+    worst = max(found, key=lambda j: float(std[j] / sizes[j]) if np.isfinite(std[j]) else np.inf)
+    names = first_ones([design.parameters[j] for j in found])
+    text = f"it does not determine {names}"
+    if not np.isfinite(std[worst]):
+        return text
+    share = relative(float(std[worst]), float(sizes[worst]))
+    of_one = f": σ is {share} of its size"
+    return text + (of_one if len(found) == 1 else f"{of_one} for {design.parameters[worst]}")
 
 
 def _accuracy(design: Design) -> str:
@@ -146,7 +174,14 @@ def _steps_after_design(design: Design) -> Iterator[str]:
             "Keep the motion away from contacts, dry friction and saturated actuators: begin with "
             "an initial control of smaller amplitude, or state narrower limits."
         )
-    elif not design.status.success:
+    undetermined = _undetermined(design) if design.separable else []
+    if undetermined:
+        names = first_ones([design.parameters[j] for j in undetermined])
+        yield (
+            f"Determine {names} with a longer or larger motion, by measuring another output, or "
+            "state what is known with `prior`."
+        )
+    if not design.status.success and design.status is not Status.ROUGH:
         yield "Allow more time or iterations in the table `[descent]` for a better design."
     if design.sound:
         yield "Export the motion for the robot: `mjfim export DESIGN_FOLDER --to player -o FILE`."

@@ -215,6 +215,7 @@ class Painter:
             size = np.full(3, 1.5 * radius)
             sphere = mujoco.mjtGeom.mjGEOM_SPHERE
             mujoco.mjv_initGeom(ball, sphere, size, place, np.eye(3).ravel(), STICK_COLOUR)
+            ball.category = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
             robot.paint(ball)
             scene.ngeom += 1
 
@@ -224,6 +225,7 @@ class Painter:
                 nothing = np.zeros(3)
                 mujoco.mjv_initGeom(stick, kind, nothing, nothing, np.eye(3).ravel(), STICK_COLOUR)
                 mujoco.mjv_connector(stick, kind, radius, place, self._data.xpos[child])
+                stick.category = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
                 robot.paint(stick)
                 scene.ngeom += 1
 
@@ -256,7 +258,6 @@ class Painter:
         box = mujoco.mjtGeom.mjGEOM_BOX
         mujoco.mjv_initGeom(wall, box, size, place, rotation.ravel(), BACKGROUND)
         _let_shine(wall)
-        wall.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
         scene.ngeom += 1
 
 
@@ -287,7 +288,8 @@ def _add_line(
 
 
 def _let_shine(geom: mujoco.MjvGeom) -> None:
-    """Give a geom its own colour whatever the lights are."""
+    """Give a geom its own colour whatever the lights are, and no shadow."""
+    geom.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
     geom.rgba[:3] /= EMISSION
     geom.emission, geom.specular, geom.shininess = EMISSION, 0.0, 0.0
 

@@ -1,0 +1,45 @@
+"""Files that a result does not need: reports, pictures, Rerun files and videos.
+
+They are written after the data. A fault of the program while one of them is drawn costs this file
+alone, and never the result.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+from mjfim.errors import MjfimError, UndrawnWarning, UnfinishedError
+from mjfim.interruption import run_optional
+
+
+def write_optional(name: str, write: Callable[[], object]) -> None:
+    """Write a file that may be left out, after Ctrl-C or because drawing it fails.
+
+    A failure is a warning, which the command line shows as one sentence. Tests make an error of it,
+    and `python -W error -m mjfim` shows where it happened.
+
+    Args:
+        name: Name of the file.
+        write: Draws and writes it.
+
+    Raises:
+        MjfimError: The file may not be written.
+        OSError: The file cannot be written.
+    """
+
+    def draw() -> None:
+        """Draw the file, and turn a fault of the program into a warning."""
+        try:
+            write()
+        except (MjfimError, OSError, UnfinishedError, UndrawnWarning):
+            raise
+        except Exception as error:
+            fault = ": ".join(part for part in (type(error).__name__, str(error)) if part)
+            message = (
+                f"could not draw {name}, because of a fault in mjfim ({fault}); the result stands, "
+                "and its data are written (python -W error -m mjfim shows the place of the fault)"
+            )
+            warnings.warn(message, UndrawnWarning, stacklevel=3)
+
+    run_optional(draw)
