@@ -20,7 +20,7 @@ from mjfim.output import archive, latex, markdown, plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.mjcf.edited_files import copies_of_included_files
 from mjfim.output.mjcf.write import write_identified
-from mjfim.output.optional_files import write_optional
+from mjfim.output.optional_files import write_guarded, write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import (
     Pictures,
@@ -382,7 +382,7 @@ def write_tables(folder: Path, record: ShownRecord) -> None:
             removed.
         record: The result.
     """
-    write_optional(" and ".join(TABLE_FILES), lambda: _write_tables(folder, record))
+    write_guarded(" and ".join(TABLE_FILES), lambda: _write_tables(folder, record))
     _clear(folder, "|".join(re.escape(name) for name in EARLIER_TABLES))
 
 
