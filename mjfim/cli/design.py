@@ -45,6 +45,7 @@ from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import MAX_STARTS
+from mjfim.output import archive
 from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.presentation import describe
@@ -127,7 +128,7 @@ def design(
     # The files of the shortest experiment describe its horizon, not the stated one.
     if found is not None:
         task = DesignTask.resolve(found.experiment, threads=threads)
-    values = result.summary()
+    values = archive.summary_with_origin(result, task.system, output)
     if found is not None:
         values["shortest"] = found.summary()
     summary = describe(result)

@@ -39,10 +39,11 @@ def test_design_leaves_its_files(home: Path, designed: Result) -> None:
 
 
 def test_design_json_is_the_file(home: Path, designed: Result) -> None:
-    """Standard output holds the summary alone; only the path to the experiment differs."""
+    """Standard output holds the summary alone, which names the experiment and its model."""
     data = read(home / "out" / "design.json")
-    assert (home / "out" / data.pop("experiment")).resolve() == home / "study.toml"
     assert loads(designed.stdout) == data
+    assert (home / "out" / data["experiment"]).resolve() == home / "study.toml"
+    assert (home / "out" / data["model"]).resolve() == home / "cart_pendulum.xml"
     assert "wrote" in designed.stderr
 
 
