@@ -57,7 +57,7 @@ def live(
             design = mjfim.design(experiment, callback=show)
 
     The viewer shows the cost and the smallest eigenvalue of the information over the iterates, and
-    the motion of the robot of the newest one. The result is the same with and without it. Where
+    the motion of the robot of the best one so far. The result is the same with and without it. Where
     there is no viewer, one sentence says so, and the work goes on.
 
     Args:

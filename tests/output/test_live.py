@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from mjfim.errors import ExperimentError, NoResultError
 from mjfim.experiment.system import System
 from mjfim.output import live as live_module
 from mjfim.output.live import HERE, live, url_of
-from mjfim.output.rerun.live import UPDATE_SECONDS, LiveShow
+from mjfim.output.rerun.live import OTHER_STARTS, UPDATE_SECONDS, LiveShow
 from mjfim.records.design import Design
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from tests.support.paths import MODELS
@@ -74,9 +75,57 @@ class Received:
         """Whether an entity has data without a time, which hide the others."""
         return any(each.is_static for each in self._chunks if str(each.entity_path) == entity)
 
+    def curves(self, plot: str) -> list[str]:
+        """Names of the entities of the curves of a plot."""
+        below = [entity.split("/") for entity in self.entities]
+        return [parts[2] for parts in below if parts[1] == plot and len(parts) == 3]
+
+    def name_of(self, entity: str) -> str:
+        """Name of a curve in the legend, the last one that was received."""
+        names = [
+            chunk.to_record_batch().column("SeriesLines:names").to_pylist()[-1][0]
+            for chunk in self._chunks
+            if str(chunk.entity_path) == entity
+            and "SeriesLines:names" in chunk.to_record_batch().schema.names
+        ]
+        return str(names[-1])
+
+    def height(self, entity: str) -> float:
+        """Length of the vertical axis of a plot."""
+        _, axes = self.rows(f"{entity}/axes", "LineStrips2D:strips")
+        return float(np.ptp(np.array(axes[-1][0])[:, 1]))
+
+    def numbers(self, entity: str) -> tuple[float, float]:
+        """Lowest and highest number beside the vertical axis of a plot, the last one."""
+        _, texts = self.rows(f"{entity}/numbers", "Points2D:labels")
+        _, places = self.rows(f"{entity}/numbers", "Points2D:positions")
+        across = np.array(places[-1])[:, 0]
+        values = [float(text) for text, x in zip(texts[-1], across, strict=True) if x < 0.0]
+        return min(values), max(values)
+
     def series(self, entity: str) -> list[float]:
         """Values of a curve."""
         return [value for (value,) in self.rows(entity, "Scalars:scalars")[1]]
+
+
+class HeldTimer:
+    """A timer that runs when the test says so."""
+
+    started: ClassVar[list[HeldTimer]] = []
+
+    def __init__(self, seconds: float, function: Callable[[], None]) -> None:
+        assert seconds == UPDATE_SECONDS
+        self.run, self.daemon = function, False
+
+    def start(self) -> None:
+        """Wait for the test."""
+        assert self.daemon
+        self.started.append(self)
+
+
+def failing() -> None:
+    """Take the place of a transmission."""
+    raise RuntimeError("connection lost")
 
 
 def watched(
@@ -118,10 +167,99 @@ class TestShown:
         assert not np.allclose(paths[0], paths[-1])
         numbers, texts = received.rows("/progress", "TextDocument:text")
         assert len(texts) == len(events) + 1, "one before the first event"
-        assert "J " in texts[-1][0]
+        assert "J " in texts[-1][0] and "best so far, shown: initial control" in texts[-1][0]
         assert not received.has_static("/progress")
         _, places = received.rows("/robot/bodies/bob", "Transform3D:translation")
         assert len(places) == len(events)
+
+    def test_curves_over_time_show_the_positions_and_the_controls(
+        self,
+        searched: tuple[Design, list[DesignEvent]],
+        experiment: mjfim.Experiment,
+        tmp_path: Path,
+    ) -> None:
+        design, events = searched
+        received = watched(events, experiment, tmp_path, step=2.0 * UPDATE_SECONDS)
+        shown = {
+            "/positions/hinge\\ \\[rad\\]": design.trajectory.qpos[:, 1],
+            "/controls/force\\ \\[N\\]": design.trajectory.ctrl[:, 0],
+        }
+        for entity, expected in shown.items():
+            numbers, curves = received.rows(f"{entity}/iterate", "LineStrips2D:strips")
+            assert numbers == list(range(len(events)))
+            last = np.array(curves[-1][0])
+            heights = np.ptp(last[:, 1]) / received.height(entity)
+            low, high = received.numbers(entity)
+            assert low >= expected.min() - np.ptp(expected)
+            assert high <= expected.max() + np.ptp(expected)
+            assert 0.2 < heights <= 1.0
+
+            # The axes hold everything that was shown before.
+            _, axes = received.rows(f"{entity}/axes", "LineStrips2D:strips")
+            assert len(axes) == len(events)
+
+    def test_the_best_iterate_of_several_starts_is_shown(
+        self,
+        searched: tuple[Design, list[DesignEvent]],
+        experiment: mjfim.Experiment,
+        tmp_path: Path,
+    ) -> None:
+        """A finer time grid comes first, then the limits, then the cost."""
+        _, (first, *_, last) = searched
+        rated = replace(last.row, rate=2.0 * last.row.rate)
+        events = [
+            first,
+            replace(last, start="multisine 1"),
+            replace(first, start="multisine 2"),
+            replace(last, start="multisine 3", row=replace(last.row, cost=1e-9, margin=-0.1)),
+            replace(first, start="multisine 4", row=replace(rated, cost=9.0)),
+        ]
+        received = watched(events, experiment, tmp_path, step=2.0 * UPDATE_SECONDS)
+        _, texts = received.rows("/progress", "TextDocument:text")
+        shown = [text.splitlines()[2] for (text,) in texts[1:]]
+        assert shown == [
+            f"best so far, shown: {name}"
+            for name in ("initial control", *("multisine 1",) * 3, "multisine 4")
+        ]
+        assert texts[3][0].startswith("newest: multisine 2, searching at")
+        _, paths = received.rows("/robot/path", "LineStrips3D:strips")
+        assert np.allclose(paths[1], paths[2]) and np.allclose(paths[1], paths[3])
+        assert not np.allclose(paths[0], paths[1])
+
+        # The curves of other starts share a name in the legend.
+        names = {name: received.name_of(f"/cost/{name}") for name in received.curves("cost")}
+        assert names.pop("multisine\\ 4") == "multisine 4"
+        assert set(names.values()) == {OTHER_STARTS} and len(names) == 4
+
+    def test_the_end_of_a_burst_is_transmitted_without_a_further_event(
+        self,
+        searched: tuple[Design, list[DesignEvent]],
+        experiment: mjfim.Experiment,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """Searches in other processes deliver all iterates at once, and then nothing."""
+        monkeypatch.setattr(threading, "Timer", HeldTimer)
+        _, events = searched
+        system = System.resolve(experiment)
+        rec = rr.RecordingStream("test")
+        rec.save(tmp_path / "live.rrd")
+        show = LiveShow(rec, system.model_at(system.theta), now=Clock(0.0), wakes=True)
+        HeldTimer.started.clear()
+        for event in events:
+            show(event)
+        assert show._transmitted == 1
+        (timer,) = HeldTimer.started
+        timer.run()
+        assert show._transmitted == len(events)
+
+        # A failure in the thread is raised at the next event, where it ends the view.
+        monkeypatch.setattr(show, "_transmit", failing)
+        show(events[0])
+        HeldTimer.started[-1].run()
+        with pytest.raises(RuntimeError, match="connection lost"):
+            show(events[0])
+        rec.disconnect()
 
     def test_transmissions_are_rare_and_lose_no_point(
         self,

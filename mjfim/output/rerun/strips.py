@@ -118,20 +118,23 @@ class StripPlot:
         """
         return self.curve(np.array([x, x]), np.array(self.y), colour)
 
-    def log_axes(self, rec: rr.RecordingStream, limits: Range = NO_LIMITS) -> None:
+    def log_axes(
+        self, rec: rr.RecordingStream, limits: Range = NO_LIMITS, *, static: bool = True
+    ) -> None:
         """Log the axes with their numbers, and the limits as lines.
 
         Args:
             rec: The recording.
             limits: Lower and upper limit of the plotted quantity; those outside the plot, and
                 infinite ones, are not drawn.
+            static: False for axes that change, which are logged at the time that is set.
         """
         frame = [[(0.0, 0.0), (0.0, self.height), (self.width, self.height)]]
         axes = rr.LineStrips2D(
             frame, colors=[AXIS_COLOUR], radii=rr.Radius.ui_points(AXIS_THICKNESS)
         )
-        rec.log(entity_path((*self.parts, "axes")), axes, static=True, strict=True)
-        self._log_numbers(rec)
+        rec.log(entity_path((*self.parts, "axes")), axes, static=static, strict=True)
+        self._log_numbers(rec, static=static)
 
         shown = [limit for limit in limits if self.y[0] <= limit <= self.y[1]]
         if shown:
@@ -141,7 +144,7 @@ class StripPlot:
                 colors=[LIMIT_COLOUR] * len(lines),
                 radii=rr.Radius.ui_points(LIMIT_THICKNESS),
             )
-            rec.log(entity_path((*self.parts, "limits")), strips, static=True, strict=True)
+            rec.log(entity_path((*self.parts, "limits")), strips, static=static, strict=True)
 
     def log_legend(self, rec: rr.RecordingStream, colours: Mapping[str, Sequence[int]]) -> None:
         """Log the names of curves at the top right, each in its colour.
@@ -171,7 +174,7 @@ class StripPlot:
             ),
         )
 
-    def _log_numbers(self, rec: rr.RecordingStream) -> None:
+    def _log_numbers(self, rec: rr.RecordingStream, *, static: bool) -> None:
         """Log the numbers beside the axes."""
         across = round_numbers(*self.x, _count(self.width, NUMBER_WIDTH))
         rounded = round_logarithms if self.logarithmic else round_numbers
@@ -193,7 +196,7 @@ class StripPlot:
             radii=rr.Radius.ui_points(0.0),
             show_labels=True,
         )
-        rec.log(entity_path((*self.parts, "numbers")), numbers, static=True, strict=True)
+        rec.log(entity_path((*self.parts, "numbers")), numbers, static=static, strict=True)
 
 
 def _count(length: float, room: float) -> int:
