@@ -57,8 +57,9 @@ def live(
             design = mjfim.design(experiment, callback=show)
 
     The viewer shows the cost and the smallest eigenvalue of the information over the iterates, and
-    the motion of the robot of the best one so far. The result is the same with and without it. Where
-    there is no viewer, one sentence says so, and the work goes on.
+    the motion of the best one so far: the robot, and its positions and controls over time. The
+    result is the same with and without it. Where there is no viewer, one sentence says so, and the
+    work goes on.
 
     Args:
         experiment: The experiment, whose model is shown.
