@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import mujoco
@@ -124,6 +124,14 @@ class SubstepObservations:
     turn_weights: Array = field(default_factory=lambda: np.zeros((0, 4)))
     tendon_forces: tuple[tuple[int, ...], ...] = ()
     tendon_lengths: np.ndarray = field(default_factory=lambda: np.zeros(0, np.intp))
+
+    def of_single_steps(self) -> SubstepObservations:
+        """Return the same observations of samples that last one engine step.
+
+        Every engine step then has the further rows that a sample had.
+        """
+        rows = (0, 0) if self.has_stages else (0,)
+        return replace(self, derivative_substeps=(1,), force_rows=rows if self.force_rows else ())
 
     @property
     def has_stages(self) -> bool:

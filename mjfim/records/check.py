@@ -111,7 +111,11 @@ class Roughness:
         cause = first_ones(self.causes) if self.causes else ""
         if not cause:
             cause = "no contact, friction or limit acts there; the motion may be chaotic"
-        size = f"{100 * self.error:.2g} %" if np.isfinite(self.error) else "an unlimited amount"
+
+        # Two digits, and no power of ten for some hundred percent.
+        size = "an unlimited amount"
+        if np.isfinite(self.error):
+            size = f"{float(f'{100.0 * self.error:.2g}'):g} %"
 
         return (
             f"not smooth: derivatives with two different difference steps disagree by {size} for "

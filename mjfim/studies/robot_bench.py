@@ -121,6 +121,9 @@ class RobotBench:
 
         self.constraints = constraint_set_of(self.stated)
         self.limits = _assessed_limits(self.stated, self.constraints)
+
+        # The controls of a robot arrive late, at any engine step, so its samples are engine steps.
+        self._observations = self.constraints.observations.of_single_steps()
         self._simulator = BatchSimulator(
             self.stated.system.model_at(self.stated.theta),
             sensors=self.stated.system.outputs.needs_sensors,
@@ -460,9 +463,7 @@ class RobotBench:
         # The control arrives late. Until then the robot gets the control before the motion begins.
         held = np.repeat(sent, self.steps_per_row, axis=0)
         applied = np.concatenate([np.tile(before, (self.late_steps, 1)), held])
-        out = self._simulator.rollout(
-            [model], start[None], applied[None], self.constraints.observations
-        )
+        out = self._simulator.rollout([model], start[None], applied[None], self._observations)
         if not out.finite[0] or out.observed is None:
             raise SimulationDivergedError("the robot's simulation diverges")
 

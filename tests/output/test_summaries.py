@@ -13,7 +13,7 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.output.rerun.text import design_text, estimate_text
 from mjfim.output.rerun.text import render as render_markdown
-from mjfim.output.summaries.accuracy import improvement
+from mjfim.output.summaries.accuracy import improvement, relative
 from mjfim.output.summaries.check import describe_check
 from mjfim.output.summaries.design import describe_design
 from mjfim.output.summaries.estimate import describe_estimate
@@ -21,6 +21,7 @@ from mjfim.output.summaries.monte_carlo import describe_study
 from mjfim.output.summaries.widths import shortened
 from mjfim.output.summary_parts import Name, Quantity, Summary, capitalised
 from mjfim.output.text import render
+from mjfim.records.check import Roughness
 from mjfim.records.design import CombinationAccuracy, Design
 from mjfim.records.estimate import Estimate
 from tests.support.paths import MODELS
@@ -128,6 +129,20 @@ def test_improvements_in_words() -> None:
     assert improvement(2.0, 0.5) == "÷ 4.0"
     assert improvement(0.5, 2.0) == "× 4.0"
     assert improvement(np.inf, 2.0) == improvement(1.0, 0.0) == "-"
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0.00123, "0.12 %"), (0.994, "99 %"), (0.998, "99.8 %"), (0.9996, "100 %"), (6.32, "632 %")],
+)
+def test_shares_near_the_whole_are_no_powers_of_ten(share: float, text: str) -> None:
+    assert str(relative(share, 1.0)) == text
+
+
+def test_disagreements_of_some_hundred_percent_are_no_powers_of_ten() -> None:
+    rough = Roughness(error=1.98, parameter="m", sample=3, time=0.1, causes=())
+    assert "disagree by 200 % for m" in str(rough)
+    assert "disagree by 2.6 % for m" in str(replace(rough, error=0.0257))
 
 
 def test_cells_in_words() -> None:

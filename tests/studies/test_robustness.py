@@ -442,6 +442,47 @@ def test_a_robot_agrees_with_a_plain_simulation_loop(
     assert by_name["control", "force"] == pytest.approx(1.0 - np.abs(sent).max() / 10.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
+def test_margins_of_servo_forces_hold_at_every_engine_step(
+    cart: tuple[mjfim.Experiment, Path], tmp_path: Path, integrator: str
+) -> None:
+    """Forces of a servo change with the state, within samples of several engine steps."""
+    servo = CART.replace(
+        '<motor name="force" joint="slide" ctrlrange="-10 10"/>',
+        '<position name="force" joint="slide" kp="30" kv="2" ctrlrange="-10 10"/>',
+    ).replace("<worldbody>", f'<option integrator="{integrator}"/><worldbody>')
+    (tmp_path / "cart.xml").write_text(servo, encoding="utf-8")
+    experiment = cart[0].replace(
+        directory=tmp_path, limits={"force": {"force": 400.0}}, playback_rate=50.0
+    )
+    path = written(DesignTask.resolve(experiment, threads=1), tmp_path)[0]
+    bench = RobotBench(experiment, path, RobotConditions(latency=0.015))
+
+    theta = np.append(bench.task.theta[:-1], 0.015)
+    noise = np.zeros((len(bench.plan.t), len(bench.task.system.outputs)))
+    recording, margins, start = bench.play(theta, noise, bench.controller)
+
+    model = mujoco.MjModel.from_xml_string(servo)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = start[:2], start[2:]
+    largest = 0.0
+    for step in range(len(recording.ctrl) + 3):
+        if step >= 3:
+            data.ctrl[:] = recording.ctrl[step - 3]
+        before = mujoco.MjData(model)
+        mujoco.mj_copyData(before, model, data)
+        mujoco.mj_step(model, data)
+        after = mujoco.MjData(model)
+        mujoco.mj_copyData(after, model, data)
+        for at in (before, after):
+            mujoco.mj_forward(model, at)
+        at_step = [abs(at.actuator_force[0]) for at in (before, data, after)]
+        largest = max(largest, *at_step)
+
+    kinds = [limit.kind for limit in bench.limits]
+    assert margins[kinds.index("force")] == pytest.approx(1.0 - largest / 400.0, abs=1e-9)
+
+
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("latency", [0.0, 0.005, pytest.param(0.02, marks=pytest.mark.slow)])
 def test_without_noise_the_true_values_are_found(

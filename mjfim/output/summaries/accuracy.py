@@ -96,10 +96,9 @@ def relative(std: float, size: float) -> Quantity:
         return Quantity(value=float("nan"))
     percent = 100.0 * std / size
 
-    # Shares above 100 % are whole numbers, not powers of ten.
-    if percent > 100.0:
-        percent = float(np.round(percent))
-    digits = int(np.clip(np.floor(np.log10(max(percent, 1.0))) + 1, 2, MAX_DIGITS))
+    # Shares from 99.5 % on are whole numbers, not powers of ten.
+    places = len(f"{percent:.0f}") if percent < 10.0**MAX_DIGITS else MAX_DIGITS
+    digits = max(places, 2)
     return Quantity(value=percent, digits=digits, suffix=" %")
 
 
