@@ -10,7 +10,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Nuisance, ParameterSpec
-from mjfim.model.coordinates import unknown_coordinate
+from mjfim.model.coordinates import output_label, split_unit, unknown_coordinate
 from mjfim.model.elements import identifier, names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource
@@ -295,6 +295,7 @@ def _nuisance_parameters(
             f"bias {name}",
             target,
             prior,
+            unit=split_unit(output_label(source.model, name))[1],
             magnitude=float(sizes.sigma[bias.output]),
             per_recording=stated.per_recording,
         )

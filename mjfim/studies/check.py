@@ -548,10 +548,11 @@ class _Verdict:
             needed = "no number of repetitions reaches"
             if worst.repetitions:
                 needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"
+            wanted = f"{worst.wanted:.3g} {worst.unit}".rstrip()
             yield (
                 f"{len(missed)} of {len(identifiable)} parameters miss the wanted σ with "
-                f"{self.source} alone; the worst is {worst.name}: {needed} {worst.wanted:.3g}. A "
-                "designed excitation (`mjfim design`) needs fewer"
+                f"{self.source} alone; the worst is {worst.name}: {needed} {wanted}. A designed "
+                "excitation (`mjfim design`) needs fewer"
             )
         elif self.tested.passed and not self.missing and not unknown and not self.not_excited:
             yield (

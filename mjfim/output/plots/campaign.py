@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator
 
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.plots import style
@@ -27,6 +27,7 @@ def campaign_figure(campaign: Campaign, parameters: CampaignParameters) -> Figur
         campaign: The campaign.
         parameters: Its parameters.
     """
+    count = len(campaign.rounds)
     shown = _shown_parameters(campaign, parameters)
     figure = style.new_figure(1.2 + 1.75 * len(shown))
     panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
@@ -42,12 +43,14 @@ def campaign_figure(campaign: Campaign, parameters: CampaignParameters) -> Figur
         _draw_estimate(right, campaign, j, true)
 
     # The numbers of the rounds are on the shared horizontal axis.
-    panels[0, 0].xaxis.set_major_locator(MaxNLocator(integer=True))
-    panels[0, 0].set_xlim(0.5, max(len(campaign.rounds), 2) + 0.5)
+    locator = MaxNLocator(integer=True) if count > 1 else FixedLocator([1])
+    panels[0, 0].xaxis.set_major_locator(locator)
+    panels[0, 0].set_xlim(0.5, count + 0.5)
     for column in (0, 1):
         panels[-1, column].set_xlabel("round")
 
-    title = f"{len(campaign.rounds)} rounds of design, recording and estimate"
+    rounds = "1 round" if count == 1 else f"{count} rounds"
+    title = f"{rounds} of design, recording and estimate"
     note = (
         f"{style.as_sentence(campaign.status.value)} Bars, and the band of the last round: ± 1 "
         "and ± 2 formal σ, which are the true accuracy only if the model and the noise are right."

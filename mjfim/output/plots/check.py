@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -13,17 +15,21 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.output.plots.style import (
     GRID_COLOUR,
+    LARGE_FONT,
     MUTED_COLOUR,
     SMALL_FONT,
     TEXT_COLOUR,
+    WIDTH,
     add_title,
     as_sentence,
     format_axes,
+    format_number,
     format_percent,
     new_figure,
     own_style,
     shorten,
     text_width,
+    without_zeros,
 )
 from mjfim.output.summaries.accuracy import BEST_CASE
 from mjfim.output.vocabulary import DESIGNED, INITIAL, MEASURED
@@ -47,6 +53,9 @@ DARK_CELL = 0.6
 
 # Height of a row, and of all that is above and below the rows [inch].
 ROW_HEIGHT, MANY_ROWS_HEIGHT, FRAME_HEIGHT = 0.3, 0.16, 2.4
+
+# Number of lines of a title above which it is shortened.
+MAX_TITLE_LINES = 2
 
 # Height of a bar as a share of the height of a row.
 BAR_HEIGHT = 0.6
@@ -84,9 +93,16 @@ def check_figure(check: Check) -> Figure:
     if not has_correlations and count > 1:
         note = f"No parameter is identifiable alone, so there are no correlations. {note}"
     verdict = check.verdict[0] if check.verdict else "all parameters are identifiable"
-    title = as_sentence(verdict.replace("`", "").removesuffix("."))
-    add_title(figure, title, _handles(check), note)
+    add_title(figure, _title(verdict), _handles(check), note)
     return figure
+
+
+def _title(verdict: str) -> str:
+    """Return a verdict as the title; a long one without what stands in brackets."""
+    plain = verdict.replace("`", "").removesuffix(".")
+    if text_width(plain, LARGE_FONT) > MAX_TITLE_LINES * WIDTH:
+        plain = re.sub(r" \([^()]*\)", "", plain)
+    return as_sentence(plain)
 
 
 def colour_of_source(check: Check) -> str:
@@ -100,11 +116,20 @@ def colour_of_source(check: Check) -> str:
     return DESIGNED.colour if "design" in check.source else INITIAL.colour
 
 
+def duration(check: Check) -> str:
+    """Return the duration of the motion that was checked, with its unit.
+
+    Args:
+        check: The check.
+    """
+    return f"{without_zeros(format_number(check.horizon))} s"
+
+
 def _handles(check: Check) -> list[Patch | Line2D]:
     """Return the entries of the legend."""
     colour = colour_of_source(check)
     handles: list[Patch | Line2D] = [
-        Patch(color=colour, label=f"predicted σ, {check.source} ({check.horizon:g} s)"),
+        Patch(color=colour, label=f"predicted σ, {check.source} ({duration(check)})"),
         Line2D(
             [], [], color=TEXT_COLOUR, marker="|", linestyle="", markersize=10, label="wanted σ"
         ),
@@ -170,15 +195,17 @@ def _draw_standard_deviations(axes: Axes, check: Check) -> None:
             continue
         opacity = 1.0 if place < len(rows) else COMBINATION_OPACITY
         axes.barh(place, value, height=BAR_HEIGHT, color=colour, alpha=opacity)
-    axes.plot(
-        wanted,
-        np.arange(len(rows)),
-        linestyle="",
-        marker="|",
-        color=TEXT_COLOUR,
-        markersize=10,
-        markeredgewidth=1.6,
-    )
+    # A light mark below the dark one can be seen on a bar.
+    for mark_colour, width in (("white", 3.2), (TEXT_COLOUR, 1.6)):
+        axes.plot(
+            wanted,
+            np.arange(len(rows)),
+            linestyle="",
+            marker="|",
+            color=mark_colour,
+            markersize=10,
+            markeredgewidth=width,
+        )
 
     few = len(relative_std) <= MAX_USUAL_FONT
     if few:

@@ -26,11 +26,15 @@ from mjfim.output.plots.style import (
     format_percent,
     new_figure,
     own_style,
+    set_plain_log_ticks,
     shorten,
     write_message,
 )
 from mjfim.output.summaries.comparison import budget_in_words
 from mjfim.records.comparison import DESIGN, Comparison, MethodResult
+
+# Title of a comparison without a verdict.
+DEFAULT_TITLE = "The design compared with other methods"
 
 # Largest number of parameters for which ratios are written into the cells.
 MAX_WRITTEN_CELLS = 12
@@ -75,13 +79,22 @@ def compare_figure(comparison: Comparison) -> Figure:
     _draw_cells(left, comparison)
     _draw_worst_combination(right, comparison)
 
+    verdict = comparison.verdict or (DEFAULT_TITLE,)
     note = (
-        f"{' '.join(comparison.verdict)} Each method had {budget_in_words(comparison)}. "
-        "Predicted standard deviations are the best case. Sorted by J, best first. In grey: the "
-        "smallest margin of all limits, as a share of half of the limit's range, and its kind; "
-        "negative: the limit is violated."
+        f"{' '.join(verdict[1:])} Each method had {budget_in_words(comparison)}. "
+        "Predicted standard deviations are the best case. Sorted by the cost J, best first. "
     )
-    add_title(figure, "The design compared with other methods", _handles(comparison), note)
+    if any(row.tightest[0] for row in comparison.rows):
+        note += (
+            "In grey: the smallest margin of all limits, as a share of half of the limit's range, "
+            "and its kind; negative: the limit is violated."
+        )
+    else:
+        note += (
+            "In grey: J, which also weighs the effort of the control: without limits, more effort "
+            "buys a smaller σ."
+        )
+    add_title(figure, verdict[0].removesuffix("."), _handles(comparison), note.strip())
     return figure
 
 
@@ -270,7 +283,7 @@ def _draw_worst_combination(axes: Axes, comparison: Comparison) -> None:
     worst = np.array([row.worst_relative_std for row in rows])
     known = worst[np.isfinite(worst)]
 
-    format_axes(axes, "σ over the scales [–]")
+    format_axes(axes, "σ / scale [–]")
     axes.grid(False, axis="y")
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_yticks([])
@@ -280,7 +293,8 @@ def _draw_worst_combination(axes: Axes, comparison: Comparison) -> None:
         write_message(axes, "no method found a usable control")
         return
 
-    low, high = _bar_range(axes, known)
+    has_margins = any(row.tightest[0] for row in rows)
+    low, high = _bar_range(axes, known, has_margins=has_margins)
     axes.tick_params(which="both", labelsize=SMALL_FONT, color=MUTED_COLOUR, labelcolor=TEXT_COLOUR)
     for place, row in enumerate(rows):
         if np.isfinite(row.worst_relative_std):
@@ -296,7 +310,7 @@ def _draw_worst_combination(axes: Axes, comparison: Comparison) -> None:
             )
 
 
-def _bar_range(axes: Axes, known: Array) -> tuple[float, float]:
+def _bar_range(axes: Axes, known: Array, *, has_margins: bool) -> tuple[float, float]:
     """Set the axis of the bars for standard deviations `known` (n,), with room for text.
 
     Returns:
@@ -306,7 +320,8 @@ def _bar_range(axes: Axes, known: Array) -> tuple[float, float]:
     if high > LOGARITHMIC_RATIO * known.min():
         low = 0.5 * float(known.min())
         axes.set_xscale("log")
-        axes.set_xlim(low, high * (high / low) ** 0.75)
+        axes.set_xlim(low, high * (high / low) ** (0.75 if has_margins else 0.45))
+        set_plain_log_ticks(axes.xaxis)
         return low, high
 
     axes.set_xlim(0.0, 1.7 * high)
@@ -329,12 +344,13 @@ def _draw_bar(axes: Axes, place: int, row: MethodResult, left: float, colour: st
         color=TEXT_COLOUR,
     )
     kind, margin = row.tightest
-    if not kind or not np.isfinite(margin):
-        return
+    words = f"J {format_number(row.cost)}"
+    if kind and np.isfinite(margin):
+        words = f"{format_percent(margin)} {kind.replace('_', ' ')}"
 
-    # The margin stands behind the value, wherever that ends.
+    # The margin, or the cost, stands behind the value, wherever that ends.
     axes.annotate(
-        f"  {format_percent(margin)} {kind.replace('_', ' ')}",
+        f"  {words}",
         (1.0, 0.5),
         xycoords=value,
         va="center",

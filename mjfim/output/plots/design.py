@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,9 @@ from mjfim.output.plots.style import (
     panel_width,
     quotient_unit,
     scale_axis,
+    set_plain_log_ticks,
     shorten,
+    text_width,
     trajectory_handles,
     write_message,
 )
@@ -56,8 +59,8 @@ MAX_PHASE_PLOTS, PHASE_COLUMNS = 6, 3
 # Largest number of intervals between the ticks of a phase plot, which has one tick more at most.
 MAX_PHASE_TICKS = 3
 
-# Characters to which the names of coordinates and parameters are shortened in the phase plots.
-PHASE_NAME_WIDTH = 16
+# Width that the label of an axis of a phase plot may have [inch].
+PHASE_LABEL_WIDTH = 2.2
 
 # Share of the largest sensitivity below which a sensitivity is a rounding error.
 NEGLIGIBLE_SENSITIVITY = 1e-6
@@ -65,6 +68,9 @@ NEGLIGIBLE_SENSITIVITY = 1e-6
 # Ratio of the designed to the initial loop of sensitivities above which the initial one is drawn
 # enlarged.
 ENLARGING_RATIO = 4.0
+
+# Space at both ends of the axis of the iterations, over the number of iterations.
+X_MARGIN = 0.04
 
 # Height that a panel gains for the enlarged loop, as a share of the height without it.
 ENLARGED_LOOP_HEIGHT = 0.62
@@ -116,7 +122,7 @@ def trajectories(design: Design, labels: Labels) -> Figure:
         controls=trajectory.ctrl.shape[1],
     )
     groups = [group for group in _groups(design, labels) if group.labels]
-    columns = min(PANEL_COLUMNS, max(len(group.labels) for group in groups))
+    columns = _panel_columns([len(group.labels) for group in groups])
     rows = sum(group.rows(columns) for group in groups) + 1
     figure = new_figure(1.15 * rows + 1.7)
     grid = figure.add_gridspec(rows, columns, height_ratios=[1.0] * (rows - 1) + [1.6])
@@ -126,7 +132,7 @@ def trajectories(design: Design, labels: Labels) -> Figure:
         for k in range(len(group.labels)):
             down, column = divmod(k, columns)
             axes = figure.add_subplot(grid[row + down, column])
-            _draw_panel(axes, design, group, k)
+            _draw_panel(axes, design, group, k, columns)
             format_axes(axes, ylabel=group.name if column == 0 else "")
             axes.yaxis.label.set_fontweight("bold")
         row += group.rows(columns)
@@ -167,8 +173,23 @@ def _groups(design: Design, labels: Labels) -> list[_Group]:
     ]
 
 
-def _draw_panel(axes: Axes, design: Design, group: _Group, k: int) -> None:
-    """Draw column k of a group along both trajectories."""
+def _panel_columns(counts: Sequence[int]) -> int:
+    """Return the number of panels side by side that leaves the fewest places empty.
+
+    Args:
+        counts: Number of panels of each group; every group begins in a row of its own.
+    """
+    widest = min(PANEL_COLUMNS, max(counts))
+    narrowest = min(PANEL_COLUMNS - 1, widest)
+    empty = {
+        columns: sum(-count % columns for count in counts)
+        for columns in range(widest, narrowest - 1, -1)
+    }
+    return min(empty, key=lambda columns: (empty[columns], -columns))
+
+
+def _draw_panel(axes: Axes, design: Design, group: _Group, k: int, columns: int) -> None:
+    """Draw quantity k of a group along both trajectories, as one of several panels in a row."""
     times = design.initial.trajectory.t, design.final.trajectory.t
     both = group.initial, group.designed
     colours = (INITIAL_COLOUR, DESIGNED_COLOUR)
@@ -178,7 +199,7 @@ def _draw_panel(axes: Axes, design: Design, group: _Group, k: int) -> None:
         else:
             axes.plot(t, values[:, k], color=colour, linewidth=width)
 
-    label = fit_label(group.labels[k], panel_width(PANEL_COLUMNS), SMALL_FONT)
+    label = fit_label(group.labels[k], panel_width(columns), SMALL_FONT)
     axes.set_title(label, loc="left", fontsize=SMALL_FONT, pad=3)
     axes.locator_params(axis="x", nbins=MAX_TIME_TICKS)
     axes.locator_params(axis="y", nbins=MAX_PANEL_TICKS)
@@ -369,12 +390,19 @@ def _enlarge_initial_loop(axes: Axes, curves: tuple[Array, Array]) -> None:
     )
 
 
+def _fitting_names(name: str, parameter: str) -> tuple[str, str]:
+    """Shorten the names of a coordinate and a parameter until their derivative fits."""
+    width = max(len(name), len(parameter))
+    while text_width(f"∂{shorten(name, width)}′/∂{shorten(parameter, width)}") > PHASE_LABEL_WIDTH:
+        width -= 1
+    return shorten(name, width), shorten(parameter, width)
+
+
 def _label_phase_axes(axes: Axes, labels: Labels, loop: _Loop, curves: tuple[Array, Array]) -> None:
     """Label the axes with the derivatives of position and velocity; units have a power of ten."""
     name, unit = split_unit(labels.positions[loop.dof])
     divisor = labels.parameter_units[loop.parameter]
-    parameter = shorten(labels.parameters[loop.parameter], PHASE_NAME_WIDTH)
-    name = shorten(name, PHASE_NAME_WIDTH)
+    name, parameter = _fitting_names(name, labels.parameters[loop.parameter])
     units = quotient_unit(unit, divisor), quotient_unit(per_second(unit), divisor)
 
     texts = []
@@ -417,8 +445,13 @@ def convergence(design: Design) -> Figure:
     if has_slope:
         _draw_history(panels[1], iterations, slope, relative_slope)
     _draw_history(panels[-1], iterations, eigenvalue)
-    _mark_rates(panels, design, iterations)
+    if len(iterations) > 1:
+        for axes in panels:
+            margin = X_MARGIN * float(np.ptp(iterations))
+            axes.set_xlim(iterations.min() - margin, iterations.max() + margin)
+    changes = _mark_rates(panels, design, iterations)
     _mark_barrier_stages(panels, design, iterations)
+    searched = has_slope and _mark_random_search(panels, iterations, slope)
 
     names = ["cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]"]
     if not has_slope:
@@ -426,6 +459,8 @@ def convergence(design: Design) -> Figure:
     for axes, name in zip(panels, names, strict=True):
         format_axes(axes, "iteration [–]", name)
         axes.xaxis.get_major_locator().set_params(integer=True)
+        if axes.get_yscale() == "log":
+            set_plain_log_ticks(axes.yaxis)
 
     handles = [
         Line2D(
@@ -446,6 +481,10 @@ def convergence(design: Design) -> Figure:
             " Dashed lines: a new barrier stage begins; with limits, the slope is that of log J "
             "plus the barrier."
         )
+    if changes:
+        note += f" Thick line: the time grid becomes finer, {', then '.join(changes)}."
+    if searched:
+        note += " Shaded: a random search went on, which has no slope."
     add_title(figure, "Convergence", handles, note)
     return figure
 
@@ -483,29 +522,38 @@ def _draw_history(
         positive = np.where(relative > 0.0, relative, np.nan)
         axes.plot(iterations, positive, color=MUTED_COLOUR, linewidth=1.0, linestyle=":")
 
+    # Dots mark the ends of the search, where they have a value.
     usable = np.flatnonzero(np.isfinite(shown))
     first, last = usable[0], usable[-1]
-    axes.plot(iterations[first], shown[first], "o", color=INITIAL_COLOUR, markersize=6)
-    axes.plot(iterations[last], shown[last], "o", color=DESIGNED_COLOUR, markersize=6)
+    if first == 0:
+        axes.plot(iterations[0], shown[0], "o", color=INITIAL_COLOUR, markersize=6)
+    if last == len(shown) - 1:
+        axes.plot(iterations[last], shown[last], "o", color=DESIGNED_COLOUR, markersize=6)
     text = f"{format_number(float(shown[first]))} → {format_number(float(shown[last]))}"
     axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=4)
 
 
-def _mark_rates(panels: NDArray[np.object_], design: Design, iterations: Array) -> None:
-    """Mark the iterations at which the time grid becomes finer, with both rates [Hz]."""
+def _mark_rates(panels: NDArray[np.object_], design: Design, iterations: Array) -> list[str]:
+    """Mark the iterations at which the time grid becomes finer; return the rates in words."""
     rates = np.array([row.rate for row in design.history])
+    changes = []
     for k in np.flatnonzero(np.diff(rates)):
         for axes in panels:
             axes.axvline(iterations[k + 1], color=GRID_COLOUR, linewidth=2.0, zorder=0)
-        panels[0].annotate(
-            f" {rates[k]:g} Hz | {rates[k + 1]:g} Hz",
-            (iterations[k + 1], 0.97),
-            xycoords=("data", "axes fraction"),
-            ha="center",
-            va="top",
-            fontsize=SMALL_FONT,
-            color=MUTED_COLOUR,
-        )
+        changes.append(f"from {rates[k]:g} to {rates[k + 1]:g} Hz")
+    return changes
+
+
+def _mark_random_search(panels: NDArray[np.object_], iterations: Array, slope: Array) -> bool:
+    """Shade the last iterations if they have no slope; return whether there are some."""
+    known = np.flatnonzero(np.isfinite(slope))
+    if not known.size or known[-1] == len(slope) - 1:
+        return False
+
+    for axes in panels:
+        begin = 0.5 * float(iterations[known[-1]] + iterations[known[-1] + 1])
+        axes.axvspan(begin, axes.get_xlim()[1], color=GRID_COLOUR, alpha=0.5, linewidth=0.0)
+    return True
 
 
 def _mark_barrier_stages(panels: NDArray[np.object_], design: Design, iterations: Array) -> None:

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from mjfim.excitation.constraints import SUBSTEP_KINDS
 from mjfim.model.coordinates import split_unit
-from mjfim.model.units import LENGTH, per_second
+from mjfim.model.units import FORCE_UNITS, LENGTH, per_second
 from mjfim.output.limit_curves import (
     closest_to_bounds,
     envelope,
@@ -39,6 +39,13 @@ from mjfim.records.labels import Labels
 # Kinds of limits in the order of their panels.
 LIMIT_KINDS = (*SUBSTEP_KINDS, "control", "control_rate", "clearance")
 
+# Unit of the force of an actuator or joint, by the unit of its control or of its position.
+FORCE_OF_CONTROL = {
+    coordinate: force
+    for unit, force in FORCE_UNITS.items()
+    for coordinate in (unit, per_second(unit), force)
+}
+
 # Largest number of panels that are as wide as the figure.
 MAX_WIDE_PANELS = 3
 
@@ -65,6 +72,23 @@ NAMED_CURVES = 3
 CURVE_NAME_WIDTH, LEGEND_NAME_WIDTH = 18, 24
 
 
+# Height of a panel, of the titles above it, and of a row [inch].
+PANEL_HEIGHT, TITLES_HEIGHT, ROW_HEIGHT = 2.0, 0.65, 0.27
+
+# Height of a share of 100 %, over the height of a row.
+FULL_ROW = 0.86
+
+# Number of envelopes, and share of a panel that they cover together [% of the limits], above which
+# each curve has a row of its own, and largest number of rows.
+MAX_ENVELOPES, MAX_COVERED, MAX_ROWS = 2, 60.0, 12
+
+# Characters to which the names of rows are shortened.
+ROW_NAME_WIDTH = 22
+
+# Space at both ends of the axis of time, over its length.
+X_MARGIN = 0.02
+
+
 @own_style
 def limits(design: Design, labels: Labels) -> Figure:
     """Draw a panel per kind of limit; a joint has the same colour in all of them.
@@ -73,29 +97,31 @@ def limits(design: Design, labels: Labels) -> Figure:
         design: A design with limits.
         labels: Labels of the model's columns, which have the units.
     """
-    kinds = [kind for kind in LIMIT_KINDS if any(usage.kind == kind for usage in design.usage)]
-    columns = 2 if len(kinds) > MAX_WIDE_PANELS else 1
-    rows = -(-len(kinds) // columns)
+    by_kind = {
+        kind: curves
+        for kind in LIMIT_KINDS
+        if (curves := [usage for usage in design.usage if usage.kind == kind])
+    }
+    columns = 2 if len(by_kind) > MAX_WIDE_PANELS else 1
     colours = joint_colours(design)
 
-    figure = new_figure(2.0 * rows + 1.3)
-    grid = figure.add_gridspec(rows, columns)
-    has_envelope = False
-    for i, kind in enumerate(kinds):
+    heights = [_panel_height(curves) for curves in by_kind.values()]
+    row_heights = [max(heights[i : i + columns]) for i in range(0, len(heights), columns)]
+    figure = new_figure(sum(row_heights) + 1.3)
+    grid = figure.add_gridspec(len(row_heights), columns, height_ratios=row_heights)
+    end = max(float(usage.t[-1]) for usage in design.usage)
+    for i, (kind, curves) in enumerate(by_kind.items()):
         axes = figure.add_subplot(grid[divmod(i, columns)])
-        curves = [usage for usage in design.usage if usage.kind == kind]
-        _draw_curves(axes, curves, colours)
-        _draw_bounds(axes, curves, one_sided=kind == "clearance")
+        if needs_rows(curves):
+            _draw_rows(axes, curves, colours)
+        else:
+            _draw_curves(axes, curves, colours)
+            _draw_bounds(axes, curves, one_sided=kind == "clearance")
         _label(axes, curves, _margin_in_words(design, kind, labels), panel_width(columns))
-        axes.set_xlabel("time [s]" if i + columns >= len(kinds) else "")
-        has_envelope |= any(would_be_solid(usage) for usage in curves)
+        axes.set_xlim(-X_MARGIN * end, (1.0 + X_MARGIN) * end)
+        axes.set_xlabel("time [s]" if i + columns >= len(by_kind) else "")
 
-    note = (
-        "All engine steps of the stated model. ±100 %: at the upper and at the lower bound; grey: "
-        "beyond a bound. Of a clearance: required over actual distance."
-    )
-    if has_envelope:
-        note += " Filled: smallest and largest value of a curve that changes too fast to be seen."
+    note = _note(by_kind)
     end_limits = [
         f"{_words(kind)} {_kept(margin)}"
         for kind, margin in design.limits.items()
@@ -109,6 +135,33 @@ def limits(design: Design, labels: Labels) -> Figure:
     ]
     add_title(figure, "How much of each limit the design uses", handles, note)
     return figure
+
+
+def _panel_height(curves: list[LimitUsage]) -> float:
+    """Return the height of the panel of one kind of limit, with its title [inch]."""
+    if not needs_rows(curves):
+        return PANEL_HEIGHT
+    return max(PANEL_HEIGHT, TITLES_HEIGHT + ROW_HEIGHT * len(_row_curves(curves)))
+
+
+def _note(by_kind: dict[str, list[LimitUsage]]) -> str:
+    """Explain what is drawn of the limits of each kind."""
+    note = (
+        "All engine steps of the stated model. ±100 %: at the upper and at the lower bound; grey: "
+        "beyond a bound."
+    )
+    if "clearance" in by_kind:
+        note += " Of a clearance: required over actual distance."
+    in_rows = [needs_rows(curves) for curves in by_kind.values()]
+    fast = [any(map(would_be_solid, curves)) for curves in by_kind.values()]
+    if any(is_fast and not rows for is_fast, rows in zip(fast, in_rows, strict=True)):
+        note += " Filled: smallest and largest value of a curve that changes too fast to be seen."
+    if any(in_rows):
+        note += (
+            " In rows: the largest share of each interval of time, whichever bound; the line at "
+            "the top of a row is the bound."
+        )
+    return note
 
 
 # ---- colours
@@ -151,6 +204,45 @@ def _draw_curves(axes: Axes, curves: list[LimitUsage], colours: dict[str, str]) 
             axes.plot(t, end, color=colour, linewidth=0.9 if strong else 0.4, zorder=order)
 
 
+def needs_rows(curves: list[LimitUsage]) -> bool:
+    """Return whether the envelopes of curves would cover each other, so that each needs a row.
+
+    Args:
+        curves: The limits of one kind.
+    """
+    widths = []
+    for usage in filter(would_be_solid, curves):
+        _, low, high = envelope(usage)
+        widths.append(float(np.mean(high - low)))
+    return len(widths) > MAX_ENVELOPES and sum(widths) > MAX_COVERED
+
+
+def _row_curves(curves: list[LimitUsage]) -> list[LimitUsage]:
+    """Return the curves that have rows: of many, those closest to a bound."""
+    closest = sorted(range(len(curves)), key=lambda i: -largest_share(curves[i]))[:MAX_ROWS]
+    return [curves[i] for i in sorted(closest)]
+
+
+def _draw_rows(axes: Axes, curves: list[LimitUsage], colours: dict[str, str]) -> None:
+    """Draw a row per curve, filled up to the largest share of each interval of time."""
+    shown = _row_curves(curves)
+    for row, usage in enumerate(shown):
+        t, low, high = envelope(usage)
+        size = np.maximum(np.abs(low), np.abs(high)) / 100.0
+        base = row + 0.5 * FULL_ROW
+        colour = colours.get(usage.name, MUTED_COLOUR)
+        top = base - FULL_ROW * size
+        axes.fill_between(t, base, top, color=colour, alpha=0.45, linewidth=0.0)
+        axes.plot(t, top, color=colour, linewidth=0.9)
+        axes.axhline(base - FULL_ROW, color=TEXT_COLOUR, linewidth=0.6)
+
+    names = [shorten(usage.name, ROW_NAME_WIDTH) for usage in shown]
+    axes.set_yticks(range(len(shown)), names)
+    axes.set_ylim(len(shown) - 0.5, -0.6)
+    axes.tick_params(axis="y", length=0.0)
+    axes.grid(False, axis="y")
+
+
 def _draw_bounds(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
     """Draw the bounds at 100 % and, unless there is only one, at -100 %; beyond them is grey."""
     largest = 100.0 * max(largest_share(usage) for usage in curves)
@@ -171,7 +263,8 @@ def _label(axes: Axes, curves: list[LimitUsage], margin: str, width: float) -> N
         f"{shorten(usage.name, CURVE_NAME_WIDTH)} {whole_percent(largest_share(usage))}"
         for usage in closest
     ]
-    format_axes(axes, ylabel="share of the limit [%]")
+    in_rows = needs_rows(curves)
+    format_axes(axes, ylabel="" if in_rows else "share of the limit [%]")
 
     # Names that do not fit above the panel are left out, the ones farthest from their bounds first.
     size = SMALL_FONT - 1.0
@@ -220,10 +313,11 @@ def _margin_in_words(design: Design, kind: str, labels: Labels) -> str:
 
 def _unit_of(usage: LimitUsage, labels: Labels) -> str:
     """Return the unit of a limited quantity; empty where the labels do not say it."""
-    if usage.kind == "clearance":
+    if usage.kind in ("clearance", "tendon_length"):
         return LENGTH
 
-    columns = labels.controls if usage.kind.startswith("control") else labels.positions
+    of_actuator = usage.kind in ("control", "control_rate", "force")
+    columns = labels.controls if of_actuator else labels.positions
     units = dict(split_unit(label) for label in columns)
     unit = units.get(usage.name, "")
     if not unit or unit == "model unit":
@@ -234,4 +328,6 @@ def _unit_of(usage: LimitUsage, labels: Labels) -> str:
         "acceleration": f"{unit}/s²",
         "control": unit,
         "control_rate": per_second(unit),
+        "force": FORCE_OF_CONTROL.get(unit, ""),
+        "joint_force": FORCE_OF_CONTROL.get(unit, ""),
     }.get(usage.kind, "")

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from mjfim.arrays import Array
-from mjfim.output.plots.check import colour_of_source
+from mjfim.output.plots.check import colour_of_source, duration
 from mjfim.output.plots.style import (
     IDENTIFIED_COLOUR,
     NOMINAL_COLOUR,
     SMALL_FONT,
     add_title,
+    fit_text,
     format_axes,
     format_number,
     new_figure,
@@ -42,8 +43,12 @@ ELLIPSES = ((2.0, 0.18), (1.0, 0.35))
 # Number of points of a curve.
 CURVE_POINTS = 90
 
-# Characters to which the names of parameters are shortened.
-NAME_WIDTH = 18
+# Characters to which the names of parameters are shortened above a panel, and width of them beside
+# an axis [inch].
+NAME_WIDTH, LABEL_WIDTH = 18, 1.05
+
+# Largest number of decimals of a value at an axis, and size up to which it has no power of ten.
+MAX_DECIMALS, LARGEST_PLAIN = 6, 1e5
 
 # Height of a row of panels, and of all that is above and below them [inch].
 ROW_HEIGHT, FRAME_HEIGHT = 1.15, 1.3
@@ -137,7 +142,7 @@ def check_pairs(check: Check) -> Figure:
         guess=None,
         colour=colour_of_source(check),
     )
-    title = f"Predicted joint uncertainty, {check.source} ({check.horizon:g} s)"
+    title = f"Predicted joint uncertainty, {check.source} ({duration(check)})"
     return _draw(estimates, title, BEST_CASE)
 
 
@@ -221,8 +226,8 @@ def _label_ticks(axes: Axes, shown: _Estimates, i: int, j: int) -> None:
     is_lowest, is_left = i == len(shown.names) - 1, j == 0 and i > 0
     format_axes(
         axes,
-        _unit(shown, j) if is_lowest else "",
-        _unit(shown, i) if is_left else "",
+        _label(shown, j) if is_lowest else "",
+        _label(shown, i) if is_left else "",
     )
     axes.xaxis.set_major_locator(FixedLocator([-TICK, TICK]))
     axes.tick_params(labelbottom=is_lowest, labelleft=is_left)
@@ -232,17 +237,22 @@ def _label_ticks(axes: Axes, shown: _Estimates, i: int, j: int) -> None:
         axes.yaxis.set_major_formatter(lambda y, _: _value(shown, i, y))
 
 
-def _unit(shown: _Estimates, i: int) -> str:
-    """Return the label of an axis: the unit of a parameter."""
-    return f"[{shown.units[i] or 'model unit'}]"
+def _label(shown: _Estimates, i: int) -> str:
+    """Return the label of an axis: name and unit of a parameter, a line each."""
+    name = fit_text(shown.names[i], LABEL_WIDTH, SMALL_FONT)
+    return f"{name}\n[{shown.units[i] or 'model unit'}]"
 
 
 def _value(shown: _Estimates, i: int, stds: float) -> str:
-    """Write the value of a parameter at a distance from its estimate, with digits that differ."""
-    value = float(shown.values[i] + stds * shown.std[i])
-    size = max(abs(value), float(shown.std[i]))
-    digits = int(np.clip(np.ceil(np.log10(size / float(shown.std[i]))) + 1.0, 2, 6))
-    return format_number(value, digits)
+    """Write the value of a parameter at a distance from its estimate, in steps of its σ."""
+    value, std = float(shown.values[i] + stds * shown.std[i]), float(shown.std[i])
+
+    # All values of a parameter have the same decimals, those that its σ can change.
+    decimals = int(np.ceil(-np.log10(std)))
+    largest = float(np.abs(shown.values[i])) + TICK * std
+    if 0 <= decimals <= MAX_DECIMALS and largest < LARGEST_PLAIN:
+        return f"{value:.{decimals}f}".replace("-", "−")
+    return format_number(value, int(np.clip(np.ceil(np.log10(largest / std)) + 1.0, 2, 6)))
 
 
 def _guesses_in_range(shown: _Estimates) -> bool:

@@ -26,8 +26,10 @@ from mjfim.output.plots.style import (
     format_with_uncertainty,
     new_figure,
     own_style,
+    set_plain_log_ticks,
     shorten,
     shorten_label,
+    without_zeros,
 )
 from mjfim.output.summaries.accuracy import BEST_CASE, improvement, relative, size_sentence
 from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
@@ -45,8 +47,9 @@ MAX_HIGH_ROWS = 12
 # a row.
 BAR_HEIGHT, BAR_OFFSET = 0.36, 0.19
 
-# Median half widths beyond which an interval is cut off, so that the others stay visible.
-MAX_RELATIVE_WIDTH = 5.0
+# Distances from the guess beyond which an interval, and an estimate, are cut off so that the others
+# stay visible, over the median distance of the ends of the intervals.
+MAX_RELATIVE_WIDTH, MAX_RELATIVE_DISTANCE = 5.0, 20.0
 
 
 # ---- predicted standard deviations
@@ -96,7 +99,8 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     _draw_bars(axes, accuracies.std_initial, -BAR_OFFSET, INITIAL_COLOUR)
     _draw_bars(axes, accuracies.std_final, BAR_OFFSET, DESIGNED_COLOUR)
 
-    format_axes(axes, "predicted standard deviation [unit of the parameter]")
+    set_plain_log_ticks(axes.xaxis)
+    format_axes(axes, "predicted σ [unit of the parameter]")
     axes.grid(False, axis="y")
     axes.set_yticks(range(count), accuracies.names)
     _write_columns(axes, accuracies)
@@ -197,8 +201,8 @@ def _write_columns(axes: Axes, accuracies: _Accuracies) -> None:
 
     # Right edge of each column [points], behind the right end of the axis.
     _write_column(axes, 62.0, "relative σ", initial_texts, INITIAL_COLOUR)
-    _write_column(axes, 122.0, "relative σ", final_texts, DESIGNED_COLOUR)
-    _write_column(axes, 178.0, "change", changes, TEXT_COLOUR)
+    _write_column(axes, 126.0, "relative σ", final_texts, DESIGNED_COLOUR)
+    _write_column(axes, 182.0, "change", changes, TEXT_COLOUR)
 
 
 def _write_column(axes: Axes, right: float, heading: str, texts: list[str], colour: str) -> None:
@@ -290,7 +294,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     format_axes(axes, f"difference from the {NOMINAL.word} value [%]")
     axes.set_yticks(range(count), [shorten_label(labels.parameter(j)) for j in range(count)])
     note = _interval_note(estimate, guess_of_zero=bool(np.isnan(difference.centre).any()))
-    add_title(figure, "Estimated parameters", _interval_handles(), note)
+    add_title(figure, "Estimated parameters", _interval_handles(estimate), note)
     return figure
 
 
@@ -312,16 +316,17 @@ def _interval_limits(difference: _RelativeEstimate) -> tuple[float, float]:
     centre = difference.centre[known]
     reach = np.abs(difference.interval - difference.centre[:, None])[known]
 
-    # Few intervals that are much wider than the others are cut off.
-    finite = reach[np.isfinite(reach)]
-    largest_reach = 1.0
-    if finite.size:
-        largest_reach = MAX_RELATIVE_WIDTH * float(np.median(finite))
-        largest_reach += float(np.abs(centre).max())
-    shown = np.minimum(reach, largest_reach)
+    # Few intervals that reach much farther from the guess than the others are cut off.
+    ends = np.stack([centre - reach[:, 0], centre + reach[:, 1]])
+    distance = np.abs(ends).max(axis=0)
+    finite = distance[np.isfinite(distance)]
+    usual = float(np.median(finite)) if finite.size else 1.0
+    near = centre[np.abs(centre) <= MAX_RELATIVE_DISTANCE * usual]
+    largest = max(MAX_RELATIVE_WIDTH * usual, float(np.abs(near).max(initial=0.0)))
+    ends = np.clip(ends, -largest, largest)
 
-    low = min(0.0, float(np.min(centre - shown[:, 0], initial=0.0)))
-    high = max(0.0, float(np.max(centre + shown[:, 1], initial=0.0)))
+    low = float(np.min(ends, initial=0.0))
+    high = float(np.max(ends, initial=0.0))
     margin = 0.08 * max(high - low, 1e-6)
     return low - margin, high + margin
 
@@ -335,13 +340,13 @@ def _draw_interval(axes: Axes, difference: _RelativeEstimate, j: int, *, at_boun
     centre = float(difference.centre[j])
     half = float(difference.formal_half_width[j])
     if np.isfinite(half):
-        formal = (max(centre - half, low), min(centre + half, high))
+        formal = np.clip((centre - half, centre + half), low, high)
         axes.plot(
             formal, (j, j), color=IDENTIFIED_COLOUR, linewidth=5.0, solid_capstyle="butt", alpha=0.3
         )
 
     left, right = (float(end) for end in difference.interval[j])
-    shown_left, shown_right = max(left, low), min(right, high)
+    shown_left, shown_right = np.clip((left, right), low, high).tolist()
     axes.plot(
         (shown_left, shown_right),
         (j, j),
@@ -375,7 +380,7 @@ def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
         low, high = estimate.interval[j]
         half_width = 0.5 * float(high - low)
 
-    guess = format_number(float(estimate.initial_theta[j]), 4)
+    guess = without_zeros(format_number(float(estimate.initial_theta[j]), 4))
     value = format_with_uncertainty(float(estimate.theta[j]), half_width)
     text = f"{guess} → {value} {unit}".rstrip()
     if estimate.parameters[j] in estimate.at_bound:
@@ -383,26 +388,28 @@ def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
     return text
 
 
-def _interval_handles() -> list[Line2D]:
+def _interval_handles(estimate: Estimate) -> list[Line2D]:
     """Return the entries of the legend."""
-    at_bound = Line2D(
-        [],
-        [],
-        color=IDENTIFIED_COLOUR,
-        marker="s",
-        markerfacecolor="white",
-        linestyle="",
-        label="at its bound",
-    )
     colour = IDENTIFIED_COLOUR
-    return [
+    handles = [
         Line2D([], [], color=NOMINAL_COLOUR, label=NOMINAL.word, linewidth=1.6),
         Line2D(
             [], [], color=colour, marker="o", alpha=0.9, label=f"{IDENTIFIED.word}, 95 % interval"
         ),
         Line2D([], [], color=colour, linewidth=5.0, alpha=0.3, label="formal 95 %"),
-        at_bound,
     ]
+    if estimate.at_bound:
+        at_bound = Line2D(
+            [],
+            [],
+            color=colour,
+            marker="s",
+            markerfacecolor="white",
+            linestyle="",
+            label="at its bound",
+        )
+        handles.append(at_bound)
+    return handles
 
 
 def _interval_note(estimate: Estimate, *, guess_of_zero: bool) -> str:
@@ -419,5 +426,5 @@ def _interval_note(estimate: Estimate, *, guess_of_zero: bool) -> str:
     if not np.array_equal(np.abs(estimate.theta), estimate.sizes):
         note += " The difference of an entry of a vector or tensor is a share of the whole."
     if guess_of_zero:
-        note += " For a guess of 0 there is no relative difference: see the text."
+        note += " For a guess of 0 there is no relative difference: its row has numbers only."
     return note

@@ -48,6 +48,9 @@ MAX_BOUNDARY_LINES = 40
 # Space above and below the curves, as a share of the range of what was measured and identified.
 MARGIN = 0.08
 
+# Space that a panel gains for a nominal model beyond this range, as a share of the range.
+NOMINAL_ROOM = 0.6
+
 # Characters to which the names of outputs and of recordings are shortened.
 OUTPUT_NAME_WIDTH, RECORDING_NAME_WIDTH = 40, 60
 
@@ -160,7 +163,7 @@ def _draw(curves: _Curves, labels: Labels, title: str, note: str) -> Figure:
         _draw_outputs(left, curves, int(column))
         _draw_errors(right, curves, int(column))
         format_axes(left)
-        format_axes(right, ylabel=f"[{split_unit(label)[1] or 'model unit'}]")
+        format_axes(right, ylabel=f"[{split_unit(label)[1] or '–'}]")
         left.set_title(
             shorten_label(label, OUTPUT_NAME_WIDTH), loc="left", fontsize=SMALL_FONT, pad=3
         )
@@ -257,12 +260,16 @@ def _draw_outputs(axes: Axes, curves: _Curves, column: int) -> None:
     # A nominal model that is far away does not make the other curves flat.
     values = np.concatenate([y, identified])
     finite = values[np.isfinite(values)]
+    low, high = finite.min(initial=np.inf), finite.max(initial=-np.inf)
     if curves.nominal is not None:
         nominal = curves.nominal[rows, column]
         axes.plot(t, nominal, color=NOMINAL_COLOUR, linewidth=0.8, zorder=1.5)
-    if finite.size and np.ptp(finite) > 0.0:
-        margin = MARGIN * float(np.ptp(finite))
-        axes.set_ylim(float(finite.min()) - margin, float(finite.max()) + margin)
+        room = NOMINAL_ROOM * (high - low)
+        low = max(min(low, np.nanmin(nominal, initial=np.inf)), low - room)
+        high = min(max(high, np.nanmax(nominal, initial=-np.inf)), high + room)
+    if high > low:
+        margin = MARGIN * float(high - low)
+        axes.set_ylim(float(low) - margin, float(high) + margin)
     _mark_segments(axes, curves.boundaries)
 
 

@@ -82,6 +82,8 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
     columns = shown_outputs(np.concatenate(residuals), sigma, MAX_OUTPUTS)
 
     across = min(PANEL_COLUMNS, len(columns))
+    if len(columns) == PANEL_COLUMNS + 1:
+        across = 2
     rows = -(-len(columns) // across)
     figure = new_figure(1.75 * rows + 1.4)
     grid = figure.add_gridspec(rows, across)
@@ -95,7 +97,7 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
             "density / white noise [–]" if k % across == 0 else "",
         )
         _draw_spectrum(axes, estimate, int(column), float(sigma[column]))
-        short = fit_text(name, panel_width(PANEL_COLUMNS), SMALL_FONT)
+        short = fit_text(name, panel_width(across), SMALL_FONT)
         axes.set_title(short, loc="left", fontsize=SMALL_FONT, pad=14)
 
     handles: list[Line2D | Patch] = [
@@ -264,14 +266,19 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
         note += " *: also part of the last fit; predicted here by a fit to the other recordings."
     if len(shown) < len(found) or len(measured) > MAX_OUTPUTS:
         note += (
-            f" Shown: {len(shown)} of {len(found)} recordings, "
-            f"{min(len(measured), MAX_OUTPUTS)} of {len(measured)} outputs."
+            f" Shown: {_share_in_words(len(shown), len(found), 'recordings')} and "
+            f"{_share_in_words(min(len(measured), MAX_OUTPUTS), len(measured), 'outputs')}."
         )
     title = "Predictions of recordings that were not fitted"
     if len(shown) == 1:
         title = f"Prediction of {_recording_name(shown[0])}, which was not fitted"
     add_title(figure, title, handles, note)
     return figure
+
+
+def _share_in_words(shown: int, count: int, things: str) -> str:
+    """Say how many things are shown, such as "8 of 12 outputs" and "all recordings"."""
+    return f"{shown} of {count} {things}" if shown < count else f"all {things}"
 
 
 def _error_rows(
@@ -291,7 +298,7 @@ def _error_rows(
     rows = [_ErrorRow(name=short, heading=True)] if several else []
     for prediction in shown:
         error = float(prediction.identified.rms[j])
-        words = f"{format_number(error)} {unit or 'model unit'}"
+        words = f"{format_number(error)} {unit}".rstrip()
         ratio = format_number(_error_ratio(prediction, j), 2)
         rows.append(
             _ErrorRow(

@@ -40,13 +40,16 @@ def robustness_figure(result: Robustness) -> Figure:
         result: The study.
     """
     figure = style.new_figure(max(6.6, 2.0 + 0.22 * len(result.limits)))
-    grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.3), height_ratios=(1.4, 0.8, 1.0))
-    axes = [figure.add_subplot(grid[0, 1])]
-    axes += [figure.add_subplot(grid[row, 1], sharex=axes[0]) for row in (1, 2)]
+    has_limits = bool(result.limits)
+    widths = (1.0, 1.3) if has_limits else (1.0,)
+    grid = figure.add_gridspec(3, len(widths), width_ratios=widths, height_ratios=(1.4, 0.8, 1.0))
+    axes = [figure.add_subplot(grid[0, -1])]
+    axes += [figure.add_subplot(grid[row, -1], sharex=axes[0]) for row in (1, 2)]
     for upper in axes[:2]:
         upper.tick_params(labelbottom=False)
 
-    _draw_limits(figure.add_subplot(grid[:, 0]), result)
+    if has_limits:
+        _draw_limits(figure.add_subplot(grid[:, 0]), result)
     _draw_errors(axes[0], result)
     _draw_coverage(axes[1], result)
     _draw_before_and_after(axes[2], result)
@@ -57,12 +60,15 @@ def robustness_figure(result: Robustness) -> Figure:
         f"{result.runs} robots, every parameter {100 * conditions.wrong:g} % off, commands "
         f"{1e3 * conditions.latency:g} ms late, {control}"
     )
+    place = "Left: dots are robots. Right, from above:" if has_limits else "From above:"
     note = (
-        "Left: dots are robots. Right, from above: errors over the formal σ (shaded: 95 % range); "
-        "robots whose 95 % interval holds the true value (dashed: required, shaded: expected); "
-        "errors in percent of the error of the guess."
+        f"{place} errors over the formal σ (shaded: 95 % range; red: outside); robots whose 95 % "
+        "interval holds the true value (dashed: required, shaded: expected); errors in percent of "
+        "the error of the guess."
     )
-    style.add_title(figure, title, _handles(), note)
+    if not has_limits:
+        note += " The experiment states no limits."
+    style.add_title(figure, title, _handles(has_limits=has_limits), note)
     return figure
 
 
@@ -97,7 +103,7 @@ def _draw_limits(axes: Axes, result: Robustness) -> None:
     axes.set_title(title, fontsize=style.NORMAL_FONT, loc="left", color=style.TEXT_COLOUR)
 
 
-def _handles() -> list[Line2D]:
+def _handles(*, has_limits: bool) -> list[Line2D]:
     """Return the entries of the legend."""
     keeping = Line2D(
         [],
@@ -130,7 +136,8 @@ def _handles() -> list[Line2D]:
         linestyle="",
         label="σ predicted by the design",
     )
-    return [planned, keeping, exceeding, guess, estimates, predicted]
+    of_limits = [planned, keeping, exceeding] if has_limits else []
+    return [*of_limits, guess, estimates, predicted]
 
 
 def _draw_errors(axes: Axes, result: Robustness) -> None:

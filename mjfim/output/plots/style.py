@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, NullLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
 from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
@@ -113,6 +113,10 @@ DATELESS: dict[str, dict[str, None]] = {"svg": {"Date": None}, "pdf": {"Creation
 
 # Digits of the tick values of a logarithmic axis, from few to many ticks per decade.
 TICK_DIGITS = ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8))
+
+# Ratio of the ends of a logarithmic axis below which its ticks are evenly spaced numbers, and the
+# largest number of intervals between them.
+NARROW_AXIS, NARROW_TICKS = 3.0, 6
 
 # Digits of a power of ten, raised.
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -203,6 +207,18 @@ def format_number(value: float, digits: int = 3) -> str:
 
     raised = str(power).translate(SUPERSCRIPTS)
     return f"{mantissa}×10{raised}".replace("-", "−")
+
+
+def without_zeros(text: str) -> str:
+    """Leave out zeros at the end of a decimal number: `0.05000` becomes `0.05`.
+
+    Args:
+        text: The number, as `format_number` writes it.
+    """
+    mantissa, times, power = text.partition("×")
+    if "." in mantissa:
+        mantissa = mantissa.rstrip("0").rstrip(".")
+    return mantissa + times + power
 
 
 def format_with_uncertainty(value: float, half_width: float) -> str:
@@ -387,9 +403,9 @@ def scale_axis(axis: Axis, largest: float) -> str:
         need none.
     """
     power = int(np.floor(np.log10(largest))) if np.isfinite(largest) and largest > 0.0 else 0
-    power = 3 * (power // 3) if power < 0 else power
     if -1 <= power < 4:
         return ""
+    power = 3 * (power // 3) if power < 0 else power
 
     scale = 10.0**power
     axis.set_major_formatter(lambda value, _: f"{value / scale:g}".replace("-", "−"))
@@ -409,7 +425,7 @@ def set_plain_log_ticks(axis: Axis) -> None:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return round numbers on a logarithmic axis: at least two, and at most about five.
+    """Return round numbers on a logarithmic axis: three to about five of them where it has some.
 
     Args:
         low: Lower end of the axis, positive.
@@ -417,12 +433,16 @@ def log_ticks(low: float, high: float) -> list[float]:
     """
     decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     decades = decades[:: max(len(decades) // 4, 1)]
+    if high < NARROW_AXIS * low:
+        candidates = MaxNLocator(NARROW_TICKS).tick_values(low, high)
+        return candidates[(candidates >= low) & (candidates <= high)].tolist()
+
     ticks: list[float] = []
     for digits in TICK_DIGITS:
         candidates = np.sort(np.outer(10.0**decades, digits).ravel())
         within = (candidates >= low) & (candidates <= high)
         ticks = candidates[within].tolist()
-        if len(ticks) >= 2:
+        if len(ticks) >= 3:
             break
     return ticks
 
@@ -433,7 +453,9 @@ def plain_number(value: float) -> str:
     Args:
         value: The number.
     """
-    return f"{value:g}" if 1e-4 < value < 1e5 else format_number(value, 1)
+    if 1e-4 < value < 1e5:
+        return f"{value:g}"
+    return format_number(value, 1).removeprefix("1×")
 
 
 def write_message(axes: Axes, sentence: str) -> None:
