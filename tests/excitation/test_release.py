@@ -16,7 +16,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import tangent_components
-from mjfim.output.plots.design import convergence, trajectories
+from mjfim.output.plots.convergence import convergence
+from mjfim.output.plots.design import trajectories
 from mjfim.records.design import Status
 from mjfim.studies.monte_carlo import monte_carlo_system
 from tests.support.cli import run

@@ -10,7 +10,8 @@ from __future__ import annotations
 from mjfim.output.plots.campaign import campaign_figure
 from mjfim.output.plots.check import check_figure
 from mjfim.output.plots.compare import compare_figure
-from mjfim.output.plots.design import convergence, sensitivity_phase, trajectories
+from mjfim.output.plots.convergence import convergence
+from mjfim.output.plots.design import sensitivity_phase, trajectories
 from mjfim.output.plots.limit_usage import limits
 from mjfim.output.plots.monte_carlo import histogram, study_overview
 from mjfim.output.plots.pairs import check_pairs, estimate_pairs

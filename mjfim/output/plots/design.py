@@ -1,4 +1,4 @@
-"""Figures of a design: trajectories, sensitivities of the motion, convergence."""
+"""Figures of a design: trajectories, sensitivities of the motion."""
 
 from __future__ import annotations
 
@@ -17,13 +17,10 @@ from mjfim.model.units import per_second
 from mjfim.output.plots.positions import shown_positions
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
-    GRID_COLOUR,
     INITIAL_COLOUR,
-    MUTED_COLOUR,
     SMALL_FONT,
     TEXT_COLOUR,
     add_title,
-    as_sentence,
     fit_label,
     format_axes,
     format_number,
@@ -32,7 +29,6 @@ from mjfim.output.plots.style import (
     panel_width,
     quotient_unit,
     scale_axis,
-    set_plain_log_ticks,
     shorten,
     text_width,
     trajectory_handles,
@@ -68,9 +64,6 @@ NEGLIGIBLE_SENSITIVITY = 1e-6
 # Ratio of the designed to the initial loop of sensitivities above which the initial one is drawn
 # enlarged.
 ENLARGING_RATIO = 4.0
-
-# Space at both ends of the axis of the iterations, over the number of iterations.
-X_MARGIN = 0.04
 
 # Height that a panel gains for the enlarged loop, as a share of the height without it.
 ENLARGED_LOOP_HEIGHT = 0.62
@@ -122,7 +115,7 @@ def trajectories(design: Design, labels: Labels) -> Figure:
         controls=trajectory.ctrl.shape[1],
     )
     groups = [group for group in _groups(design, labels) if group.labels]
-    columns = _panel_columns([len(group.labels) for group in groups])
+    columns = panel_columns([len(group.labels) for group in groups])
     rows = sum(group.rows(columns) for group in groups) + 1
     figure = new_figure(1.15 * rows + 1.7)
     grid = figure.add_gridspec(rows, columns, height_ratios=[1.0] * (rows - 1) + [1.6])
@@ -173,7 +166,7 @@ def _groups(design: Design, labels: Labels) -> list[_Group]:
     ]
 
 
-def _panel_columns(counts: Sequence[int]) -> int:
+def panel_columns(counts: Sequence[int]) -> int:
     """Return the number of panels side by side that leaves the fewest places empty.
 
     Args:
@@ -413,154 +406,3 @@ def _label_phase_axes(axes: Axes, labels: Labels, loop: _Loop, curves: tuple[Arr
         power = scale_axis(axis, largest)
         texts.append(f"∂{name}{mark}/∂{parameter}\n[{power}{quotient}]")
     format_axes(axes, *texts)
-
-
-# ---- convergence
-
-
-@own_style
-def convergence(design: Design) -> Figure:
-    """Draw cost, slope and smallest eigenvalue over the iterations, logarithmically.
-
-    Args:
-        design: The design.
-    """
-    history = design.history
-    iterations = np.array([row.iteration for row in history], dtype=np.float64)
-    cost = np.array([row.cost for row in history], dtype=np.float64)
-    slope = np.abs(np.array([row.slope for row in history], dtype=np.float64))
-    eigenvalue = np.array([row.min_eigenvalue for row in history], dtype=np.float64)
-
-    # With a barrier the slope is that of log J, which is relative already. The search for a release
-    # has no slope.
-    has_barrier = any(row.mu for row in history)
-    has_slope = not history or bool(np.isfinite(slope).any())
-    relative_slope = None
-    if has_slope and not has_barrier:
-        relative_slope = slope / np.where(cost == 0.0, np.nan, np.abs(cost))
-
-    figure = new_figure(3.3)
-    panels = figure.subplots(1, 3 if has_slope else 2)
-    _draw_history(panels[0], iterations, cost)
-    if has_slope:
-        _draw_history(panels[1], iterations, slope, relative_slope)
-    _draw_history(panels[-1], iterations, eigenvalue)
-    if len(iterations) > 1:
-        for axes in panels:
-            margin = X_MARGIN * float(np.ptp(iterations))
-            axes.set_xlim(iterations.min() - margin, iterations.max() + margin)
-    changes = _mark_rates(panels, design, iterations)
-    _mark_barrier_stages(panels, design, iterations)
-    searched = has_slope and _mark_random_search(panels, iterations, slope)
-
-    names = ["cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]"]
-    if not has_slope:
-        names.pop(1)
-    for axes, name in zip(panels, names, strict=True):
-        format_axes(axes, "iteration [–]", name)
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        if axes.get_yscale() == "log":
-            set_plain_log_ticks(axes.yaxis)
-
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=INITIAL_COLOUR,
-            marker="o",
-            linestyle="",
-            label=_start_label(design),
-        ),
-        Line2D([], [], color=DESIGNED_COLOUR, marker="o", linestyle="", label="designed"),
-    ]
-    if relative_slope is not None:
-        handles.append(Line2D([], [], color=MUTED_COLOUR, linestyle=":", label="slope / J"))
-    note = as_sentence(design.outcome)
-    if has_barrier:
-        note += (
-            " Dashed lines: a new barrier stage begins; with limits, the slope is that of log J "
-            "plus the barrier."
-        )
-    if changes:
-        note += f" Thick line: the time grid becomes finer, {', then '.join(changes)}."
-    if searched:
-        note += " Shaded: a random search went on, which has no slope."
-    add_title(figure, "Convergence", handles, note)
-    return figure
-
-
-def _start_label(design: Design) -> str:
-    """Return the name of the first iterate, which is not the initial trajectory in every search."""
-    costs = [row.cost for row in design.history[:1]]
-    if not costs or np.isclose(costs[0], design.initial.cost, rtol=1e-9, atol=0.0):
-        return "initial"
-    return f"start: {design.found_by}"
-
-
-def _draw_history(
-    axes: Axes, iterations: Array, values: Array, relative: Array | None = None
-) -> None:
-    """Draw one quantity over the iterations; dots mark its first and its last value.
-
-    Args:
-        axes: Axes of the panel; they become logarithmic unless no value is positive.
-        iterations: (n,) numbers of the iterations.
-        values: (n,) values; of a logarithmic axis, the positive ones are shown.
-        relative: (n,) values of a second, dotted curve.
-    """
-    if not np.isfinite(values).any():
-        write_message(axes, "no iterations recorded")
-        return
-
-    shown = np.where(values > 0.0, values, np.nan)
-    if np.isfinite(shown).any():
-        axes.set_yscale("log")
-    else:
-        shown = values
-    axes.plot(iterations, shown, color=MUTED_COLOUR, linewidth=1.3, marker=".", markersize=3)
-    if relative is not None:
-        positive = np.where(relative > 0.0, relative, np.nan)
-        axes.plot(iterations, positive, color=MUTED_COLOUR, linewidth=1.0, linestyle=":")
-
-    # Dots mark the ends of the search, where they have a value.
-    usable = np.flatnonzero(np.isfinite(shown))
-    first, last = usable[0], usable[-1]
-    if first == 0:
-        axes.plot(iterations[0], shown[0], "o", color=INITIAL_COLOUR, markersize=6)
-    if last == len(shown) - 1:
-        axes.plot(iterations[last], shown[last], "o", color=DESIGNED_COLOUR, markersize=6)
-    text = f"{format_number(float(shown[first]))} → {format_number(float(shown[last]))}"
-    axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=4)
-
-
-def _mark_rates(panels: NDArray[np.object_], design: Design, iterations: Array) -> list[str]:
-    """Mark the iterations at which the time grid becomes finer; return the rates in words."""
-    rates = np.array([row.rate for row in design.history])
-    changes = []
-    for k in np.flatnonzero(np.diff(rates)):
-        for axes in panels:
-            axes.axvline(iterations[k + 1], color=GRID_COLOUR, linewidth=2.0, zorder=0)
-        changes.append(f"from {rates[k]:g} to {rates[k + 1]:g} Hz")
-    return changes
-
-
-def _mark_random_search(panels: NDArray[np.object_], iterations: Array, slope: Array) -> bool:
-    """Shade the last iterations if they have no slope; return whether there are some."""
-    known = np.flatnonzero(np.isfinite(slope))
-    if not known.size or known[-1] == len(slope) - 1:
-        return False
-
-    for axes in panels:
-        begin = 0.5 * float(iterations[known[-1]] + iterations[known[-1] + 1])
-        axes.axvspan(begin, axes.get_xlim()[1], color=GRID_COLOUR, alpha=0.5, linewidth=0.0)
-    return True
-
-
-def _mark_barrier_stages(panels: NDArray[np.object_], design: Design, iterations: Array) -> None:
-    """Mark the iterations at which a new barrier stage begins."""
-    mu = np.array([row.mu for row in design.history])
-    for k in np.flatnonzero(mu[1:] != mu[:-1]):
-        for axes in panels:
-            axes.axvline(
-                iterations[k + 1], color=GRID_COLOUR, linewidth=1.0, linestyle="--", zorder=0
-            )

@@ -434,8 +434,8 @@ def log_ticks(low: float, high: float) -> list[float]:
     decades = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     decades = decades[:: max(len(decades) // 4, 1)]
     if high < NARROW_AXIS * low:
-        candidates = MaxNLocator(NARROW_TICKS).tick_values(low, high)
-        return candidates[(candidates >= low) & (candidates <= high)].tolist()
+        even = np.asarray(MaxNLocator(NARROW_TICKS, steps=[1, 2, 5, 10]).tick_values(low, high))
+        return [float(tick) for tick in even if low <= tick <= high]
 
     ticks: list[float] = []
     for digits in TICK_DIGITS:
