@@ -380,7 +380,7 @@ def test_deviations_and_biases_by_name(tmp_path: Path) -> None:
         "delay",
     ]
     assert [p.prior for p in parameters.values()] == [None, None, None, None, 0.1, 0.3, 0.005]
-    assert [p.unit for p in parameters.values()][3:] == ["rad", "m/s", "", "s"]
+    assert [p.unit for p in parameters.values()][3:] == ["rad", "m/s", "m", "s"]
     assert parameters["delay"].scale == 0.01
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
@@ -95,7 +96,7 @@ def _relative_slope(design: Design, slope: Array) -> Array | None:
 def _format_panel(axes: Axes, name: str, iterations: Array) -> None:
     """Label a panel, and let it show all iterations."""
     format_axes(axes, "iteration [–]", name)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True))
     if axes.get_yscale() == "log":
         set_plain_log_ticks(axes.yaxis)
     if len(iterations) > 1:
