@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-
-from matplotlib.figure import Figure
 
 from mjfim.atomic_io import remove_earlier_result, replacing
 from mjfim.errors import ModelError, RecordingError
@@ -23,6 +21,7 @@ from mjfim.output.mjcf.write import write_identified
 from mjfim.output.optional_files import write_guarded, write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.pictures import (
+    DrawPicture,
     Pictures,
     fit_names,
     held_out_names,
@@ -416,7 +415,7 @@ def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureForm
         write_optional(file.name, partial(_write_picture, draw, file))
 
 
-def _write_picture(draw: Callable[[], Figure], file: Path) -> None:
+def _write_picture(draw: DrawPicture, file: Path) -> None:
     """Draw a picture and write it."""
     plots.save(draw(), file)
 

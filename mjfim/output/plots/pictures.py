@@ -24,8 +24,11 @@ from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robustness import Robustness
 from mjfim.records.shown import ShownRecord
 
+# A function that draws a figure.
+DrawPicture = Callable[[], Figure]
+
 # Functions that draw the figures of a record, by the name of the figure.
-Pictures = dict[str, Callable[[], Figure]]
+Pictures = dict[str, DrawPicture]
 
 
 def picture_names(record: ShownRecord) -> tuple[str, ...]:
