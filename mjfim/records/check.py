@@ -110,7 +110,10 @@ class Roughness:
     def __str__(self) -> str:
         cause = first_ones(self.causes) if self.causes else ""
         if not cause:
-            cause = "no contact, friction or limit acts there; the motion may be chaotic"
+            cause = (
+                "no contact, friction or limit acts there; the motion may be chaotic, or depend "
+                "too strongly on this parameter"
+            )
 
         # Two digits, and no power of ten for some hundred percent.
         size = "an unlimited amount"

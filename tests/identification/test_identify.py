@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from collections.abc import Callable
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,9 +25,11 @@ from mjfim.identification.identify import identify, identify_system, least_squar
 from mjfim.identification.residuals import FitProblem
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
+from mjfim.output.summaries.verdicts import verdict_of
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.campaign import identify_all
+from tests.support.numerics import make_task
 from tests.support.paths import ROOT
 
 
@@ -387,3 +391,31 @@ def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
     assert estimate.std[product] > abs(estimate.theta[product])
     assert estimate.sizes[product] > 10.0 * abs(estimate.theta[product])
     assert "rod.t2" not in estimate.sloppy
+
+
+def test_an_entry_of_a_vector_is_known_compared_with_the_whole_vector(tmp_path: Path) -> None:
+    """A coordinate near zero is not sloppy, because a share of it would say nothing."""
+    model = """<mujoco>
+      <option timestep="0.01"/>
+      <worldbody><body name="rod">
+        <joint name="hinge" axis="0 1 0" damping="0.1"/>
+        <inertial pos="0 0 -0.4" mass="1" diaginertia="1e-2 1e-2 1e-2"/>
+      </body></worldbody>
+      <actuator><motor name="motor" joint="hinge"/></actuator>
+    </mujoco>"""
+    task = make_task(
+        model,
+        tmp_path,
+        horizon=1.0,
+        parameters={"x": {"target": "body/rod:ipos[0]"}, "z": {"target": "body/rod:ipos[2]"}},
+        noise={"qpos:hinge": 1e-3},
+        fit={"bootstrap": 0},
+    )
+    estimate = identify_system(task.system, [simulate_system(task.system, task.initial, seed=1)])
+    half_width = 0.5 * np.ptp(estimate.interval, axis=1)
+    assert half_width[0] > 0.25 * abs(estimate.theta[0])
+    assert half_width[0] < 0.05 * estimate.sizes[0]
+    assert estimate.sizes[0] >= 0.4
+    assert not estimate.sloppy
+    assert not any("sloppy" in text for text in estimate.warnings)
+    assert re.search(r"every parameter is known to ± [\d.]+ % or better", verdict_of(estimate).text)
