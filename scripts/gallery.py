@@ -25,7 +25,7 @@ from typing import Literal
 
 from PIL import Image
 
-from scripts.rerun_screenshot import screenshot
+from scripts.rerun_screenshot import every_tab, screenshot
 from scripts.verbs import call_verb
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -50,6 +50,9 @@ SCHEMES: tuple[Literal["light", "dark"], ...] = ("light", "dark")
 
 # Moment of the simulated motion that Rerun shows [s].
 SHOWN_TIME = 1.5
+
+# Sizes of the window in which all tabs of Rerun recordings are looked at [pixels].
+VIEWER_SIZES = ((1280, 800), (1920, 1080))
 
 # Screenshots of the whole report that the page shows; the others are for looking at.
 PAGE_SCREENSHOTS = ("report-desktop-light",)
@@ -356,6 +359,20 @@ def for_page(picture: Path, target: Path) -> None:
     image.quantize(PAGE_COLOURS).save(target, optimize=True)
 
 
+def save_every_tab(folder: Path) -> None:
+    """Save pictures of all tabs of the Rerun files of a robot, beside its other screenshots.
+
+    Args:
+        folder: Folder of the robot.
+    """
+    for recording in sorted(folder.glob("*/*.rrd")):
+        for size in VIEWER_SIZES:
+            try:
+                every_tab(recording, recording.parent / "screenshots", SHOWN_TIME, size=size)
+            except ConnectionError as error:
+                print(f"{recording}: no viewer: {error}", file=sys.stderr)
+
+
 # ---- page
 
 
@@ -418,6 +435,11 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/gallery"))
     parser.add_argument("--page", type=Path, help="page in Markdown to write")
     parser.add_argument("--only", nargs="+", metavar="ROBOT", help="names of robots")
+    parser.add_argument(
+        "--every-tab",
+        action="store_true",
+        help="also save every tab of the Rerun files at two sizes, which takes a while",
+    )
     options = parser.parse_args()
 
     found = []
@@ -433,6 +455,8 @@ def main() -> int:
         if folder.exists():
             parser.error(f"{folder} exists; every robot needs a fresh folder")
         found.append((robot, list(show_robot(robot, folder))))
+        if options.every_tab:
+            save_every_tab(folder)
 
     if options.page is not None:
         write_page(options.page, found)

@@ -512,6 +512,11 @@ class TestDesign:
         expected = (costs - costs[0]) / (costs[-1] - costs[0])
         np.testing.assert_allclose(shares, expected, atol=1e-6)
 
+        _, texts = column(file, (*at, "numbers"), None, "Points2D:labels")
+        _, places = column(file, (*at, "numbers"), None, "Points2D:positions")
+        below = np.array(places[0])[:, 0] >= 0.0
+        assert list(np.array(texts[0])[below]) == ["0", "1", "2"]
+
         iterations, lines = column(file, (*at, "now"), "iteration", "LineStrips2D:strips")
         assert list(iterations) == [0, 1, 2]
         assert [np.array(line[0])[0, 0] for line in lines] == pytest.approx(curve[:, 0].tolist())

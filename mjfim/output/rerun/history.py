@@ -117,6 +117,7 @@ def history_plots(
             y=padded(float(values.min()), float(values.max())),
             size=plot_size(len(filled)),
             logarithmic=title.startswith(LOGARITHM),
+            counts=True,
         )
         plots.append(HistoryPlot(iterations=iterations, values=values, plot=plot, style=style))
     return plots

@@ -37,9 +37,8 @@ VISIBLE_X, VISIBLE_Y = (-1.7, 3.3), (-1.75, 1.2)
 # Colours of the axes and of the values at their ends (0..255).
 AXIS_COLOUR, LABEL_COLOUR = [150, 150, 150], [205, 205, 205]
 
-# Thickness of axes and curves, and radius of the dots at the ends of the axes and on the curves
-# [points].
-AXIS_THICKNESS, CURVE_THICKNESS, END_DOT, MOVING_DOT = 0.5, 1.0, 1.0, 3.5
+# Thickness of axes and curves, and radius of the dots that move along the curves [points].
+AXIS_THICKNESS, CURVE_THICKNESS, MOVING_DOT = 0.5, 1.0, 3.5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -114,7 +113,7 @@ class PhasePlot:
             LABEL_PLACES,
             labels=texts,
             colors=[LABEL_COLOUR] * 2,
-            radii=rr.Radius.ui_points(END_DOT),
+            radii=rr.Radius.ui_points(0.0),
             show_labels=True,
         )
         rec.log(entity_path((*self.parts, "ends")), marks, static=True, strict=True)

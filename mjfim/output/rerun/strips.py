@@ -61,6 +61,7 @@ class StripPlot:
         size: Width and height of the whole plot [points].
         logarithmic: True if the values are logarithms to base 10; the numbers beside the axis are
             those of which they are logarithms.
+        counts: True if the horizontal axis counts something, so that its numbers are whole.
     """
 
     parts: EntityParts
@@ -69,6 +70,7 @@ class StripPlot:
     y: Range
     size: tuple[float, float]
     logarithmic: bool = False
+    counts: bool = False
 
     @property
     def width(self) -> float:
@@ -177,6 +179,8 @@ class StripPlot:
     def _log_numbers(self, rec: rr.RecordingStream, *, static: bool) -> None:
         """Log the numbers beside the axes."""
         across = round_numbers(*self.x, _count(self.width, NUMBER_WIDTH))
+        if self.counts:
+            across = across[across == np.rint(across)]
         rounded = round_logarithms if self.logarithmic else round_numbers
         up = rounded(*self.y, _count(self.height, NUMBER_HEIGHT))
         below = self.points(across, np.full(len(across), self.y[0]))
