@@ -114,7 +114,9 @@ def usage_plots(design: Design, iterates: IterateCurves | None) -> list[SeriesPl
     plots = []
     for kind in dict.fromkeys(used.kind for used in design.usage):
         uses = [used for used in design.usage if used.kind == kind]
-        named = closest_to_bounds(uses)[:NAMED_CURVES]
+        named = closest_to_bounds(uses)
+        if len(named) > NAMED_CURVES + 1:
+            named = named[:NAMED_CURVES]
         curves = [_curve_of_use(used, colours[used.name], used.name in named) for used in uses]
         worst = _worst_use(kind, uses, design.history)
         if not worst.finite.any() and iterates is not None and kind in KINDS_OF_MOTIONS:
