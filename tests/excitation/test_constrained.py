@@ -143,7 +143,9 @@ def test_no_engine_step_of_the_study_violates_a_limit(paper: Design) -> None:
     assert [row.mu for row in paper.history] == sorted(
         (row.mu for row in paper.history), reverse=True
     )
-    assert paper.history[-1].margin >= 0.0
+    last = paper.history[-1]
+    assert last.margin >= 0.0
+    assert last.margins.keys() == margins.keys() and min(last.margins.values()) == last.margin
 
 
 # ---- ways to the inside
