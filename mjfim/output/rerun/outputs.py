@@ -31,7 +31,7 @@ IDENTIFIED_WIDTH = 2.0
 # Half width of the band around a prediction [standard deviations of the noise], and the least share
 # of the values of a plot that the whole band has to fill: the edges of a narrower one cover the
 # curves.
-BAND, LEAST_BAND = 2.0, 0.08
+BAND, LEAST_BAND = 2.0, 0.15
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
