@@ -14,6 +14,7 @@ from mjfim.identification.duration import pass_seconds
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
+from mjfim.studies.check import MAX_TESTED_SAMPLES
 from mjfim.studies.duration import check_seconds, trials_seconds
 
 # Duration from which work is announced [s].
@@ -25,8 +26,13 @@ LONGEST_ITERATION = 3600.0
 # Share of the longest iteration below which its time need not be known accurately.
 NEGLIGIBLE_SHARE = 0.1
 
-# Passes over the data that a fit usually needs, with its intervals and predictions.
-USUAL_PASSES = 10
+# Fewest and most passes over the data that fits usually need, with predictions and intervals. A fit
+# of a right model from a good guess needs about 15, that of a real log up to 50.
+FEWEST_PASSES = 10
+MOST_PASSES = 50
+
+# Passes over the data of a check, beside its tests along the longest recording.
+CHECK_PASSES = 3
 
 # Ends of sentences about work that Ctrl-C ends.
 BEST_IS_KEPT = "Ctrl-C ends it at any time with the best result so far"
@@ -133,15 +139,36 @@ def announce_check(system: System, control: Array) -> Duration | None:
     return Duration(seconds=seconds)
 
 
-def announce_recordings(
-    system: System, recordings: Sequence[Recording], *, fit: bool
+def announce_fit(system: System, recordings: Sequence[Recording]) -> None:
+    """Say how long a fit may take, if it is long.
+
+    Nobody knows beforehand how many passes over the data it needs, so that both ends of the usual
+    range are stated.
+
+    Args:
+        system: The system whose parameters are fitted.
+        recordings: The recordings.
+    """
+    each = pass_seconds(system, recordings)
+    if each is None or FEWEST_PASSES * each < 0.5 * ANNOUNCED_SECONDS:
+        return
+
+    shortest, longest = in_words(FEWEST_PASSES * each), in_words(MOST_PASSES * each)
+    _say(
+        f"{_rows_in_words(recordings)}: one pass over the data takes about {in_words(each)}, and "
+        f"the fit, of {FEWEST_PASSES} to {MOST_PASSES} passes, {shortest} to {longest}; "
+        f"{BEST_IS_KEPT}"
+    )
+
+
+def announce_check_of_recordings(
+    system: System, recordings: Sequence[Recording]
 ) -> Duration | None:
-    """Say how long the work on recordings takes, if it is long.
+    """Say how long a check of recordings takes, if it is long.
 
     Args:
         system: The system.
         recordings: The recordings.
-        fit: True for a fit, False for a check.
 
     Returns:
         The time; None if it is short or not known.
@@ -150,16 +177,24 @@ def announce_recordings(
     if each is None:
         return None
 
-    total = (USUAL_PASSES if fit else 2) * each
+    # The derivatives are tested along the longest recording only.
+    longest = max(recordings, key=lambda recording: len(recording.ctrl))
+    control = longest.ctrl[: min(MAX_TESTED_SAMPLES, len(longest.t) - 1)]
+    tests = check_seconds(system, control, negligible=ANNOUNCED_SECONDS) or 0.0
+
+    total = CHECK_PASSES * each + tests
     if total < ANNOUNCED_SECONDS:
         return None
-    rows = sum(len(recording.t) for recording in recordings)
-    begin = f"{rows:,} rows: one pass over the data takes about {in_words(each)}"
-    if fit:
-        _say(f"{begin}, and the fit usually about {in_words(total)}; {BEST_IS_KEPT}")
-    else:
-        _say(f"{begin}, and the check about {in_words(total)}")
+    _say(
+        f"{_rows_in_words(recordings)}: one pass over the data takes about {in_words(each)}, and "
+        f"the check about {in_words(total)}"
+    )
     return Duration(seconds=total)
+
+
+def _rows_in_words(recordings: Sequence[Recording]) -> str:
+    """Number of rows of all recordings."""
+    return f"{sum(len(recording.t) for recording in recordings):,} rows"
 
 
 def announce_trials(system: System, trajectories: Mapping[str, Trajectory], trials: int) -> None:

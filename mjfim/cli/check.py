@@ -9,7 +9,11 @@ import typer
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.cli.announcements import announce_check, announce_recordings, refusal_of_design
+from mjfim.cli.announcements import (
+    announce_check,
+    announce_check_of_recordings,
+    refusal_of_design,
+)
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -77,7 +81,7 @@ def check(
         require_design_keys(system, "check without recordings")
     with progress("estimating how long it takes"):
         if loaded:
-            expected = announce_recordings(system, loaded, fit=False)
+            expected = announce_check_of_recordings(system, loaded)
         else:
             given = _stated_control(system) if trajectory is None else trajectory.ctrl
             expected = announce_check(system, given)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.announcements import announce_recordings
+from mjfim.cli.announcements import announce_fit
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -91,9 +91,9 @@ def identify(
     with progress("reading"):
         fitted = [read_log(path, system.channels) for path in logs]
         predicted = [read_log(path, system.channels) for path in held_out_logs]
-        expected = announce_recordings(system, [log.recording for log in fitted], fit=True)
+        announce_fit(system, [log.recording for log in fitted])
     with (
-        progress("fitting", expected=expected) as display,
+        progress("fitting") as display,
         watched(live, system, display) as show,
     ):
         result = identify_system(

@@ -16,7 +16,7 @@ from mjfim.cli.announcements import (
     announce_check,
     announce_comparison,
     announce_design,
-    announce_recordings,
+    announce_fit,
     announce_trials,
 )
 from mjfim.errors import ExperimentError
@@ -100,9 +100,10 @@ def test_long_checks_fits_and_studies_are_announced(
         y=np.resize(system.plant.outputs(curve.state, None), (rows, 4)),
         outputs=system.outputs.names,
     )
-    announce_recordings(system, [recording], fit=True)
+    announce_fit(system, [recording])
 
     told = capsys.readouterr().err.splitlines()
+    assert "the fit, of 10 to 50 passes," in told[-1]
     assert [line.split(" takes ")[0].split(" take ")[0] for line in told] == [
         "mjfim: the check",
         "mjfim: 1,000,000 trials",
