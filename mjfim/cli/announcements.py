@@ -197,17 +197,23 @@ def _rows_in_words(recordings: Sequence[Recording]) -> str:
     return f"{sum(len(recording.t) for recording in recordings):,} rows"
 
 
-def announce_trials(system: System, trajectories: Mapping[str, Trajectory], trials: int) -> None:
+def announce_trials(
+    system: System, trajectories: Mapping[str, Trajectory], trials: int
+) -> Duration:
     """Say how long a Monte-Carlo study takes, if it is long.
 
     Args:
         system: The system.
         trajectories: Trajectories by name.
         trials: Number of repetitions of each.
+
+    Returns:
+        The time.
     """
     seconds = trials_seconds(system, trajectories, trials)
     if seconds >= ANNOUNCED_SECONDS:
         _say(f"{trials:,} trials take about {in_words(seconds)}; {DONE_IS_KEPT}")
+    return Duration(seconds=seconds)
 
 
 def announce_comparison(methods: int, seconds: float) -> None:

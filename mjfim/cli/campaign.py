@@ -20,10 +20,11 @@ from mjfim.cli.common import (
     Verbose,
     claim_folder,
     errors,
-    keep_result,
     out,
+    progress,
     say_written,
     verb,
+    writing,
 )
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.target_accuracy import target_accuracies
@@ -46,7 +47,7 @@ from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.events import Event, StudyEvent
+from mjfim.records.events import Callback, Event, StudyEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import restate_experiment
 
@@ -104,15 +105,20 @@ def campaign(
     claim_folder(output, names, input_files(stated, recordings or []), force=force)
 
     # Every round makes a design; its recordings add less time.
-    announce_design(run.task.system, is_default=False, work="the design of a round")
-    found = run.simulated(rounds, seed) if simulated else run.real(rounds, recordings or [])
+    with progress("estimating how long it takes"):
+        system = run.task.system
+        expected = announce_design(system, is_default=False, work="the design of a round")
+    with progress("designing", expected=expected) as display:
+        display.count_rounds(rounds)
+        run.display = display
+        found = run.simulated(rounds, seed) if simulated else run.real(rounds, recordings or [])
 
-    keep_result(output)
-    warning = run.folder.write_campaign(found, simulated=simulated)
-    if warning:
-        errors.print(f"warning: {warning}", markup=False)
     parameters = CampaignParameters.stated(run.task.parameters, simulated=simulated)
     out.print(render(describe_campaign(found, parameters), verbose=verbose))
+    with writing(output):
+        warning = run.folder.write_campaign(found, simulated=simulated)
+    if warning:
+        errors.print(f"warning: {warning}", markup=False)
     if found.status is CampaignStatus.WAITING:
         waiting = run.folder.round(run.folder.designed)
         out.print(
@@ -131,6 +137,7 @@ class CampaignRun:
     Attributes:
         task: The task as stated.
         folder: The folder of the campaign.
+        display: Shows the progress of designs and estimates, or None.
     """
 
     def __init__(
@@ -149,6 +156,7 @@ class CampaignRun:
         self.task = task
         self.folder = CampaignFolder(path, task.system, pictures)
         self._wanted = target_accuracies(task)
+        self.display: Callback | None = None
         self._estimate: Estimate | None = None
 
     def require_simulation(self, seed: int, *, resume: bool) -> None:
@@ -269,7 +277,9 @@ class CampaignRun:
         self.folder.write_design(design, number, system)
 
     def _finish_round(self, event: Event) -> None:
-        """Write the estimate of a complete round, and print it."""
+        """Show the progress, and write and print the estimate of a complete round."""
+        if self.display is not None:
+            self.display(event)
         if not isinstance(event, StudyEvent) or not isinstance(event.result, Round):
             return
 

@@ -22,6 +22,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn
 from rich.progress_bar import ProgressBar
+from rich.table import Column
 from rich.text import Text
 from typer.core import TyperCommand
 
@@ -134,6 +135,17 @@ BAR_WIDTH = 10
 
 # Time after which a line of progress is due, if stderr is not a terminal [s].
 LINE_SECONDS = 10.0
+
+# Share of all work from which the time that is left follows from the time so far.
+LEAST_DONE = 0.1
+
+# Share of a round, compared with the mean of the earlier ones, at which its bar stops.
+MOST_OF_ROUND = 0.95
+
+# Time to write a file of a kind, in that of a picture; data take next to none. The report is
+# written again with a video in the folders that have a file for Rerun.
+PICTURE_WEIGHTS = {".png": 1.0, ".svg": 1.0, ".pdf": 1.0, ".rrd": 0.5}
+VIDEO_WEIGHT = 4.0
 
 # Arguments and options that several verbs share.
 ExperimentFile = Annotated[
@@ -578,6 +590,73 @@ class Duration:
     word: str = "about"
 
 
+class _Rounds:
+    """Rounds of a campaign, which take about equally long.
+
+    Attributes:
+        count: Largest number of rounds.
+        done: Number of complete rounds.
+    """
+
+    def __init__(self, *, count: int) -> None:
+        """Begin the first round."""
+        self.count = count
+        self.done = 0
+        self._begun = time.monotonic()
+        self._lengths: list[float] = []
+
+    def finish_one(self, *, is_new: bool) -> None:
+        """Count a complete round.
+
+        Args:
+            is_new: False for a round of an earlier call, which is only identified again.
+        """
+        now = time.monotonic()
+        self.done += 1
+        if is_new:
+            self._lengths.append(now - self._begun)
+        self._begun = now
+
+    @property
+    def done_so_far(self) -> float:
+        """Complete rounds, and the share of the present one, which lasts as long as the others."""
+        if not self._lengths:
+            return float(self.done)
+        mean = sum(self._lengths) / len(self._lengths)
+        share = (time.monotonic() - self._begun) / mean
+        return self.done + min(share, MOST_OF_ROUND)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Time of all rounds that are left [s]; None before the first one is complete."""
+        if not self._lengths:
+            return None
+        mean = sum(self._lengths) / len(self._lengths)
+        return (self.count - self.done_so_far) * mean
+
+    def __str__(self) -> str:
+        return f"round {min(self.done + 1, self.count)} of at most {self.count}"
+
+
+def work_on_files(names: Sequence[str]) -> float:
+    """Work to write files, in that to draw one picture.
+
+    Args:
+        names: Their names; a report that is written for the second time gets a video.
+    """
+    total = 0.0
+    for k, name in enumerate(names):
+        is_second_report = name == REPORT and name in names[:k]
+        total += VIDEO_WEIGHT if is_second_report else PICTURE_WEIGHTS.get(Path(name).suffix, 0.0)
+    return total
+
+
+def _second_reports(names: Sequence[str]) -> list[str]:
+    """The report once more where it gets a video."""
+    has_motion = any(name.endswith(".rrd") for name in names)
+    return [REPORT] if has_motion and REPORT in names else []
+
+
 class ProgressDisplay:
     """Display of progress on stderr: a bar on a terminal, otherwise a line from time to time."""
 
@@ -589,33 +668,74 @@ class ProgressDisplay:
             description: Text until the first event.
         """
         self._bar = bar
-        self._task = bar.add_task(description, total=None, part_began=time.monotonic())
+        self._task = bar.add_task(
+            description, total=None, part_began=time.monotonic(), is_whole=False
+        )
         self._announced_part = ""
         self._stage = ""
         self._latest = description
         self._begun = self._told = time.monotonic()
+        self._rounds: _Rounds | None = None
+        self._counts_files = False
 
     def count_file(self, path: Path) -> None:
-        """Show how many of the files that may be written are written."""
+        """Show which share of the work on files is done."""
         if path.name.startswith("."):
             return
 
         _written.append(path)
-        self._latest = f"written: {path.name}"
-        total = max(len(_names), len(_written))
-        self._bar.update(self._task, description=self._latest, total=total, completed=len(_written))
+        self._counts_files = True
+        done = work_on_files([each.name for each in _written])
+        total = work_on_files([*dict.fromkeys(_names), *_second_reports(_names)])
+        self._show(f"written: {path.name}", max(done, total) or None, done)
+
+    def count_rounds(self, count: int) -> None:
+        """Show from now on how many rounds are done, and the number of the present one.
+
+        Args:
+            count: Largest number of rounds.
+        """
+        self._rounds = _Rounds(count=count)
+        self._bar.update(self._task, rounds=self._rounds)
+        self.describe(self._latest)
 
     def begin_stage(self, name: str, index: int, count: int) -> None:
         """Show which work begins, and its number among those of its kind if that is known."""
-        self._latest = name
-        self._bar.update(self._task, description=name, total=count or None, completed=index)
-        if index == 0:
-            self._bar.update(self._task, part_began=time.monotonic())
+        if self._counts_files:
+            self._bar.update(self._task, description=name)
+        elif self._rounds is not None or not count:
+            self.describe(name)
+        else:
+            self._show(name, count, index, is_whole=False)
+            if index == 0:
+                self._bar.update(self._task, part_began=time.monotonic())
 
     def describe(self, description: str) -> None:
         """Show what is done until the next event."""
-        self._latest = description
-        self._bar.update(self._task, description=description, total=None, completed=0)
+        if self._rounds is None:
+            self._show(description)
+            return
+        done = self._rounds.done_so_far
+        total = self._rounds.count if done else None
+        self._show(f"{self._rounds}\n{description}", total, done)
+
+    def _show(
+        self, text: str, total: float | None = None, done: float = 0.0, *, is_whole: bool = True
+    ) -> None:
+        """Show what is done.
+
+        Args:
+            text: The work, in words.
+            total: Number of its parts; None if it is not known.
+            done: Number of finished parts.
+            is_whole: False where the parts are only those of one stage.
+        """
+        self._latest = text.replace("\n", ": ")
+
+        # An update cannot take away a total.
+        task = next(each for each in self._bar.tasks if each.id == self._task)
+        task.total = total
+        self._bar.update(self._task, description=text, completed=done, is_whole=is_whole)
 
     def tell_if_silent(self, seconds: float) -> None:
         """Without a terminal, print what is done if nothing was printed for some seconds."""
@@ -662,23 +782,23 @@ class ProgressDisplay:
 
         is_due = iteration % period == 0
         if is_due and not errors.is_terminal:
-            self._print(text)
+            self._print(self._latest)
 
     def _show_study(self, event: StudyEvent) -> None:
-        """Show the progress of a study."""
+        """Show the progress of a study; the verb prints the result of a round itself."""
+        if self._rounds is not None and event.result is not None:
+            is_new = getattr(event.result, "design", None) is not None
+            self._rounds.finish_one(is_new=is_new)
+            self.describe("designing")
+            return
+
         # Without a known number of parts there is no bar, and each part is a line.
         if event.count is None:
             self._print(event.message)
             return
 
         part = part_text(event)
-        self._latest = part
-        self._bar.update(
-            self._task,
-            description=f"{part}  {event.message}",
-            total=event.count,
-            completed=event.index + event.share,
-        )
+        self._show(f"{part}  {event.message}", event.count, event.index + event.share)
         if errors.is_terminal:
             return
 
@@ -704,7 +824,9 @@ def progress(
     Yields:
         The display, which is called with every event.
     """
-    text = TextColumn("{task.description}", markup=False)
+    # On a narrow terminal the text is folded, so that the times are not cut.
+    folded = Column(no_wrap=False, overflow="fold")
+    text = TextColumn("{task.description}", markup=False, table_column=folded)
     columns = (SpinnerColumn(), text, _Bar(bar_width=BAR_WIDTH), _TimeColumn(expected))
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         display = ProgressDisplay(bar, description)
@@ -743,12 +865,17 @@ class _TimeColumn(ProgressColumn):
         elapsed = task.elapsed or 0.0
         text = clock(elapsed)
         expected = self._expected
-        if expected is not None and expected.seconds > elapsed:
+        done = task.completed / task.total if task.total else 0.0
+        rounds = task.fields.get("rounds")
+        if rounds is not None and rounds.seconds_left is not None:
+            text += f", at most about {clock(rounds.seconds_left)} left"
+        elif task.fields.get("is_whole") and LEAST_DONE <= done < 1.0:
+            text += f", about {clock(elapsed * (1.0 / done - 1.0))} left"
+        elif expected is not None and expected.seconds > elapsed:
             text += f" of {expected.word} {clock(expected.seconds)}"
-        elif task.total and 0.0 < task.completed < task.total:
+        elif LEAST_DONE <= done < 1.0:
             of_parts = time.monotonic() - task.fields["part_began"]
-            left = of_parts * (task.total / task.completed - 1.0)
-            text += f", about {clock(left)} left"
+            text += f", about {clock(of_parts * (1.0 / done - 1.0))} left"
         return Text(text, style="progress.elapsed", no_wrap=True)
 
 

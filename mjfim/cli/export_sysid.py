@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.cli.announcements import announce_fit
 from mjfim.cli.common import (
     ExperimentFile,
     Folder,
@@ -15,15 +16,17 @@ from mjfim.cli.common import (
     Verbose,
     claim_folder,
     errors,
-    keep_result,
     out,
+    progress,
     verb,
+    writing,
 )
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.system import System
 from mjfim.output.folders import SYSID_FILES
 from mjfim.output.text import render
 from mjfim.recordings.read import read_recording, recording_paths
+from mjfim.records.progress import begin_stage
 
 
 @verb
@@ -45,15 +48,19 @@ def export_sysid(
     system = System.resolve(mjfim.Experiment.from_file(experiment))
     inputs = input_files(system.experiment, recordings)
     claim_folder(output, SYSID_FILES, inputs, force=force)
-    logs = recording_paths(recordings, system.channels)
-    loaded = [read_recording(path, system.channels) for path in logs]
+    with progress("reading"):
+        logs = recording_paths(recordings, system.channels)
+        loaded = [read_recording(path, system.channels) for path in logs]
+        announce_fit(system, loaded)
 
-    result = sysid_comparison.compare_with_sysid(system, loaded)
+    with progress("fitting") as show:
+        result = sysid_comparison.compare_with_sysid(system, loaded, show)
     summary = sysid_comparison.describe_sysid_comparison(result)
     out.print(render(summary, verbose=verbose))
     for sentence in result.warnings:
         errors.print(f"warning: {sentence}", markup=False)
 
-    keep_result(output)
-    sysid_comparison.write_sysid_comparison(output, result)
+    with writing(output):
+        begin_stage("writing the report of mujoco.sysid")
+        sysid_comparison.write_sysid_comparison(output, result)
     out.print(f"wrote {output}: comparison.json, sysid_report.html", soft_wrap=True)

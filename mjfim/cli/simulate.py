@@ -125,8 +125,11 @@ def montecarlo(
     claim_folder(output, pictures.files(study_files(system.parameters.names)), inputs, force=force)
 
     require_memory_for_trials(system, named, trials)
-    announce_trials(system, named, trials)
-    with progress(f"{trials} trials") as display, watched(live, system, display) as show:
+    expected = announce_trials(system, named, trials)
+    with (
+        progress(f"{trials} trials", expected=expected) as display,
+        watched(live, system, display) as show,
+    ):
         study = monte_carlo_system(system, named, trials=trials, seed=seed, callback=show)
 
     if not study.sets:

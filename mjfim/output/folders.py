@@ -37,6 +37,7 @@ from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.progress import begin_stage
 from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json, write_json
 from mjfim.records.shown import ShownRecord
@@ -226,6 +227,7 @@ def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
     if interruption is not None and interruption.presses:
         return
 
+    begin_stage("drawing the video of the report")
     video, sentence = video_for_report(system, result)
     write_report(folder, type(result), video, sentence)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from mjfim.output.vocabulary import shown_word
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 
 
@@ -86,4 +87,4 @@ def part_text(event: StudyEvent) -> str:
     Args:
         event: The event of a study with a known number of parts.
     """
-    return f"{event.index + 1}/{event.count} {event.part}"
+    return f"{event.index + 1}/{event.count} {shown_word(event.part)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,18 @@ from rich.progress import Progress
 
 import mjfim
 from mjfim.cli import common
-from mjfim.cli.common import Duration, MessageConsole, ProgressDisplay, _TimeColumn, clock
+from mjfim.cli.common import (
+    VIDEO_WEIGHT,
+    Duration,
+    MessageConsole,
+    ProgressDisplay,
+    _TimeColumn,
+    clock,
+)
 from mjfim.excitation.task import DesignTask
 from mjfim.output.progress_text import design_stage, design_text
 from mjfim.records.design import HistoryRow
-from mjfim.records.events import DesignEvent
+from mjfim.records.events import DesignEvent, StudyEvent
 from mjfim.records.progress import begin_stage, stages_observed_by
 from mjfim.studies.check import check_task
 from tests.support.paths import MODELS
@@ -55,15 +63,76 @@ def test_the_time_that_is_left_is_shown() -> None:
     assert str(_TimeColumn(None).render(task)).endswith("left")
 
 
-def test_files_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(common, "_names", ["a.json", "b.png"])
+def test_files_are_counted_by_the_work_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Data take no time, and the video of a report several times that of a picture."""
+    monkeypatch.setattr(common, "_names", ["a.json", "b.png", "design.rrd", "report.html"])
     monkeypatch.setattr(common, "_written", [])
     bar = Progress(disable=True)
     display = ProgressDisplay(bar, "writing")
-    for name in (".mjfim.json", "a.json"):
+    total = 1.5 + VIDEO_WEIGHT
+    for name, done in ((".mjfim.json", 0.0), ("report.html", 0.0), ("b.png", 1.0)):
         display.count_file(Path(name))
+        (task,) = bar.tasks
+        assert task.completed == done
+    assert (task.description, task.total) == ("written: b.png", total)
+
+    # A stage between two files keeps the bar.
+    display.begin_stage("drawing", 0, 0)
+    assert (task.description, task.total) == ("drawing", total)
+    for name in ("design.rrd", "report.html"):
+        display.count_file(Path(name))
+    assert task.completed == task.total == total
+
+
+def test_a_stage_without_parts_has_no_bar() -> None:
+    """The number of parts of an earlier stage is forgotten."""
+    bar = Progress(disable=True)
+    display = ProgressDisplay(bar, "fitting")
+    display.begin_stage("predicting", 1, 3)
     (task,) = bar.tasks
-    assert (task.description, task.completed, task.total) == ("written: a.json", 1, 2)
+    assert (task.total, task.completed) == (3, 1)
+    display.begin_stage("computing the intervals", 0, 0)
+    assert task.total is None
+
+
+def test_rounds_of_a_campaign_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bar is that of all rounds, and the time that is left follows from complete rounds."""
+    now = 0.0
+    monkeypatch.setattr(common.time, "monotonic", lambda: now)
+    bar = Progress(disable=True)
+    display = ProgressDisplay(bar, "designing")
+    display.count_rounds(4)
+    (task,) = bar.tasks
+    display(an_iterate(mu=0.0))
+    assert task.description.startswith("round 1 of at most 4\niteration   7")
+    assert task.total is None
+
+    now = 10.0
+    ended = StudyEvent(
+        study="campaign",
+        part="round 1",
+        index=0,
+        count=4,
+        share=1.0,
+        result=SimpleNamespace(design="a design"),
+    )
+    display(ended)
+    now = 15.0
+    display.begin_stage("computing the intervals", 0, 0)
+    assert task.description == "round 2 of at most 4\ncomputing the intervals"
+    assert (task.completed, task.total) == (1.5, 4)
+    task.start_time, task.stop_time = 0.0, 15.0
+    assert str(_TimeColumn(None).render(task)) == "0:15, at most about 0:25 left"
+
+
+def test_no_time_is_cut_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Long descriptions are folded between words."""
+    console = MessageConsole(file=io.StringIO(), force_terminal=True, width=60)
+    monkeypatch.setattr(common, "errors", console)
+    with common.progress("designing", expected=Duration(seconds=4000.0)) as display:
+        display.describe("a description that is so long that it does not fit in one line")
+    written = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "1:06:40" in written and "…" not in written
 
 
 def test_a_report_is_named_only_where_it_was_written(

@@ -19,6 +19,9 @@ from mjfim.output.summary_parts import (
 )
 from mjfim.records.comparison import DESIGN, Comparison, MethodResult
 
+# Relative difference above which a factor is easier to read than percent.
+LARGE_DIFFERENCE = 10.0
+
 
 def describe_comparison(comparison: Comparison) -> Summary:
     """Describe the result of each method with equal budgets, and which is the best.
@@ -86,7 +89,7 @@ def _method_cells(comparison: Comparison, row: MethodResult) -> tuple[Cell, ...]
 
     against_design = ""
     if design is not None and row is not design and not np.isnan(row.cost):
-        against_design = f"{-100 * comparison.gain(row, design):+.3g} %"
+        against_design = _difference(-comparison.gain(row, design))
     margin = "-"
     if kind and np.isfinite(relative_margin):
         margin = f"{100.0 * relative_margin:.2g} % {kind.replace('_', ' ')}"
@@ -103,6 +106,11 @@ def _method_cells(comparison: Comparison, row: MethodResult) -> tuple[Cell, ...]
         f"{row.steps / 1e6:.2f} M",
         margin,
     )
+
+
+def _difference(share: float) -> str:
+    """Return by how much a cost is larger, in percent or, where it is far larger, as a factor."""
+    return f"× {1.0 + share:.3g}" if share >= LARGE_DIFFERENCE else f"{100.0 * share:+.3g} %"
 
 
 def _method_accuracy_table(comparison: Comparison) -> SummaryTable:

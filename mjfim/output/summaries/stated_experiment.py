@@ -91,10 +91,16 @@ def _verdict(stated: StatedExperiment) -> str:
     """One sentence: the file is correct, and for which verbs it is complete."""
     count = len(stated.parameters)
     found = (
-        f"{stated.source} is correct: {count} parameter{'s' if count != 1 else ''}, "
-        f"{len(stated.outputs)} outputs, {len(stated.controls)} controls, {stated.rate:g} Hz"
+        f"{stated.source} is correct: {_counted(count, 'parameter')}, "
+        f"{_counted(len(stated.outputs), 'output')}, "
+        f"{_counted(len(stated.controls), 'control')}, {stated.rate:g} Hz"
     )
     if stated.missing:
         keys = " and ".join(f"`{key}`" for key in stated.missing)
         return f"{found}. It serves `identify`; `check` and `design` also need {keys}"
     return f"{found}, {stated.horizon:g} s"
+
+
+def _counted(count: int, noun: str) -> str:
+    """A number of things in words."""
+    return f"{count} {noun}{'s' if count != 1 else ''}"

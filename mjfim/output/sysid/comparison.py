@@ -24,6 +24,8 @@ from mjfim.output.summary_parts import Cell, Name, Row, Summary, SummaryTable, c
 from mjfim.output.sysid.sequences import Exported, build, export, silenced
 from mjfim.output.vocabulary import NOMINAL
 from mjfim.records.estimate import Estimate
+from mjfim.records.events import Callback
+from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import write_json
 
@@ -103,22 +105,29 @@ def _fit_summary(fit: SysidFit) -> dict[str, Any]:
     return {"theta": fit.theta, "chi2": fit.chi2, "seconds": fit.seconds, "status": fit.status}
 
 
-def compare_with_sysid(system: System, recordings: Sequence[Recording]) -> SysidComparison:
+def compare_with_sysid(
+    system: System, recordings: Sequence[Recording], callback: Callback | None = None
+) -> SysidComparison:
     """Fit recordings with mjfim, and twice with sysid.
 
     Args:
         system: The experiment.
         recordings: Its recordings.
+        callback: Called with the events of mjfim's estimation.
 
     Raises:
         MjfimError: sysid cannot express the problem, or is not installed.
     """
+    begin_stage("translating the experiment for mujoco.sysid")
     exported = export(system, recordings)
+    estimate = identify_system(system, recordings, callback=callback)
+
+    begin_stage("fitting with mujoco.sysid, weighted by the noise (1 of 2)")
+    weighted = fit_with_sysid(exported, weighted=True)
+    begin_stage("fitting with mujoco.sysid, default weights (2 of 2)")
+    unweighted = fit_with_sysid(exported, weighted=False)
     return SysidComparison(
-        exported=exported,
-        estimate=identify_system(system, recordings),
-        weighted=fit_with_sysid(exported, weighted=True),
-        unweighted=fit_with_sysid(exported, weighted=False),
+        exported=exported, estimate=estimate, weighted=weighted, unweighted=unweighted
     )
 
 
@@ -211,11 +220,6 @@ def describe_sysid_comparison(comparison: SysidComparison) -> Summary:
         )
         rows.append(Row(cells=cells))
 
-    squares = [f"{fit.chi2:.6g}" for fit in (estimate, *fits)]
-    seconds = [f"{fit.seconds:.2f}" for fit in (estimate, *fits)]
-    for heading, values in (("χ²", squares), ("seconds", seconds)):
-        rows.append(Row(cells=(heading, "", "", values[0], "", "", "", *values[1:])))
-
     table = SummaryTable(
         key="estimators",
         title="Estimates from these recordings by mjfim and by mujoco.sysid",
@@ -229,10 +233,26 @@ def describe_sysid_comparison(comparison: SysidComparison) -> Summary:
             "high",
             "sysid, weighted",
             "sysid, default",
+            details=["95 % low", "high"],
+            optional=["true", NOMINAL.word, "formal σ"],
         ),
         rows=tuple(rows),
     )
-    return Summary(title="mjfim and mujoco.sysid", outcome="", parts=(table,))
+    found = (
+        ("mjfim", estimate.chi2, estimate.seconds),
+        ("sysid, weighted", fits[0].chi2, fits[0].seconds),
+        ("sysid, default", fits[1].chi2, fits[1].seconds),
+    )
+    quality = SummaryTable(
+        key="fits",
+        title="Squared residuals relative to the stated noise, and the time of each fit",
+        columns=columns("fit", "χ²", "time"),
+        rows=tuple(
+            Row(cells=(title, f"{squares:.6g}", f"{seconds:.2f} s"))
+            for title, squares, seconds in found
+        ),
+    )
+    return Summary(title="mjfim and mujoco.sysid", outcome="", parts=(table, quality))
 
 
 def write_sysid_comparison(folder: Path, comparison: SysidComparison) -> None:
