@@ -7,6 +7,10 @@ The command line is called as a user calls it. Pictures, what the terminal print
 screenshots of the Rerun files are collected per robot. Robots whose files are missing, and
 screenshots for which no browser or no viewer can start, are left out with a sentence on stderr.
 
+Recordings of own models and of first experiments are simulated with a robot whose parameters
+differ from the model, so that an identified model differs from the nominal one. What the calls
+printed is kept: `--reuse` makes the page again from the files of an earlier run.
+
 `--models` is a folder with `menagerie_panda` and `menagerie_so_arm100` of the MuJoCo Menagerie, and
 `--data` one with the logs `dfki_double_pendulum`.
 """
@@ -15,16 +19,22 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import re
+import shlex
 import shutil
 import sys
+import textwrap
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import tomlkit
 from PIL import Image
 
+from mjfim.output.vocabulary import TERMS
 from scripts.rerun_screenshot import every_tab, screenshot
 from scripts.verbs import call_verb
 
@@ -37,7 +47,16 @@ COLUMNS = 80
 PATIENCE = 900.0
 
 # Largest width of a picture on the page [pixels], and its number of colours.
-PAGE_WIDTH, PAGE_COLOURS = 1200, 128
+PAGE_WIDTH, PAGE_COLOURS = 1000, 64
+
+# Height of what the page shows of a long picture, such as a whole report, over its width.
+SHOWN_HEIGHT = 1.9
+
+# Relative difference of the simulated robots from their models.
+ROBOT_DIFFERENCE = 0.1
+
+# File with what the calls for a robot printed.
+CALLS = "calls.json"
 
 # Names of browsers with the DevTools protocol, the usual one first.
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -54,8 +73,38 @@ SHOWN_TIME = 1.5
 # Sizes of the window in which all tabs of Rerun recordings are looked at [pixels].
 VIEWER_SIZES = ((1280, 800), (1920, 1080))
 
-# Screenshots of the whole report that the page shows; the others are for looking at.
-PAGE_SCREENSHOTS = ("report-desktop-light",)
+# What the pictures of the page show, by the begin of their names, in the order of the page. Other
+# pictures are for looking at.
+CAPTIONS = {
+    "check": "Predicted and wanted σ of every parameter, and the correlations of the estimates",
+    "pairs": "Joint uncertainty of the estimates of pairs of parameters",
+    "standard_deviations": "Predicted σ of every parameter, initial and designed",
+    "trajectories": "Motion and controls, and the information gathered up to each time",
+    "limits": "How much of each limit the design uses",
+    "sensitivity_phase": "How the motion reacts to each parameter",
+    "convergence": "Cost, slope and information over the iterations of the search",
+    "parameters": "Estimates with their 95 % intervals, relative to the nominal values",
+    "fit": "Measured outputs, the identified and the nominal model, and the residuals",
+    "held_out": "A recording that was not fitted, and its predictions",
+    "predictions": "Errors of the predictions of what was not fitted, over the noise",
+    "spectra": "Spectra of the residuals beside white noise",
+    "trace": "Parameters over the iterations of the fit",
+    "overview": "Scatter of the estimates of many simulated recordings, and the Cramér–Rao bound",
+    "histogram_": "Estimates of one parameter in many simulated recordings",
+    "compare": "The design beside other excitations with the same time",
+    "playback": "Limits, errors and coverage of robots that differ from the model",
+    "campaign": "σ and estimate of every parameter over the rounds",
+    "report-desktop-light": "The beginning of `report.html`",
+    "report-phone-dark": "The beginning of `report.html` on a phone, in dark colours",
+    "rerun-design": "`design.rrd` in the viewer",
+    "rerun-estimate": "`estimate.rrd` in the viewer",
+}
+
+# Code in HTML, for text in Markdown.
+CODE = r"<code>\1</code>"
+
+# Pictures that the page shows of one call only.
+ONCE = "report-phone-dark"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +113,8 @@ class Step:
 
     Attributes:
         verb: The verb.
-        words: Its arguments; `{experiment}`, `{out}` and the names of files are filled in.
+        words: Its arguments; `{experiment}`, the experiment with the `{robot}`'s values, and the
+            folder `{out}` are filled in.
         folder: Folder of the results below that of the robot; None if the verb writes one file.
     """
 
@@ -104,8 +154,8 @@ class Shown:
         command: The command, with short paths.
         code: Exit code.
         seconds: Duration [s].
-        terminal: What was printed on stdout, then the messages on stderr.
-        pictures: Pictures by title.
+        terminal: What was printed on stdout; the messages on stderr where that is nothing.
+        pictures: Pictures by name.
     """
 
     command: str
@@ -120,7 +170,7 @@ def _design_steps(*further: Step) -> tuple[Step, ...]:
     return (
         Step(verb="check", words=("{experiment}", "-o", "{out}/check"), folder="check"),
         Step(verb="design", words=("{experiment}", "-o", "{out}/design"), folder="design"),
-        Step(verb="simulate", words=("{experiment}", "{out}/design", "-o", "{out}/recording.csv")),
+        Step(verb="simulate", words=("{robot}", "{out}/design", "-o", "{out}/recording.csv")),
         Step(
             verb="identify",
             words=("{experiment}", "{out}/recording.csv", "-o", "{out}/identify"),
@@ -247,31 +297,66 @@ def show_robot(robot: Robot, folder: Path) -> Iterator[Shown]:
     experiment = robot.experiment
     if experiment is None:
         experiment = folder / f"{robot.name}.toml"
-        yield _call(Step(verb="init", words=(str(robot.model), "-o", str(experiment))), {})
+        init = Step(verb="init", words=(str(robot.model), "-o", str(experiment)))
+        yield _call(init, {}, folder.parent)
 
-    values = {"experiment": str(experiment), "out": str(folder)}
+    values = {"experiment": experiment, "robot": experiment, "out": folder}
     for step in robot.steps:
-        shown = _call(step, values)
+        if step.verb == "simulate":
+            values["robot"] = simulated_robot(experiment, folder)
+        shown = _call(step, values, folder.parent)
         if step.folder is not None:
             shown.pictures = _pictures(folder / step.folder)
         yield shown
 
 
-def _call(step: Step, values: dict[str, str]) -> Shown:
-    """Call a verb as a user does."""
+def simulated_robot(experiment: Path, folder: Path) -> Path:
+    """Write an experiment whose robot differs from its model.
+
+    Parameters without a prior or a stated true value differ by a share of their size, up and down
+    in turn.
+
+    Args:
+        experiment: Experiment file.
+        folder: Folder of the robot, with the result of a check.
+
+    Returns:
+        The file; `experiment` itself where all parameters have a stated value.
+    """
+    check = json.loads((folder / "check" / "check.json").read_text(encoding="utf-8"))
+    rows = {row["name"]: row for row in check["parameters"]}
+    stated = tomlkit.parse(experiment.read_text(encoding="utf-8"))
+    tables: dict[str, Any] = stated["parameters"]
+    open_ones = [name for name, table in tables.items() if not {"true", "prior"} & set(table)]
+    if not open_ones:
+        return experiment
+
+    for i, name in enumerate(open_ones):
+        change = ROBOT_DIFFERENCE * (-1) ** i
+        tables[name]["true"] = float(f"{rows[name]['value'] + change * rows[name]['size']:.4g}")
+    model = experiment.parent / str(stated["model"])
+    stated["model"] = os.path.relpath(model, folder)
+    robot = folder / f"{experiment.stem}_robot.toml"
+    robot.write_text(tomlkit.dumps(stated), encoding="utf-8")
+    return robot
+
+
+def _call(step: Step, values: Mapping[str, Path], root: Path) -> Shown:
+    """Call a verb as a user does; paths below `root` are shown relative to it."""
     words = [word.format(**values) if "{" in word else word for word in step.words]
     variables = {"PYTHONPATH": str(ROOT), "COLUMNS": str(COLUMNS)}
     begun = time.perf_counter()
     ended = call_verb([step.verb, *words], variables=variables, patience=PATIENCE)
     seconds = time.perf_counter() - begun
 
-    command = " ".join(["mjfim", step.verb, *(_short(word) for word in words)])
+    command = shlex.join(["mjfim", step.verb, *(_short(word) for word in words)])
     print(f"{command}: exit code {ended.returncode}, {seconds:.0f} s", file=sys.stderr)
+    printed = ended.stdout.rstrip() or (ended.stderr.rstrip() if ended.returncode else "")
     return Shown(
         command=command,
         code=ended.returncode,
         seconds=seconds,
-        terminal=_without_long_paths(ended.stdout.rstrip()),
+        terminal=_without_long_paths(printed, root),
     )
 
 
@@ -281,9 +366,26 @@ def _short(word: str) -> str:
     return "/".join(path.parts[-2:]) if path.is_absolute() else word
 
 
-def _without_long_paths(text: str) -> str:
-    """Return what was printed, without the folder of this checkout."""
-    return text.replace(f"{ROOT}/", "")
+def _without_long_paths(text: str, root: Path) -> str:
+    """Return what was printed, without the folder of the results and that of this checkout."""
+    return text.replace(f"{root}/", "").replace(f"{ROOT}/", "")
+
+
+def keep_calls(calls: Sequence[Shown], folder: Path) -> None:
+    """Write what the calls for a robot left behind into its folder."""
+    kept = [asdict(call) for call in calls]
+    for call in kept:
+        named = call["pictures"].items()
+        call["pictures"] = {name: path.relative_to(folder).as_posix() for name, path in named}
+    (folder / CALLS).write_text(json.dumps(kept, indent=2), encoding="utf-8")
+
+
+def kept_calls(folder: Path) -> list[Shown]:
+    """Read what the calls for a robot left behind in an earlier run."""
+    calls = [Shown(**call) for call in json.loads((folder / CALLS).read_text(encoding="utf-8"))]
+    for call in calls:
+        call.pictures = {name: folder / path for name, path in call.pictures.items()}
+    return calls
 
 
 # ---- pictures
@@ -346,17 +448,23 @@ def report_screenshots(report: Path, folder: Path) -> dict[str, Path]:
     return pictures
 
 
-def for_page(picture: Path, target: Path) -> None:
-    """Write a small copy of a picture.
+def for_page(picture: Path, target: Path) -> int:
+    """Write a small copy of a picture; only the beginning of a long one.
 
     Args:
         picture: The picture.
         target: File to write.
+
+    Returns:
+        The width of the copy [pixels].
     """
     with Image.open(picture) as opened:
         image = opened.convert("RGB")
-    image.thumbnail((PAGE_WIDTH, 10 * PAGE_WIDTH))
+    if image.height > SHOWN_HEIGHT * image.width:
+        image = image.crop((0, 0, image.width, int(SHOWN_HEIGHT * image.width)))
+    image.thumbnail((PAGE_WIDTH, image.height))
     image.quantize(PAGE_COLOURS).save(target, optimize=True)
+    return image.width
 
 
 def save_every_tab(folder: Path) -> None:
@@ -376,18 +484,33 @@ def save_every_tab(folder: Path) -> None:
 # ---- page
 
 
-HEAD = """# Gallery
+HEAD = """---
+hide:
+  - navigation
+---
 
-Every output of mjfim for six robots, made by
+# Gallery
+
+Every output of mjfim for several robots: what the terminal prints, the pictures, the beginning of
+`report.html`, and the files of the viewer. The page is made by
+
+<!-- not run: needs models and logs of others -->
 
 ```sh
-python -m scripts.gallery --models FOLDER --data FOLDER -o out/gallery --page docs/gallery.md
+python -m scripts.gallery --models FOLDER --data FOLDER \\
+    -o out/gallery --page docs/gallery.md
 ```
 
-The colours mean the same everywhere: blue is the initial trajectory, red the designed one, orange
-the nominal model, teal what was measured, purple what was identified. `report.html` shows the same
-results with plots to hover and zoom; here are pictures of it.
+The colours mean the same everywhere: {colours}
+([words and colours](reference/words-and-colours.md)). Pictures of reports end where their first
+screens end; the reports themselves have plots to hover and zoom.
 """
+
+# What is said of the simulated recordings of a robot.
+SIMULATED = (
+    "Its recordings are simulated: the robot's parameters differ from the model by "
+    f"{100 * ROBOT_DIFFERENCE:.0f} % of their sizes, unless they are known beforehand."
+)
 
 
 def write_page(page: Path, shown: Sequence[tuple[Robot, Sequence[Shown]]]) -> None:
@@ -402,27 +525,112 @@ def write_page(page: Path, shown: Sequence[tuple[Robot, Sequence[Shown]]]) -> No
         shutil.rmtree(images)
     images.mkdir(parents=True)
 
-    parts = [HEAD]
+    *most, last = [f"{term.colour_name} for {term.word}" for term in TERMS]
+    colours = f"{', '.join(most)} and {last}"
+    parts = [
+        "\n".join(textwrap.wrap(line, 100)) for line in HEAD.format(colours=colours).split("\n")
+    ]
+    parts.append(_contents(shown))
+    once = True
     for robot, calls in shown:
-        parts.append(f"## {robot.title}\n\n{robot.text}\n")
-        parts += [_section(robot, call, images) for call in calls]
+        parts += [f"## {robot.title}", "", *textwrap.wrap(robot_text(robot, calls), 100), ""]
+        for call in calls:
+            parts += [_section(robot, call, images, once=once)]
+            once &= ONCE not in call.pictures
     page.write_text("\n".join(parts), encoding="utf-8")
 
 
-def _section(robot: Robot, call: Shown, images: Path) -> str:
-    """Describe one call: the command, what the terminal printed, and the pictures."""
-    verb = call.command.split()[1]
-    lines = [f"### {robot.title}: {verb}", "", "```text", f"$ {call.command}"]
-    lines += [call.terminal] if call.terminal else []
-    lines += ["```", ""]
+def robot_text(robot: Robot, calls: Sequence[Shown]) -> str:
+    """Return the sentences below the name of a robot."""
+    is_other = any("_robot.toml" in call.command for call in calls)
+    return f"{robot.text} {SIMULATED}" if is_other else robot.text
 
-    for name, picture in call.pictures.items():
-        if name.startswith("report-") and name not in PAGE_SCREENSHOTS:
+
+def _contents(shown: Sequence[tuple[Robot, Sequence[Shown]]]) -> str:
+    """Return a table with a link to every call of every robot."""
+    lines = ["| robot | results |", "|---|---|"]
+    for robot, calls in shown:
+        links = [f"[{_verb(call)}](#{_anchor(robot, _verb(call))})" for call in calls]
+        lines.append(f"| {robot.title} | {', '.join(links)} |")
+    return "\n".join([*lines, ""])
+
+
+def _verb(call: Shown) -> str:
+    """Return the verb of a call."""
+    return call.command.split()[1]
+
+
+def _anchor(robot: Robot, verb: str) -> str:
+    """Return the anchor of a section, as the documentation names it."""
+    return f"{robot.title}-{verb}".lower().replace(" ", "-")
+
+
+def terminal_block(call: Shown) -> str:
+    """Return a command and what it printed, as a terminal of the usual width shows them."""
+    # A command continues on the next line behind a backslash.
+    command = textwrap.wrap(
+        f"$ {call.command}",
+        COLUMNS - 2,
+        subsequent_indent="    ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    lines = [" \\\n".join(command)]
+    for line in call.terminal.splitlines():
+        indent = " " * (len(line) - len(line.lstrip()))
+        lines += textwrap.wrap(line, COLUMNS, subsequent_indent=indent) or [""]
+    return "\n".join(["```text", *lines, "```", ""])
+
+
+def _section(robot: Robot, call: Shown, images: Path, *, once: bool) -> str:
+    """Describe one call: the command, what the terminal printed, and the pictures.
+
+    With `once`, the pictures are shown that the page has only once.
+    """
+    verb = _verb(call)
+    lines = [f"### {robot.title}: {verb}", "", terminal_block(call)]
+    if call.code == 1:
+        lines += ["Exit code 1: the run is complete, and did not reach its goal.", ""]
+
+    for start, caption in CAPTIONS.items():
+        found = [name for name in call.pictures if _shows(name, start)]
+        if not found or (start == ONCE and not once):
             continue
-        target = images / f"{robot.name}-{verb}-{name}.png"
-        for_page(picture, target)
-        lines += [f"![{robot.title}, {verb}: {name}](images/gallery/{target.name})", ""]
+
+        target = images / f"{robot.name}-{verb}-{found[0]}.png"
+        width = for_page(call.pictures[found[0]], target)
+        alt = f"{robot.title}, {verb}: {caption.replace('`', '')}"
+        more = f" (one of {len(found)})" if len(found) > 1 else ""
+        lines += [
+            '<figure markdown="span">',
+            f'![{alt}](images/gallery/{target.name}){{ width="{width}" loading="lazy" }}',
+            f"<figcaption>{re.sub('`(.+?)`', CODE, caption)}{more}</figcaption>",
+            "</figure>",
+            "",
+        ]
     return "\n".join(lines)
+
+
+def _shows(name: str, start: str) -> bool:
+    """Return whether a picture is of a kind: its name is the kind's, perhaps with a number."""
+    return (
+        name == start
+        or (name.startswith(start) and start.endswith("_"))
+        or (name.removeprefix(f"{start}_").isdecimal() and name.startswith(start))
+    )
+
+
+def _new_calls(robot: Robot, folder: Path, parser: argparse.ArgumentParser) -> list[Shown]:
+    """Make the calls for a robot; none if its files are missing."""
+    missing = [path for path in robot.needs if not path.exists()]
+    if missing:
+        print(f"{robot.name}: left out, {missing[0]} does not exist", file=sys.stderr)
+        return []
+    if folder.exists():
+        parser.error(f"{folder} exists; every robot needs a fresh folder")
+    calls = list(show_robot(robot, folder))
+    keep_calls(calls, folder)
+    return calls
 
 
 def main() -> int:
@@ -440,23 +648,19 @@ def main() -> int:
         action="store_true",
         help="also save every tab of the Rerun files at two sizes, which takes a while",
     )
+    parser.add_argument("--reuse", action="store_true", help="use the files of an earlier run")
     options = parser.parse_args()
 
     found = []
     for robot in robots(options.models.resolve(), options.data.resolve()):
-        missing = [path for path in robot.needs if not path.exists()]
-        if missing:
-            print(f"{robot.name}: left out, {missing[0]} does not exist", file=sys.stderr)
-            continue
+        folder = options.output.resolve() / robot.name
         if options.only and robot.name not in options.only:
             continue
-
-        folder = options.output.resolve() / robot.name
-        if folder.exists():
-            parser.error(f"{folder} exists; every robot needs a fresh folder")
-        found.append((robot, list(show_robot(robot, folder))))
-        if options.every_tab:
-            save_every_tab(folder)
+        calls = kept_calls(folder) if options.reuse else _new_calls(robot, folder, parser)
+        if calls:
+            found.append((robot, calls))
+            if options.every_tab:
+                save_every_tab(folder)
 
     if options.page is not None:
         write_page(options.page, found)

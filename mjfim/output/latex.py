@@ -25,12 +25,15 @@ SPECIAL = {
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
+    '"': "''",
 }
 
 # Characters of units and formulas as commands of mathematics.
 MATHEMATICS = {
     "×": r"\times",
+    "÷": r"\div",
+    "▶": r"\triangleright",
+    "•": r"\bullet",
     "·": r"\cdot",
     "±": r"\pm",
     "∞": r"\infty",

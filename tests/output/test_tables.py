@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import shutil
+import subprocess
+import unicodedata
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +25,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
 )
 from tests.support.made_records import make_study
+from tests.support.paths import ROOT
 
 # A name with every character that Markdown or LaTeX could take for a mark of its own.
 HOSTILE = r"a|b*c`d<e>f_g\h{i}j$k&l#m%n~o^p_[q]"
@@ -103,3 +109,45 @@ def test_line_breaks_do_not_break_a_table() -> None:
     summary = Summary(title="A\nB", outcome="", parts=(table,))
     assert "# A B\n" in markdown.render_tables(summary)
     assert r"\caption{two lines}" in latex.render_tables(summary)
+
+
+def test_latex_knows_every_character_of_the_tables() -> None:
+    """Words of summaries and records hold no character that LaTeX refuses."""
+    files = [*(ROOT / "mjfim" / "output" / "summaries").glob("*.py")]
+    files += [ROOT / "mjfim" / "output" / "summary_parts.py"]
+    files += (ROOT / "mjfim" / "records").glob("*.py")
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text("utf-8")))]
+    texts = [node.value for node in nodes if isinstance(node, ast.Constant)]
+    used = {character for text in texts if isinstance(text, str) for character in text}
+
+    # LaTeX reads letters with accents as they are.
+    unknown = {
+        c for c in used if not latex.escape(c).isascii() and not unicodedata.decomposition(c)
+    }
+    assert unknown == set()
+
+
+@pytest.mark.slow
+def test_tables_with_hostile_names_are_compiled(tmp_path: Path) -> None:
+    compiler = shutil.which("pdflatex")
+    if compiler is None:
+        pytest.skip("pdflatex is not installed")
+    table = made_table(title=HOSTILE + '"σ ± × ÷ ▶ 10⁻⁷', note="50 % of σ²; a_1 & b")
+    summary = Summary(title="", outcome="", parts=(table, table))
+    lines = [r"\documentclass{article}", r"\usepackage{booktabs}", r"\begin{document}"]
+    lines += [latex.render_tables(summary), r"\end{document}", ""]
+    (tmp_path / "tables.tex").write_text("\n".join(lines), encoding="utf-8")
+
+    ended = subprocess.run(
+        [compiler, "-draftmode", "-interaction=nonstopmode", "-halt-on-error", "tables.tex"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        errors="replace",
+        timeout=60.0,
+        check=False,
+    )
+    if "booktabs.sty' not found" in ended.stdout:
+        pytest.skip("this LaTeX has no package booktabs")
+    assert ended.returncode == 0, ended.stdout[-2000:]
