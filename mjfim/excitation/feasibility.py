@@ -18,6 +18,39 @@ SHRINK_FACTORS = np.concatenate(
 )
 
 
+# Factors on the deviation of all actuators, and on that of a single one in addition.
+COMMON_FACTORS = (1.0, 0.97, 0.9, 0.8)
+SINGLE_FACTORS = (0.94, 0.8, 0.64, 0.4, 0.2, 0.0)
+
+
+def reduced_actuators(control: Array, centre: Array) -> Iterator[Iterator[Array]]:
+    """Controls in which a single actuator deviates less from the centre than all others.
+
+    A motion often leaves a limit by one joint only, and shrinking all actuators would lose most of
+    the information.
+
+    Args:
+        control: (N, nu) control, which is infeasible [u-unit].
+        centre: (nu,) control towards which it is shrunk [u-unit].
+
+    Yields:
+        For each common factor and each actuator: (N, nu) controls, the largest one first.
+    """
+    for common in COMMON_FACTORS:
+        shrunk = centre + common * (control - centre)
+        for actuator in range(control.shape[1]):
+            yield _reductions(shrunk, centre, actuator)
+
+
+def _reductions(control: Array, centre: Array, actuator: int) -> Iterator[Array]:
+    """Controls in which one actuator deviates less from the centre."""
+    for factor in SINGLE_FACTORS:
+        reduced = control.copy()
+        deviation = control[:, actuator] - centre[actuator]
+        reduced[:, actuator] = centre[actuator] + factor * deviation
+        yield reduced
+
+
 def shrink_until_feasible(
     control: Array, centre: Array, evaluate: Callable[[Array], T | None]
 ) -> T | None:

@@ -8,7 +8,7 @@ is evaluated; then it is optimised again within tighter limits.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,7 +20,7 @@ from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.excitation.constrained import ConstrainedSearch, run_in_worker
 from mjfim.excitation.controls_within_limits import LimitedCost
-from mjfim.excitation.feasibility import shrink_about_each
+from mjfim.excitation.feasibility import reduced_actuators, shrink_about_each
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
 from mjfim.excitation.levels import DescentLevel
@@ -196,18 +196,34 @@ class Multistart:
                 return results
 
             winner, _ = violated
-            results[winner] = self._best_feasible(results[winner])
+            results[winner] = self._best_feasible(results[winner], waiting)
         return results
 
-    def _best_feasible(self, result: RunResult) -> RunResult:
+    def _best_feasible(self, result: RunResult, waiting: Budget) -> RunResult:
         """A result with its best feasible control: a shrunk one, or that of an earlier stage."""
-        found = [self._shrink(np.asarray(result.control))]
+        control = np.asarray(result.control)
+        found = [self._shrink(control)]
         found += [_Feasible(self._cost_on_stated_plant(c), c) for c in result.earlier]
+
+        # No run within tighter limits may follow a request to stop.
+        if self.budget.stop.requested:
+            found += self._with_reduced_actuators(control, waiting)
 
         best = min(found, key=lambda feasible: feasible.cost)
         if not np.isfinite(best.cost):
             return replace(result, cost=np.inf, status=Status.INFEASIBLE)
         return replace(result, control=best.control, cost=best.cost, status=Status.BEST_SEEN)
+
+    def _with_reduced_actuators(self, control: Array, waiting: Budget) -> Iterator[_Feasible]:
+        """Feasible controls in which one actuator deviates less, while there is time to wait."""
+        for candidates in reduced_actuators(control, self.fine.task.centre):
+            for candidate in candidates:
+                if waiting.exhausted is not None:
+                    return
+                cost = self._cost_on_stated_plant(candidate)
+                if np.isfinite(cost):
+                    yield _Feasible(cost, candidate)
+                    break
 
     # ---- the search for a feasible motion
 

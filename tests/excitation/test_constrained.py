@@ -214,6 +214,24 @@ def test_an_infeasible_result_with_a_feasible_motion_inside_is_shrunk(tmp_path: 
     assert_inside(task, found.control)
 
 
+def test_a_stopped_search_shrinks_only_the_actuator_that_leaves_its_limit(tmp_path: Path) -> None:
+    """To shrink both would lose information; no further run may follow a request to stop."""
+    task = arm_task(tmp_path, limits={"control_rate": 40.0})
+    wave = np.sin(4.0 * np.pi * task.t)[:, None]
+    control = task.centre + wave * [1.6, 0.3]
+    search = multistart_of(task.relaxed())
+    search.budget.stop.request()
+    shrunk = search._shrink(control)
+    assert np.isfinite(shrunk.cost)
+
+    left = RunResult(name="x", control=control, cost=0.1 * shrunk.cost)
+    (kept,) = consume(search.tighten_winner([left]), None)
+    assert kept.status is Status.BEST_SEEN
+    assert kept.cost < 0.7 * shrunk.cost
+    assert np.abs(kept.control).max() <= 1.0
+    np.testing.assert_allclose(kept.control[:, 1], control[:, 1])
+
+
 def test_a_design_says_what_the_initial_control_violates_and_when(tmp_path: Path) -> None:
     wild = {"kind": "sine", "amplitude": 8.0, "frequency": 1.0}
     task = cart_inside(tmp_path, control=wild, descent={"max_iterations": 1, "coarse": 1})
