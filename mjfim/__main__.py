@@ -22,6 +22,7 @@ from types import FrameType  # noqa: E402
 from typing import NoReturn  # noqa: E402
 
 from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS  # noqa: E402
+from mjfim.own_defaults import ignore_settings_of_this_folder  # noqa: E402
 
 
 def main() -> NoReturn:
@@ -31,7 +32,7 @@ def main() -> NoReturn:
     for number in SIGNALS if handled else ():
         signal.signal(number, _end_at_once)
 
-    _import_matplotlib()
+    ignore_settings_of_this_folder()
     from mjfim.cli.main import main as run_command_line
 
     # Verbs have a handler of their own. After a verb, the program ends by itself.
@@ -40,20 +41,6 @@ def main() -> NoReturn:
     finally:
         for number in SIGNALS if handled else ():
             signal.signal(number, signal.SIG_IGN)
-
-
-def _import_matplotlib() -> None:
-    """Import matplotlib with its own defaults; it would read a `matplotlibrc` of this folder."""
-    current = os.open(os.curdir, os.O_RDONLY) if hasattr(os, "fchdir") else os.getcwd()
-    os.chdir(HOME)
-    try:
-        import matplotlib
-
-        matplotlib.rcdefaults()
-    finally:
-        os.chdir(current)
-        if isinstance(current, int):
-            os.close(current)
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> None:

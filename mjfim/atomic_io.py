@@ -12,8 +12,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Protocol
 
-import psutil
-
 # Permissions of a new file, from which the umask of the process removes some.
 DEFAULT_PERMISSIONS = 0o666
 
@@ -164,6 +162,8 @@ def _remove_left_over_files(folder: Path) -> None:
 
 def _is_running(process: int) -> bool:
     """Check whether a process exists, by its number."""
+    import psutil  # slow, and needed only where a process has left a file
+
     # `os.kill(process, 0)` would end the process on Windows.
     try:
         return bool(psutil.pid_exists(process))

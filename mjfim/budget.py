@@ -8,6 +8,7 @@ turns Ctrl-C into a request of a token.
 from __future__ import annotations
 
 import copy
+import math
 import signal
 import threading
 import time
@@ -17,8 +18,6 @@ from contextvars import ContextVar
 from enum import Enum
 from types import FrameType
 from typing import Any
-
-import numpy as np
 
 from mjfim.interruption import current_interruption
 
@@ -69,7 +68,7 @@ class Budget:
     def __init__(
         self,
         *,
-        seconds: float = np.inf,
+        seconds: float = math.inf,
         steps: float | None = None,
         iterations: int | None = None,
         stop: StopToken | None = None,
@@ -77,8 +76,8 @@ class Budget:
         self.stop = StopToken() if stop is None else stop
         self.begun = time.monotonic()
         self.deadline = self.begun + seconds
-        self.max_steps = np.inf if steps is None else float(steps)
-        self.max_iterations = np.inf if iterations is None else float(iterations)
+        self.max_steps = math.inf if steps is None else float(steps)
+        self.max_iterations = math.inf if iterations is None else float(iterations)
         self.steps = 0.0
         self.iterations = 0
 
@@ -107,7 +106,7 @@ class Budget:
         """Used fraction of the limit that is closest to its end; 1 or more if it is exhausted."""
         shares = [self.steps / self.max_steps, self.iterations / self.max_iterations]
         total = self.deadline - self.begun
-        if np.isfinite(total):
+        if math.isfinite(total):
             shares.append(self.seconds_used / total if total > 0.0 else 1.0)
 
         return max(shares)
@@ -139,7 +138,7 @@ class Budget:
         steps_left = max(self.max_steps - self.steps, 0.0)
         return Budget(
             seconds=fraction * self.seconds_left,
-            steps=fraction * steps_left if np.isfinite(steps_left) else None,
+            steps=fraction * steps_left if math.isfinite(steps_left) else None,
             iterations=iterations,
             stop=self.stop,
         )

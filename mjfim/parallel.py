@@ -27,6 +27,7 @@ from weakref import WeakKeyDictionary
 
 from threadpoolctl import threadpool_limits
 
+from mjfim.amounts import MAX_THREADS
 from mjfim.budget import Budget, StopToken
 from mjfim.errors import ExperimentError
 from mjfim.interruption import SIGNALS, hurried
@@ -49,9 +50,6 @@ LOST_SENTENCE = (
     "a worker process was ended from outside (killed, perhaps because the memory was full); its "
     "work was done again without worker processes"
 )
-
-# Largest number of threads that can be asked for; more would only use memory.
-MAX_THREADS = 1024
 
 # Largest number of processes of a pool on Windows, beyond which Python refuses it.
 MAX_WINDOWS_PROCESSES = 61

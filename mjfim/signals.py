@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.signal import chirp
+import scipy
 
 from mjfim.arrays import Array
 
@@ -65,14 +64,14 @@ def spline_basis(
 
     # Splines that extend beyond the end of the horizon continue at its beginning.
     if periodic:
-        values = BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
+        values = scipy.interpolate.BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
         values[:, :SPLINE_DEGREE] += values[:, intervals:]
         return np.asarray(values[:, :intervals])
 
     # Knots are repeated at both ends. Only the first two splines then have a value or a slope at
     # the beginning, and only the last two at the end.
     knots = np.clip(knots, 0.0, horizon)
-    values = BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
+    values = scipy.interpolate.BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
     first = 2 if starts_at_rest else 0
     last = values.shape[1] - (2 if ends_at_rest else 0)
     return np.asarray(values[:, first:last])
@@ -259,7 +258,7 @@ class Chirp:
         last_frequency = settings.frequency(last).tolist()
         degrees = (360.0 * phase).tolist()
         sweeps = [
-            chirp(settings.t, f0, settings.horizon, f1, phi=phi)
+            scipy.signal.chirp(settings.t, f0, settings.horizon, f1, phi=phi)
             for f0, f1, phi in zip(first_frequency, last_frequency, degrees, strict=True)
         ]
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 from mjfim import atomic_io, parallel
@@ -33,7 +34,7 @@ def test_left_over_files_are_removed_on_windows_without_a_signal(
         raise AssertionError(f"signal {number} to process {process}")
 
     monkeypatch.setattr(os, "kill", no_signal)
-    monkeypatch.setattr(atomic_io.psutil, "pid_exists", lambda process: process == 17)
+    monkeypatch.setattr(psutil, "pid_exists", lambda process: process == 17)
     ended, running = (
         tmp_path / f"{atomic_io.PREFIX}{process}-x.csv" for process in (4_000_000, 17)
     )

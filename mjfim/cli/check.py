@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import mjfim
-from mjfim.arrays import Array
-from mjfim.cli.announcements import (
-    announce_check,
-    announce_check_of_recordings,
-    refusal_of_design,
-)
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -31,14 +25,11 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import ExperimentError
-from mjfim.excitation.task_parts import require_design_keys, stated_control
-from mjfim.experiment.input_files import input_files
-from mjfim.experiment.system import System
-from mjfim.output import archive
-from mjfim.output.folders import CHECK_FILES
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.presentation import describe
-from mjfim.recordings.read import read_recording, recording_paths
+
+if TYPE_CHECKING:
+    from mjfim.arrays import Array
+    from mjfim.experiment.system import System
 
 
 @verb
@@ -64,6 +55,19 @@ def check(
     threads: Threads = None,
 ) -> None:
     """Say which parameters can be identified, how accurately, and which only in combination."""
+    from mjfim.cli.announcements import (
+        announce_check,
+        announce_check_of_recordings,
+        refusal_of_design,
+    )
+    from mjfim.excitation.task_parts import require_design_keys
+    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.system import System
+    from mjfim.output import archive
+    from mjfim.output.folders import CHECK_FILES
+    from mjfim.output.presentation import describe
+    from mjfim.recordings.read import read_recording, recording_paths
+
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(stated, threads=threads)
     with progress("reading"):
@@ -110,6 +114,8 @@ def _stated_control(system: System) -> Array:
     Raises:
         ExperimentError: The horizon or the signal cannot be used; the message names the file.
     """
+    from mjfim.excitation.task_parts import stated_control
+
     try:
         return stated_control(system)
     except ExperimentError as error:

@@ -27,12 +27,13 @@ from rich.text import Text
 from typer.core import TyperCommand
 
 import mjfim
+from mjfim.amounts import MAX_THREADS
 from mjfim.atomic_io import observed_by, remove_temporary_files
+from mjfim.cli.inputs import require_inputs
 from mjfim.errors import (
     MjfimError,
     ModelWarning,
     NoResultError,
-    RecordingError,
     UndrawnWarning,
     UnfinishedError,
 )
@@ -42,6 +43,7 @@ from mjfim.interruption import (
     Interruption,
     current_interruption,
 )
+from mjfim.output.live_address import ADDRESS, HERE
 from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.progress_text import design_stage, design_text, fit_text, part_text
@@ -49,14 +51,13 @@ from mjfim.output.report import OWN_REPORTS, REPORT, is_report
 from mjfim.output.summary_parts import Summary
 from mjfim.output.text import render
 from mjfim.output.video.record import NoVideoError, format_of, require_encoder
-from mjfim.parallel import LOST_SENTENCE, MAX_THREADS, Pool
 from mjfim.records.events import Callback, DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.progress import stages_observed_by
-from mjfim.records.serialization import as_json as records_as_json
 
 if TYPE_CHECKING:
     from mjfim.experiment.system import System
     from mjfim.output.video.results import Filmed
+    from mjfim.parallel import Pool
 
 app = typer.Typer(
     add_completion=False,
@@ -348,6 +349,8 @@ def worker_processes(count: int) -> Iterator[Pool]:
     Args:
         count: Largest number of processes.
     """
+    from mjfim.parallel import LOST_SENTENCE, Pool
+
     with Pool(count) as pool:
         yield pool
     if pool.has_lost_worker:
@@ -415,26 +418,6 @@ def root(
     """Design the experiment that identifies a MuJoCo model's parameters, then identify them."""
 
 
-def _require_utf8_paths(values: Iterable[Any]) -> None:
-    """Refuse paths that libraries cannot open, before the work.
-
-    Args:
-        values: Arguments of a verb; only paths and lists of paths are looked at.
-
-    Raises:
-        RecordingError: A path has characters that are not UTF-8 in the present locale.
-    """
-    for value in values:
-        for path in value if isinstance(value, list) else [value]:
-            try:
-                str(path).encode("utf-8")
-            except UnicodeEncodeError:
-                raise RecordingError(
-                    f"{path}: this path has characters that are not UTF-8 in the present locale; "
-                    "rename it, or set a UTF-8 locale, for example LC_ALL=C.UTF-8"
-                ) from None
-
-
 def verb(function: Callable[..., None]) -> Callable[..., None]:
     """Register a function as a verb, and turn its errors into messages and exit codes.
 
@@ -449,13 +432,13 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
     """
 
     @functools.wraps(function)
-    def wrapped(*args: Any, **kwargs: Any) -> None:
+    def wrapped(**kwargs: Any) -> None:
         """Call the verb; print one message and exit for each error."""
         interruption = Interruption(_announce)
         try:
-            with interruption, _claims, _worded_warnings():
-                _require_utf8_paths([*args, *kwargs.values()])
-                function(*args, **kwargs)
+            with interruption, _claims, _worded_warnings(), _pressed_during_import(interruption):
+                require_inputs(kwargs)
+                function(**kwargs)
         except (NoResultError, UnfinishedError):
             _say_what_is_there(interruption)
             raise typer.Exit(INTERRUPTED_CODE) from None
@@ -483,6 +466,17 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
 
     app.command(function.__name__.rstrip("_").replace("_", "-"), cls=VerbCommand)(wrapped)
     return wrapped
+
+
+@contextmanager
+def _pressed_during_import(interruption: Interruption) -> Iterator[None]:
+    """Recognise a press during an import, where compiled modules raise an error of their own."""
+    try:
+        yield
+    except ImportError:
+        if interruption.presses:
+            raise NoResultError from None
+        raise
 
 
 @contextmanager
@@ -538,8 +532,6 @@ def with_live_address(words: Sequence[str]) -> list[str]:
     Args:
         words: The words. A word after --live is its address only if it looks like one.
     """
-    from mjfim.output.live import ADDRESS, HERE
-
     completed: list[str] = []
     for k, word in enumerate(words):
         follower = words[k + 1] if k + 1 < len(words) else ""
@@ -564,7 +556,7 @@ def watched(address: str | None, system: System, display: Callback) -> Iterator[
         yield display
         return
 
-    from mjfim.output.live import HERE, live_system
+    from mjfim.output.live import live_system
 
     where = None if address == HERE else address
     with live_system(system, where, say=_announce) as show:
@@ -937,6 +929,8 @@ def print_result(
         verbose: True for all tables and sentences, False for a screen of text at most.
     """
     if as_json:
-        typer.echo(records_as_json(values), nl=False)
+        from mjfim.records.serialization import as_json as json_of
+
+        typer.echo(json_of(values), nl=False)
     else:
         out.print(render(summary, verbose=verbose))

@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.announcements import announce_comparison
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -26,14 +25,8 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import NoResultError
-from mjfim.excitation.task import DesignTask
-from mjfim.experiment.input_files import input_files
-from mjfim.output import archive
-from mjfim.output.folders import comparison_files
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.presentation import describe
-from mjfim.studies.baselines.methods import METHODS
-from mjfim.studies.compare import chosen_methods, compare_task
+from mjfim.studies.baselines.titles import TITLES
 
 
 @verb
@@ -48,7 +41,7 @@ def compare(
     methods: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME,...", help=f"Baselines to run before the design: {', '.join(METHODS)}."
+            metavar="NAME,...", help=f"Baselines to run before the design: {', '.join(TITLES)}."
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the baselines.")] = 0,
@@ -62,6 +55,14 @@ def compare(
 
     The exit code is 1 if one of them is better than the design.
     """
+    from mjfim.cli.announcements import announce_comparison
+    from mjfim.excitation.task import DesignTask
+    from mjfim.experiment.input_files import input_files
+    from mjfim.output import archive
+    from mjfim.output.folders import comparison_files
+    from mjfim.output.presentation import describe
+    from mjfim.studies.compare import chosen_methods, compare_task
+
     task = DesignTask.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     chosen = (
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import mjfim
+from mjfim.amounts import MAX_STARTS
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.cli.announcements import announce_design, number_of_starts
 from mjfim.cli.common import (
     AsJson,
     Duration,
@@ -38,19 +37,16 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import first_ones
-from mjfim.excitation.design import design_budget, design_task
-from mjfim.excitation.shortest_horizon import OutOfReachError, ShortestExperiment
-from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import require_design_keys
-from mjfim.experiment.input_files import input_files
-from mjfim.experiment.system import System
-from mjfim.experiment.task_tables import MAX_STARTS
-from mjfim.output import archive
-from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.presentation import describe
-from mjfim.records.design import Design
-from mjfim.records.events import Callback
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from mjfim.excitation.shortest_horizon import ShortestExperiment
+    from mjfim.excitation.task import DesignTask
+    from mjfim.experiment.system import System
+    from mjfim.records.design import Design
+    from mjfim.records.events import Callback
 
 # Time after which a design ends that states none [s].
 DEFAULT_SECONDS = 120.0
@@ -63,6 +59,8 @@ def several(task: DesignTask) -> Iterator[Executor | None]:
     Yields:
         A pool; None without hard limits, and for a single initial control, which uses all threads.
     """
+    from mjfim.cli.announcements import number_of_starts
+
     count = number_of_starts(task.system)
     if count == 1 or not task.is_limited:
         yield None
@@ -97,6 +95,15 @@ def design(
     threads: Threads = None,
 ) -> None:
     """Design the excitation that gives the most information about the parameters."""
+    from mjfim.excitation.design import design_budget, design_task
+    from mjfim.excitation.task import DesignTask
+    from mjfim.excitation.task_parts import require_design_keys
+    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.system import System
+    from mjfim.output import archive
+    from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
+    from mjfim.output.presentation import describe
+
     stated = mjfim.Experiment.from_file(experiment)
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
@@ -173,6 +180,8 @@ def _announced(system: System, has_default: bool) -> tuple[System, Duration | No
         system: The system, whose experiment states the design.
         has_default: True if the default time ends the design.
     """
+    from mjfim.cli.announcements import announce_design
+
     if has_default:
         limited = system.experiment.replace(descent={"seconds": DEFAULT_SECONDS})
         system = replace(system, experiment=limited)
@@ -193,6 +202,8 @@ def _shortest(
     task: DesignTask, callback: Callback, executor: Executor | None, stop: StopToken
 ) -> ShortestExperiment:
     """Find the shortest experiment; exit with code 1 if the longest one misses a target."""
+    from mjfim.excitation.shortest_horizon import OutOfReachError
+
     try:
         return mjfim.shortest_experiment(
             task.experiment,

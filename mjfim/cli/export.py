@@ -9,18 +9,7 @@ import typer
 
 import mjfim
 from mjfim.cli.common import Force, claim_file, claim_folder, errors, keep_result, progress, verb
-from mjfim.experiment.input_files import input_files
-from mjfim.experiment.system import System
-from mjfim.output.folders import find_experiment_file
-from mjfim.output.robot.export import (
-    ExportOptions,
-    Target,
-    exported_files,
-    is_folder,
-    target_of,
-    write_export,
-)
-from mjfim.output.robot.plan import RobotPlan
+from mjfim.output.robot.options import Target
 
 
 @verb
@@ -60,6 +49,18 @@ def export(
     force: Force = False,
 ) -> None:
     """Write a design for ROS 2 or LeRobot, or as a stand-alone Python program that plays it."""
+    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.system import System
+    from mjfim.output.folders import find_experiment_file
+    from mjfim.output.robot.export import (
+        ExportOptions,
+        exported_files,
+        is_folder,
+        target_of,
+        write_export,
+    )
+    from mjfim.output.robot.plan import RobotPlan
+
     target = target_of(to)
     file = design_folder / "design.npz" if design_folder.is_dir() else design_folder
     stated = mjfim.Experiment.from_file(experiment or find_experiment_file(file))

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.announcements import announce_fit
 from mjfim.cli.common import (
     ExperimentFile,
     Folder,
@@ -21,12 +20,7 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
-from mjfim.experiment.input_files import input_files
-from mjfim.experiment.system import System
-from mjfim.output.folders import SYSID_FILES
 from mjfim.output.text import render
-from mjfim.recordings.read import read_recording, recording_paths
-from mjfim.records.progress import begin_stage
 
 
 @verb
@@ -40,9 +34,14 @@ def export_sysid(
     force: Force = False,
 ) -> None:
     """Pass recordings and parameters to mujoco.sysid, and compare its estimates with mjfim's."""
-    # MuJoCo's sysid takes a while to import; no other verb needs it.
+    from mjfim.cli.announcements import announce_fit
+    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.system import System
+    from mjfim.output.folders import SYSID_FILES
     from mjfim.output.sysid import comparison as sysid_comparison
     from mjfim.output.sysid.sequences import require_extra
+    from mjfim.recordings.read import read_recording, recording_paths
+    from mjfim.records.progress import begin_stage
 
     require_extra()
     system = System.resolve(mjfim.Experiment.from_file(experiment))

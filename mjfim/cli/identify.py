@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.announcements import announce_fit
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -32,15 +31,7 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import ExperimentError
-from mjfim.experiment.input_files import input_files
-from mjfim.experiment.system import System
-from mjfim.identification.identify import identify_system
-from mjfim.output import archive
-from mjfim.output.folders import estimate_files, parts_of_identified
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.presentation import describe
-from mjfim.output.summaries.logs import describe_logs
-from mjfim.recordings.read import read_log, recording_paths
 
 
 @verb
@@ -75,6 +66,16 @@ def identify(
     threads: Threads = None,
 ) -> None:
     """Estimate the parameters from recordings, with intervals, predictions and warnings."""
+    from mjfim.cli.announcements import announce_fit
+    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.system import System
+    from mjfim.identification.identify import identify_system
+    from mjfim.output import archive
+    from mjfim.output.folders import estimate_files, parts_of_identified
+    from mjfim.output.presentation import describe
+    from mjfim.output.summaries.logs import describe_logs
+    from mjfim.recordings.read import read_log, recording_paths
+
     if method not in ("least_squares", "newton"):
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mjfim.atomic_io import replacing
 from mjfim.cli.common import Force, ModelFile, claim_file, errors, out, progress, verb
-from mjfim.cli.questions import ask as ask_for
 from mjfim.errors import ExperimentError
-from mjfim.studies.first_experiment.candidates import GROUPS, Group
-from mjfim.studies.first_experiment.document import experiment_text
-from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
-from mjfim.studies.first_experiment.urdf import is_urdf
-from mjfim.studies.first_experiment.wishes import Wishes, groups_of
+from mjfim.studies.first_experiment.groups import GROUPS, Group
+
+if TYPE_CHECKING:
+    from mjfim.studies.first_experiment.propose import Proposal
+    from mjfim.studies.first_experiment.wishes import Wishes
 
 
 @verb
@@ -53,6 +52,12 @@ def init(
     force: Force = False,
 ) -> None:
     """Write a first experiment file for a model, with a comment for every choice."""
+    from mjfim.cli.questions import ask as ask_for
+    from mjfim.studies.first_experiment.document import experiment_text
+    from mjfim.studies.first_experiment.propose import propose_experiment
+    from mjfim.studies.first_experiment.urdf import is_urdf
+    from mjfim.studies.first_experiment.wishes import Wishes
+
     file = output or Path(f"{model.stem}.toml")
     companion = file.with_name(f"{file.stem}_motors.xml")
     wishes = Wishes(groups=_groups(parameters), payload=payload)
@@ -83,6 +88,8 @@ def init(
 
 def _groups(text: str) -> list[Group]:
     """Groups of parameters of the option `--parameters`."""
+    from mjfim.studies.first_experiment.wishes import groups_of
+
     try:
         return groups_of(text)
     except ExperimentError as error:

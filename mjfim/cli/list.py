@@ -9,8 +9,6 @@ import typer
 
 from mjfim.cli.common import AsJson, ModelFile, print_result, verb
 from mjfim.errors import ExperimentError
-from mjfim.output.summaries.inventory import describe_inventory
-from mjfim.studies.inventory import list_model
 
 # Kinds of entries, as in `mjfim.records.inventory.KINDS`.
 Kind = Literal["parameters", "outputs", "actuators", "keyframes", "limits"]
@@ -33,6 +31,9 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List the parameters, outputs, actuators, keyframes and limits of a model."""
+    from mjfim.output.summaries.inventory import describe_inventory
+    from mjfim.studies.inventory import list_model
+
     inventory = list_model(model)
     if kind is not None:
         inventory = inventory.only(kind)

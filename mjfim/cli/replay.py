@@ -13,10 +13,6 @@ import mjfim
 from mjfim.atomic_io import replacing
 from mjfim.cli.common import Force, claim_file, errors, verb
 from mjfim.errors import RecordingError
-from mjfim.experiment.labels import labels_of_system
-from mjfim.experiment.system import System
-from mjfim.output import archive
-from mjfim.output.folders import find_experiment_file, find_rerun_file
 
 
 @verb
@@ -35,7 +31,11 @@ def replay(
     force: Force = False,
 ) -> None:
     """Show a result in the Rerun viewer."""
+    from mjfim.experiment.labels import labels_of_system
+    from mjfim.experiment.system import System
+    from mjfim.output import archive
     from mjfim.output import rerun as rerun_log
+    from mjfim.output.folders import find_experiment_file, find_rerun_file
 
     if save is not None and save.suffix != ".rrd":
         raise RecordingError(f"--save {save}: a Rerun file ends in .rrd")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import mjfim
-from mjfim.cli.announcements import announce_trials
 from mjfim.cli.common import (
     AsJson,
     DesignFile,
@@ -34,17 +33,11 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import NoResultError
-from mjfim.excitation.task import DesignTask
-from mjfim.excitation.task_parts import require_design_keys
-from mjfim.experiment.input_files import input_files
-from mjfim.experiment.simulate import simulate_system
-from mjfim.experiment.system import System
-from mjfim.output import archive
-from mjfim.output.folders import study_files
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.presentation import describe
-from mjfim.records.trajectory import Trajectory
-from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
+
+if TYPE_CHECKING:
+    from mjfim.experiment.system import System
+    from mjfim.records.trajectory import Trajectory
 
 
 @verb
@@ -69,6 +62,13 @@ def simulate(
     Without a design it is a recording of the initial control, or of the motion of a model without
     actuators from its initial state.
     """
+    from mjfim.excitation.task import DesignTask
+    from mjfim.excitation.task_parts import require_design_keys
+    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.simulate import simulate_system
+    from mjfim.experiment.system import System
+    from mjfim.output import archive
+
     system = System.resolve(mjfim.Experiment.from_file(experiment))
     output = output or (design_file or experiment).with_name("recording.csv")
     inputs = input_files(system.experiment, [design_file])
@@ -114,6 +114,14 @@ def montecarlo(
     force: Force = False,
 ) -> None:
     """Compare estimates with the Cramér-Rao bound on the initial and on the designed trajectory."""
+    from mjfim.cli.announcements import announce_trials
+    from mjfim.experiment.input_files import input_files
+    from mjfim.experiment.system import System
+    from mjfim.output import archive
+    from mjfim.output.folders import study_files
+    from mjfim.output.presentation import describe
+    from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
+
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(
         stated if measure_rate is None else stated.replace(measure_rate=measure_rate)

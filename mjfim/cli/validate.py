@@ -11,9 +11,6 @@ import typer
 import mjfim
 from mjfim.cli.common import AsJson, Verbose, print_result, verb
 from mjfim.errors import ExperimentError
-from mjfim.experiment.schema import json_schema
-from mjfim.output.summaries.stated_experiment import describe_experiment
-from mjfim.studies.stated_experiment import stated_experiment
 
 
 @verb
@@ -29,6 +26,10 @@ def validate(
     verbose: Verbose = False,
 ) -> None:
     """Say whether an experiment file is correct, and what it states."""
+    from mjfim.experiment.schema import json_schema
+    from mjfim.output.summaries.stated_experiment import describe_experiment
+    from mjfim.studies.stated_experiment import stated_experiment
+
     if schema:
         typer.echo(json.dumps(json_schema(), indent=2, ensure_ascii=False))
         return

@@ -1,11 +1,6 @@
 """Optimal design of excitation trajectories, with and without limits."""
 
-from mjfim.excitation.constraints import ConstraintSet
-from mjfim.excitation.objective import DesignProblem
-from mjfim.excitation.task import DesignTask
+import lazy_loader
 
-__all__ = [
-    "ConstraintSet",
-    "DesignProblem",
-    "DesignTask",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

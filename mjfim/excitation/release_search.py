@@ -12,8 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import NonlinearConstraint, minimize
-from scipy.stats import qmc
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget
@@ -189,7 +188,7 @@ class ReleaseSearch:
         """Evaluate the stated release, the corners of the ranges and a Sobol sequence."""
         d = len(self.space.names)
         stated = self.space.shares_of_stated()
-        sequence = qmc.Sobol(d, scramble=False)
+        sequence = scipy.stats.qmc.Sobol(d, scramble=False)
         grid = list(sequence.random_base2(min(GRID_EXPONENT + d, MAX_GRID_EXPONENT)))
         if d <= MAX_CORNER_COORDINATES:
             corners = [np.array(corner) for corner in itertools.product((0.0, 1.0), repeat=d)]
@@ -256,10 +255,12 @@ class ReleaseSearch:
         if start.margins:
             kinds = tuple(start.margins)
             constraints = [
-                NonlinearConstraint(lambda x: _margins(seen(x), kinds) - SAFETY, 0.0, np.inf)
+                scipy.optimize.NonlinearConstraint(
+                    lambda x: _margins(seen(x), kinds) - SAFETY, 0.0, np.inf
+                )
             ]
         try:
-            found = minimize(
+            found = scipy.optimize.minimize(
                 lambda x: self._objective(seen(x)),
                 start.shares,
                 method="COBYQA",

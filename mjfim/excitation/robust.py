@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from mjfim.arrays import Array
 
@@ -54,7 +54,7 @@ class ParameterSamples:
         if self.over == "mean":
             return float(values.mean())
         if self.logarithmic:
-            return float((logsumexp(q * values) - np.log(len(values))) / q)
+            return float((scipy.special.logsumexp(q * values) - np.log(len(values))) / q)
 
         # Divide by the largest value, so that powers neither overflow nor vanish.
         largest = values.max()
@@ -75,7 +75,7 @@ class ParameterSamples:
         if self.over == "mean":
             return np.full(len(values), 1.0 / len(values))
         if self.logarithmic:
-            return np.asarray(np.exp(q * values - logsumexp(q * values)))
+            return np.asarray(np.exp(q * values - scipy.special.logsumexp(q * values)))
 
         pooled = self.value(phi)
         return np.asarray((values / pooled) ** (q - 1.0) / len(values))

@@ -29,7 +29,7 @@ from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
-from mjfim.recordings.formats.read import read_table
+from mjfim.recordings import formats
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
 from mjfim.records.events import Callback, StudyEvent
@@ -470,7 +470,7 @@ def _default_longest(task: DesignTask) -> float:
     if isinstance(experiment.initial.control, Signal):
         return longest
 
-    columns = read_table(experiment.directory / str(experiment.initial.control))
+    columns = formats.read_table(experiment.directory / str(experiment.initial.control))
     name = task.controls[0]
     values = columns[name if name in columns else f"ctrl:{name}"]
     t = columns["t"][np.isfinite(values)]

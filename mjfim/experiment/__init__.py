@@ -1,12 +1,6 @@
 """The experiment file as a checked record (schema), and the system that it resolves to."""
 
-from mjfim.experiment.schema import Experiment, json_schema
-from mjfim.experiment.system import System
-from mjfim.experiment.time_grid import TimeGrid
+import lazy_loader
 
-__all__ = [
-    "Experiment",
-    "System",
-    "TimeGrid",
-    "json_schema",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import chirp
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.experiment.schema import by_name
@@ -54,7 +54,7 @@ def _shape(signal: Signal, t: Array, nu: int) -> Array:
     if signal.kind == "chirp":
         first = signal.frequency
         last = signal.frequency_end or CHIRP_SPAN * first
-        sweeps = [chirp(t, first * s, t[-1], last * s, phi=-90.0) for s in spread]
+        sweeps = [scipy.signal.chirp(t, first * s, t[-1], last * s, phi=-90.0) for s in spread]
         return np.stack(sweeps, axis=1)
 
     if signal.kind == "multisine":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from pydantic.json_schema import SkipJsonSchema
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
+from mjfim.experiment.experiment_file import read_tables
 from mjfim.experiment.messages import explain, valid_keys
 from mjfim.experiment.system_tables import Correlated, Initial, NoiseSpec, Nuisance, ParameterSpec
 from mjfim.experiment.task_tables import Boundary, Cost, Descent, FitSpec, Limits, Robust
@@ -20,9 +20,7 @@ from mjfim.recordings.spec import Hertz, PositiveWithUnit, RecordingSpec, Second
 
 ONLY_IN_PYTHON = ("function",)  # Keys of a parameter that a file cannot state.
 RESERVED = ("directory", "source")  # Attributes of an experiment that are no keys of the file.
-MAX_FILE_SIZE = 64 * 2**20  # Largest size of an experiment file [characters].
 DIALECT = "https://json-schema.org/draft/2020-12/schema"  # Dialect of the JSON schema.
-MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")  # Endings of model files, which are no experiments.
 
 
 class Experiment(Section):
@@ -155,26 +153,7 @@ class Experiment(Section):
             ExperimentError: The file cannot be read, or a key or a value in it is not valid.
         """
         path = Path(path)
-
-        try:
-            values = tomllib.loads(_read_text(path))
-        except OSError as error:
-            raise ExperimentError(
-                f"{path}: cannot read the experiment file: {error.strerror}"
-            ) from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            if path.suffix.lower() in MODEL_ENDINGS:
-                raise ExperimentError(
-                    f"{path}: a model, but an experiment file (TOML) is needed, which states the "
-                    f"model; `mjfim init {path}` writes a first one"
-                ) from None
-            raise ExperimentError(f"{path}: not valid TOML: {error}") from None
-        except RecursionError:
-            raise ExperimentError(
-                f"{path}: lists or tables are nested too deeply; an experiment file needs three "
-                "levels"
-            ) from None
-
+        values = read_tables(path)
         _refuse_python_keys(path, values)
         return Experiment(**values, directory=path.parent, source=str(path))
 
@@ -205,27 +184,6 @@ class Experiment(Section):
                 values[key] = value
 
         return Experiment(**{"directory": self.directory, "source": self.source, **values})
-
-
-def _read_text(path: Path) -> str:
-    """The text of an experiment file.
-
-    Args:
-        path: The file. Devices have no end, so that it is not read beyond the largest size.
-
-    Raises:
-        ExperimentError: The file is too large.
-        OSError: The file cannot be read.
-        UnicodeDecodeError: The file is not UTF-8.
-    """
-    with path.open(encoding="utf-8") as stream:
-        text = stream.read(MAX_FILE_SIZE + 1)
-    if len(text) > MAX_FILE_SIZE:
-        raise ExperimentError(
-            f"{path}: more than {MAX_FILE_SIZE >> 20} million characters; this is no experiment "
-            "file"
-        )
-    return text
 
 
 def json_schema() -> dict[str, Any]:

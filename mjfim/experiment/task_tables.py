@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from mjfim.amounts import MAX_ITERATIONS, MAX_REPLICATES, MAX_SAMPLES, MAX_STARTS
 from mjfim.recordings.spec import (
     Boolean,
     Finite,
@@ -26,12 +27,6 @@ from mjfim.recordings.spec import (
 
 # Ranges of the three coordinates of a place.
 Box = tuple[RangeWithUnit, RangeWithUnit, RangeWithUnit]
-
-# Largest numbers of repeated work; larger ones are mistyped and would not end.
-MAX_STARTS = 10_000
-MAX_ITERATIONS = 1_000_000
-MAX_REPLICATES = 100_000
-MAX_SAMPLES = 10_000
 
 
 class Cost(Section):

@@ -1,9 +1,6 @@
 """Parameter estimation from recordings by multiple shooting, and its diagnostics."""
 
-from mjfim.identification.residuals import FitProblem
-from mjfim.identification.task import FitTask
+import lazy_loader
 
-__all__ = [
-    "FitProblem",
-    "FitTask",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

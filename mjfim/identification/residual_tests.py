@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate
-from scipy.stats import chi2 as chi2_distribution
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.records.estimate import Whiteness, WorstResidual
@@ -66,7 +65,7 @@ def is_larger_than_noise(chi2: float, dof: int) -> bool:
     Returns:
         True where the difference is significant and relevant.
     """
-    significant = chi2_distribution.sf(chi2, dof) < SIGNIFICANCE
+    significant = scipy.stats.chi2.sf(chi2, dof) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) > RELEVANT_SIZE_RATIO)
 
 
@@ -80,7 +79,7 @@ def is_smaller_than_noise(chi2: float, dof: int) -> bool:
     Returns:
         True where the difference is significant and relevant.
     """
-    significant = chi2_distribution.cdf(chi2, dof) < SIGNIFICANCE
+    significant = scipy.stats.chi2.cdf(chi2, dof) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) < 1.0 / RELEVANT_SIZE_RATIO)
 
 
@@ -296,7 +295,7 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
     # by the number of tests (Bonferroni).
     variance = squares / count
     runs = list(_run_tests(series, variance))
-    probabilities = [float(chi2_distribution.sf(statistic, lags)), *(p for _, p in runs)]
+    probabilities = [float(scipy.stats.chi2.sf(statistic, lags)), *(p for _, p in runs)]
     inflation = max((ratio for ratio, _ in runs), default=1.0)
     return Whiteness(
         output=output,
@@ -317,7 +316,7 @@ def _autocorrelation(series: Sequence[Array], longest_lag: int) -> Array:
     total = np.zeros(longest_lag + 1)
     for part in series:
         # The correlation has lags of both signs; lag zero is in the middle.
-        products = correlate(part, part, method="fft")
+        products = scipy.signal.correlate(part, part, method="fft")
         zero_lag = len(part) - 1
         at_lags = products[zero_lag : zero_lag + longest_lag + 1]
         total[: len(at_lags)] += at_lags
@@ -360,5 +359,5 @@ def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float
             return
 
         statistic = length * float(joined @ joined) / variance
-        yield statistic / len(joined), float(chi2_distribution.sf(statistic, len(joined)))
+        yield statistic / len(joined), float(scipy.stats.chi2.sf(statistic, len(joined)))
         length *= RUN_RATIO

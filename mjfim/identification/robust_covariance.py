@@ -14,8 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import f as fisher
-from scipy.stats import t as student
+import scipy
 
 from mjfim.arrays import Array, scaled_pseudo_inverse, scaled_to_unit_diagonal
 from mjfim.optimize.condensed_least_squares import Condensed
@@ -178,8 +177,8 @@ def _interval(
         count: Number of blocks from which the sandwich covariance was computed.
     """
     upper_tail = 0.5 + LEVEL / 2.0
-    student_quantile = float(student.ppf(upper_tail, max(count - 1, 1)))
-    normal_quantile = float(student.ppf(upper_tail, 1e9))
+    student_quantile = float(scipy.stats.t.ppf(upper_tail, max(count - 1, 1)))
+    normal_quantile = float(scipy.stats.t.ppf(upper_tail, 1e9))
 
     half_width = np.maximum(
         normal_quantile * np.hypot(formal, between),
@@ -337,7 +336,7 @@ def _compare_recordings(
         mean = np.sum(w * y) / w.sum()
         scatter = float(np.sum(w * (y - mean) ** 2))
         others = int(estimated.sum()) - 1
-        if fisher.sf(scatter / others, others, freedom) < SIGNIFICANCE:
+        if scipy.stats.f.sf(scatter / others, others, freedom) < SIGNIFICANCE:
             apart.append(j)
             excess = max(scatter - others, 0.0)
             between[j] = np.sqrt(excess / (w.sum() - np.sum(w**2) / w.sum()))

@@ -10,16 +10,7 @@ Modules:
     smoothness: Detection of points at which derivatives do not exist.
 """
 
-from mjfim.information.criteria import Criterion
-from mjfim.information.fisher import FisherInformation
-from mjfim.information.identifiability import IdentifiabilityTest
-from mjfim.information.marginal import standard_deviations
-from mjfim.information.null_space import NullSpace
+import lazy_loader
 
-__all__ = [
-    "Criterion",
-    "FisherInformation",
-    "IdentifiabilityTest",
-    "NullSpace",
-    "standard_deviations",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

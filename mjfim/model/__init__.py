@@ -1,16 +1,6 @@
 """MuJoCo models: load, vary, read and write parameters by path."""
 
-from mjfim.model.geom_distance import GeomDistances
-from mjfim.model.loading import ModelSource
-from mjfim.model.parameters import ParameterSet
-from mjfim.model.paths import ParameterPath
-from mjfim.model.variants import ModelVariant, PlantModel
+import lazy_loader
 
-__all__ = [
-    "GeomDistances",
-    "ModelSource",
-    "ModelVariant",
-    "ParameterPath",
-    "ParameterSet",
-    "PlantModel",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from mjfim.arrays import Array
 
@@ -59,7 +59,7 @@ class BodyInertia:
             moments: (3,) principal moments [kg m²].
             quaternion: (4,) orientation (w, x, y, z) of the principal axes in the body frame.
         """
-        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+        R = scipy.spatial.transform.Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
         inertia = R * np.asarray(moments) @ R.T
         return BodyInertia(mass=float(mass), com=np.array(com), inertia=inertia)
 
@@ -77,7 +77,7 @@ class BodyInertia:
         if np.linalg.det(R) < 0.0:
             R = R * np.array([1.0, 1.0, -1.0])
 
-        return moments, Rotation.from_matrix(R).as_quat(scalar_first=True)
+        return moments, scipy.spatial.transform.Rotation.from_matrix(R).as_quat(scalar_first=True)
 
     @property
     def second_moments(self) -> Array:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import qmc
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
@@ -67,7 +66,7 @@ def sample_parameters(
     samples = np.tile(theta, (count, 1))
     if count > 1:
         generator = np.random.default_rng(seed)
-        quantiles = qmc.LatinHypercube(len(free), rng=generator).random(count - 1)
+        quantiles = scipy.stats.qmc.LatinHypercube(len(free), rng=generator).random(count - 1)
         for column, j in enumerate(free):
             parameter = parameters.parameters[j]
             samples[1:, j] = _values(parameter, float(theta[j]), quantiles[:, column])
@@ -96,7 +95,7 @@ def _values(parameter: Parameter, value: float, quantiles: Array) -> Array:
     elif is_scalar and value < 0.0:
         high = min(high, MIN_SHARE_OF_VALUE * value)
 
-    deviations = np.clip(ndtri(quantiles), -MAX_DEVIATION, MAX_DEVIATION)
+    deviations = np.clip(scipy.special.ndtri(quantiles), -MAX_DEVIATION, MAX_DEVIATION)
     return np.asarray(np.clip(value + parameter.prior * deviations, low, high))
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, listed
@@ -186,8 +186,10 @@ class ParameterWriter:
 
     def _write_orientation(self, model: Any, array: str, row: int, vector: Array) -> None:
         """Turn a body or site from its nominal orientation by a rotation vector: (3,) [rad]."""
-        nominal = Rotation.from_quat(self._parameters.nominal[array, row], scalar_first=True)
-        turned = nominal * Rotation.from_rotvec(vector)
+        nominal = scipy.spatial.transform.Rotation.from_quat(
+            self._parameters.nominal[array, row], scalar_first=True
+        )
+        turned = nominal * scipy.spatial.transform.Rotation.from_rotvec(vector)
         getattr(model, array)[row] = turned.as_quat(scalar_first=True)
 
         # MuJoCo skips the orientation of sites whose frame coincides with their body's.

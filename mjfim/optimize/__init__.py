@@ -16,25 +16,7 @@ Modules:
     bracketing: Search for the smallest feasible number of samples.
 """
 
-from mjfim.optimize.barrier import Bounds, relaxed_log_barrier
-from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
-from mjfim.optimize.condensed_least_squares import Condensed
-from mjfim.optimize.directions import LBFGS, MetricDescent
-from mjfim.optimize.levenberg_marquardt import minimise
-from mjfim.optimize.lq import regulator
-from mjfim.optimize.robust_losses import RobustLoss
-from mjfim.optimize.structured_bfgs import StructuredBFGS
+import lazy_loader
 
-__all__ = [
-    "LBFGS",
-    "Bounds",
-    "Condensed",
-    "MetricDescent",
-    "RobustLoss",
-    "SampleGrid",
-    "StructuredBFGS",
-    "minimise",
-    "regulator",
-    "relaxed_log_barrier",
-    "smallest_feasible",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

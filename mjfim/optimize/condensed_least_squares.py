@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import lsq_linear
+import scipy
 
 from mjfim.arrays import Array, scaled_to_unit_diagonal
 
@@ -373,7 +373,7 @@ def _bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Ar
     low = low[~fixed]
     high = high[~fixed]
     norms = norms[~fixed]
-    solved = lsq_linear(
+    solved = scipy.optimize.lsq_linear(
         A[:, ~fixed] / norms,
         b,
         (low * norms, high * norms),

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.blas import dtbsv
-from scipy.linalg.lapack import dposv
+import scipy
 
 from mjfim.arrays import Array
 
@@ -84,7 +83,7 @@ class LinearRecursion:
 
         flat = np.array(rhs, dtype=np.float64).reshape(-1)
         with np.errstate(over="ignore", invalid="ignore"):
-            solution = dtbsv(
+            solution = scipy.linalg.blas.dtbsv(
                 2 * n - 1,
                 self._banded_matrix,
                 flat,
@@ -131,7 +130,7 @@ def _solve_positive_definite(S: Array, rhs: Array) -> Array:
 
     LAPACK is called directly, because the checks of NumPy take longer than the solution.
     """
-    _, x, info = dposv(S, rhs)
+    _, x, info = scipy.linalg.lapack.dposv(S, rhs)
     if info != 0:
         raise np.linalg.LinAlgError(
             "the Riccati recursion lost positive definiteness; its weights must be positive"

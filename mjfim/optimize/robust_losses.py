@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import norm
+import scipy
 
 from mjfim.arrays import Array
 
@@ -50,8 +50,8 @@ class RobustLoss:
 
         # Variance of the normal distribution truncated at both sides.
         limit = self.outlier_threshold
-        inside = 1.0 - 2.0 * norm.sf(limit)
-        return float(1.0 - 2.0 * limit * norm.pdf(limit) / inside)
+        inside = 1.0 - 2.0 * scipy.stats.norm.sf(limit)
+        return float(1.0 - 2.0 * limit * scipy.stats.norm.pdf(limit) / inside)
 
     def value(self, r: Array) -> float:
         """Sum of the loss over residuals.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.optimize.barrier import BarrierExpansion
@@ -186,7 +186,7 @@ class BasisMetric:
     @cached_property
     def _factor(self) -> tuple[Array, bool]:
         """Cholesky factor of H, and whether it is the lower one."""
-        factor, lower = cho_factor(self.H, lower=True)
+        factor, lower = scipy.linalg.cho_factor(self.H, lower=True)
         return factor, bool(lower)
 
     def apply(self, s: Array) -> Array:
@@ -209,7 +209,7 @@ class BasisMetric:
         Returns:
             (M, nu) coefficients s with `apply(s) = g`.
         """
-        return np.asarray(cho_solve(self._factor, g.reshape(-1)).reshape(g.shape))
+        return np.asarray(scipy.linalg.cho_solve(self._factor, g.reshape(-1)).reshape(g.shape))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import pyarrow.csv
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
@@ -112,6 +111,8 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
         path: File to write.
         columns: (M,) values by name of the column.
     """
+    import pyarrow.csv  # slow; a check without a folder writes no table
+
     arrays = {
         name: pyarrow.array(np.asarray(values), from_pandas=True)
         for name, values in columns.items()

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mjfim.atomic_io import remove_earlier_result, replacing
 from mjfim.errors import ModelError, RecordingError
@@ -14,24 +15,16 @@ from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.interruption import current_interruption
-from mjfim.output import archive, latex, markdown, plots
+from mjfim.output import archive, latex, markdown, plots, video
 from mjfim.output import rerun as rerun_log
 from mjfim.output.mjcf.edited_files import copies_of_included_files
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.optional_files import write_guarded, write_optional
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.plots.pictures import (
-    DrawPicture,
-    Pictures,
-    fit_names,
-    held_out_names,
-    histogram_name,
-    pictures_of,
-)
+from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
 from mjfim.output.presentation import describe
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import write_report
-from mjfim.output.video.results import video_for_report
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
@@ -41,6 +34,9 @@ from mjfim.records.progress import begin_stage
 from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json, write_json
 from mjfim.records.shown import ShownRecord
+
+if TYPE_CHECKING:
+    from mjfim.output.plots.pictures import DrawPicture, Pictures
 
 # The identified model.
 IDENTIFIED = "identified.xml"
@@ -228,8 +224,8 @@ def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
         return
 
     begin_stage("drawing the video of the report")
-    video, sentence = video_for_report(system, result)
-    write_report(folder, type(result), video, sentence)
+    found, sentence = video.video_for_report(system, result)
+    write_report(folder, type(result), found, sentence)
 
 
 def _write_design_log(folder: Path, design: Design, system: System) -> None:
@@ -398,6 +394,8 @@ def _write_tables(folder: Path, record: ShownRecord) -> None:
 
 def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
     """Write all figures of a result."""
+    from mjfim.output.plots.pictures import pictures_of  # imports matplotlib, which is slow
+
     write_pictures(folder, pictures_of(record), picture_format)
 
 

@@ -6,7 +6,6 @@ A viewer that is missing, or that is closed, never changes the search: one sente
 from __future__ import annotations
 
 import os
-import re
 import socket
 import subprocess
 import sys
@@ -16,23 +15,14 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from mjfim.errors import ExperimentError, MjfimError
+from mjfim.errors import MjfimError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.output.live_address import DEFAULT_ADDRESS, DEFAULT_PORT, url_of
 from mjfim.records.events import Callback, Event
 
 if TYPE_CHECKING:
     from mjfim.output.rerun.live import LiveShow
-
-# Port at which a viewer listens if it is not told another one.
-DEFAULT_PORT = 9876
-DEFAULT_ADDRESS = f"127.0.0.1:{DEFAULT_PORT}"
-
-# Address that stands for the viewer of this computer, which may be opened.
-HERE = "here"
-
-# Form of an address: a host with a port, or a URL of Rerun.
-ADDRESS = re.compile(r"rerun(\+https?)?://\S+|[\w.-]+:\d{1,5}")
 
 # Time to wait for an answer of a viewer that should be there, and for a new viewer [s].
 ANSWER_SECONDS, START_SECONDS = 2.0, 20.0
@@ -107,23 +97,6 @@ def live_system(
         yield watched
     finally:
         watched.end()
-
-
-def url_of(address: str) -> str:
-    """Return the URL of a viewer.
-
-    Args:
-        address: A host with a port, or a URL of Rerun.
-
-    Raises:
-        ExperimentError: The address has another form.
-    """
-    if not ADDRESS.fullmatch(address):
-        raise ExperimentError(
-            f"--live {address}: an address is HOST:PORT, such as {DEFAULT_ADDRESS}, or a URL that "
-            "begins with rerun+http://"
-        )
-    return address if "://" in address else f"rerun+http://{address}/proxy"
 
 
 class _Watched:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-
-import numpy as np
 
 
 class Emphasis(Enum):
@@ -37,9 +36,9 @@ class Quantity:
     infinite: str = "∞"
 
     def __str__(self) -> str:
-        if np.isnan(self.value):
+        if math.isnan(self.value):
             return "-"
-        if np.isinf(self.value):
+        if math.isinf(self.value):
             return self.infinite if self.value > 0.0 else f"-{self.infinite}"
         return f"{self.value:.{self.digits}g}{self.suffix}"
 

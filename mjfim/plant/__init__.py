@@ -15,16 +15,7 @@ Modules:
     active_constraints: Contacts, limits, friction and clamps that act along a trajectory.
 """
 
-from mjfim.plant.derivatives import Derivatives
-from mjfim.plant.noise import Noise
-from mjfim.plant.outputs import Outputs
-from mjfim.plant.plant import Plant
-from mjfim.plant.state_space import StateSpace
+import lazy_loader
 
-__all__ = [
-    "Derivatives",
-    "Noise",
-    "Outputs",
-    "Plant",
-    "StateSpace",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
+import scipy
 
 from mjfim.arrays import Array
 
@@ -78,8 +78,8 @@ class OutputDelay:
         places = (rows, nodes.ravel())
         shape = (len(wanted), samples)
         return OutputDelay(
-            weights=csr_array((value.ravel(), places), shape=shape),
-            weight_slopes=csr_array((slope.ravel(), places), shape=shape),
+            weights=scipy.sparse.csr_array((value.ravel(), places), shape=shape),
+            weight_slopes=scipy.sparse.csr_array((slope.ravel(), places), shape=shape),
         )
 
     def apply(self, values: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
+import scipy
 
 from mjfim.arrays import Array
 
@@ -100,7 +100,7 @@ class Noise:
             return np.asarray(values / self.sigma.reshape(-1, *[1] * (values.ndim - 2)))
 
         rows = np.moveaxis(values, 1, 0)
-        flat = solve_triangular(self.factor, rows.reshape(len(rows), -1), lower=True)
+        flat = scipy.linalg.solve_triangular(self.factor, rows.reshape(len(rows), -1), lower=True)
         return np.asarray(np.moveaxis(flat.reshape(rows.shape), 0, 1))
 
     def whitened_rows(self, values: Array) -> Array:

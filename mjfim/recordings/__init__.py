@@ -1,20 +1,6 @@
 """Logs of any format as recordings in SI units, with remarks about the quality of their data."""
 
-from mjfim.recordings.channels import Channels
-from mjfim.recordings.formats.read import read_table
-from mjfim.recordings.read import Log, read_log, read_recording, recording_paths
-from mjfim.recordings.spec import ColumnSpec, RecordingSpec
-from mjfim.recordings.summary import LogSummary, summarize
+import lazy_loader
 
-__all__ = [
-    "Channels",
-    "ColumnSpec",
-    "Log",
-    "LogSummary",
-    "RecordingSpec",
-    "read_log",
-    "read_recording",
-    "read_table",
-    "recording_paths",
-    "summarize",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

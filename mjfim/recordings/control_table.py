@@ -9,7 +9,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, listed, unknown
-from mjfim.recordings.formats.read import read_table
+from mjfim.recordings import formats
 
 # Prefixes of the columns that a design.csv has besides the time and the controls.
 DESIGN_PREFIXES = ("qpos:", "qvel:", "act:", "gain:", "note:")
@@ -41,7 +41,7 @@ def read_control(
         RecordingError: A column is missing or unknown, a number is missing, the times do not
             increase, or the table does not cover the sample times.
     """
-    columns = read_table(path)
+    columns = formats.read_table(path)
     stamps, values = _columns_of_control(path, columns, names)
     _check_values(path, stamps, values)
 

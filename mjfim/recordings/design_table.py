@@ -10,8 +10,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.model.coordinates import gain_names, state_names
+from mjfim.recordings import formats
 from mjfim.recordings.channels import Channels
-from mjfim.recordings.formats.read import read_table
 from mjfim.records.playback import Playback
 
 # Smallest number of rows of a playback.
@@ -34,7 +34,7 @@ def read_playback(path: Path, channels: Channels) -> Playback:
     Raises:
         RecordingError: A column or a number is missing, or the times are not equally spaced.
     """
-    table = read_table(path)
+    table = formats.read_table(path)
     states = state_names(channels.model)
     controls = channels.control_columns
     gains = gain_names(channels.model, channels.controls)

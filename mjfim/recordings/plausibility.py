@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import scalar_joints
@@ -238,7 +238,7 @@ def _unexplained_share(y: Array, motion: Array) -> float:
 
 def _rough_part(x: Array) -> Array:
     """(M,) what a running median removes from x: (M,); beyond its ends, x keeps its last values."""
-    smooth: Array = median_filter(x, size=MEDIAN_ROWS, mode="nearest")
+    smooth: Array = scipy.ndimage.median_filter(x, size=MEDIAN_ROWS, mode="nearest")
     return x - smooth
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, closest, listed, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
+from mjfim.recordings import formats
 from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.column_units import check_unit, convert, units_of
-from mjfim.recordings.formats.lerobot import is_lerobot_dataset, lerobot_episodes
-from mjfim.recordings.formats.read import read_columns
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec, RecordingSpec
 from mjfim.recordings.summary import LogSummary, summarize
@@ -89,7 +88,7 @@ def read_log(path: Path, channels: Channels) -> Log:
     check_spec(channels)
     spec = channels.spec
 
-    table = read_columns(path, spec)
+    table = formats.read_columns(path, spec)
     if "time" not in spec.model_fields_set:
         _require_default(table, "time", spec.time, key="[recording] time")
     sources = _sources(table, channels)
@@ -141,7 +140,8 @@ def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        found += lerobot_episodes(path, channels.spec) if is_lerobot_dataset(path) else [path]
+        is_dataset = formats.is_lerobot_dataset(path)
+        found += formats.lerobot_episodes(path, channels.spec) if is_dataset else [path]
     return found
 
 

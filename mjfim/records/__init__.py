@@ -3,28 +3,7 @@
 Each record can be saved and loaded.
 """
 
-from mjfim.records.campaign import Campaign, CampaignStatus
-from mjfim.records.check import Check
-from mjfim.records.comparison import Comparison, MethodOutcome
-from mjfim.records.design import Design, Status
-from mjfim.records.estimate import Estimate
-from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.recording import Recording
-from mjfim.records.robustness import RobotConditions, Robustness
-from mjfim.records.trajectory import Trajectory
+import lazy_loader
 
-__all__ = [
-    "Campaign",
-    "CampaignStatus",
-    "Check",
-    "Comparison",
-    "Design",
-    "Estimate",
-    "MethodOutcome",
-    "MonteCarloStudy",
-    "Recording",
-    "RobotConditions",
-    "Robustness",
-    "Status",
-    "Trajectory",
-]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

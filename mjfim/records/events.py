@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from mjfim.records.design import HistoryRow
+if TYPE_CHECKING:
+    from mjfim.records.design import HistoryRow
 
 
 @dataclass(frozen=True, kw_only=True)

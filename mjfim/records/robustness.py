@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from mjfim.amounts import MAX_NOISE, MAX_WRONG
 from mjfim.arrays import Array, freeze
 from mjfim.errors import ExperimentError
 from mjfim.records.shown import ShownRecord
@@ -22,10 +23,6 @@ REQUIRED_COVERAGE = 0.90
 
 # Default delay of the control of a simulated robot [s]; it is rounded up to whole timesteps.
 LATENCY = 5e-3
-
-# Largest relative error of a guess, and largest ratio of the noise to the stated one. Robots beyond
-# them have nothing in common with the model, and their numbers overflow in the end.
-MAX_WRONG, MAX_NOISE = 10.0, 1e6
 
 # Smallest reserve, as a fraction of half a range; smaller values are round-off.
 MIN_RESERVE = 1e-9

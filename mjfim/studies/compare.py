@@ -34,6 +34,7 @@ from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
 from mjfim.records.progress import shown_progress
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.baselines.methods import METHODS, run_baseline
+from mjfim.studies.baselines.titles import TITLES
 
 # Name of the design for the user.
 DESIGN_TITLE = "mjfim's design"
@@ -244,7 +245,7 @@ class _MethodRun:
     def title(self) -> str:
         """Name of the method for the user."""
         method = self.search.method
-        return DESIGN_TITLE if method == DESIGN else METHODS[method].title
+        return DESIGN_TITLE if method == DESIGN else TITLES[method]
 
     def report(self, share: float, cost: float) -> None:
         """Report the used share of the budget and the lowest J so far."""

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
@@ -603,7 +603,7 @@ def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialStatistic
         mean = good.mean(axis=0)
         covariance = np.atleast_2d(np.cov(good, rowvar=False))
         efficiency = np.diag(crlb) / np.diag(covariance)
-        quantiles = chi2_distribution.ppf([0.025, 0.975], n - 1) / (n - 1)
+        quantiles = scipy.stats.chi2.ppf([0.025, 0.975], n - 1) / (n - 1)
         interval = efficiency[:, None] * quantiles
 
     return TrialStatistics(

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 from threadpoolctl import threadpool_limits
 
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
@@ -200,7 +200,7 @@ def _covered(runs: Sequence[RobotRun], selected: np.ndarray) -> int:
         selected: (p,) True for the parameters of the region.
     """
     indices = np.flatnonzero(selected)
-    threshold = chi2.ppf(CONFIDENCE, len(indices))
+    threshold = scipy.stats.chi2.ppf(CONFIDENCE, len(indices))
     return int(sum(run.squared_distance(indices) <= threshold for run in runs))
 
 

@@ -152,20 +152,27 @@ from importlib.abc import MetaPathFinder
 
 class Press(MetaPathFinder):
     def find_spec(self, name, path, target=None):
-        if name == sys.argv[1]:
+        if name == module:
             os.kill(os.getpid(), signal.SIGTERM)
 
 
+module = sys.argv.pop(1)
 sys.meta_path.insert(0, Press())
 runpy.run_module("mjfim", run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("module", ["matplotlib", "mjfim.cli.main", "rerun"])
-def test_a_press_while_the_program_starts(module: str) -> None:
-    words = [sys.executable, "-W", "error", "-c", PRESSED_DURING_IMPORT, module]
+@pytest.mark.parametrize("module", ["mjfim.cli.main", "numpy", "mujoco"])
+def test_a_press_while_the_program_or_a_verb_starts(module: str) -> None:
+    """A verb imports numpy and mujoco when it runs."""
+    words = ["check", MODELS / "cart_pendulum.toml"]
     ended = subprocess.run(
-        words, capture_output=True, text=True, cwd=ROOT, check=False, timeout=60.0
+        [sys.executable, "-W", "error", "-c", PRESSED_DURING_IMPORT, module, *words],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+        timeout=60.0,
     )
     assert ended.returncode == 1
     assert ended.stderr == f"mjfim: {NOTHING_SENTENCE}\n"

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.cli.robustness import tightened
+from mjfim.cli.reserve import tightened
 from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design_task

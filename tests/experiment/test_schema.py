@@ -15,7 +15,7 @@ import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
 from mjfim.excitation.task import DesignTask
-from mjfim.experiment import schema
+from mjfim.experiment import experiment_file
 from mjfim.experiment.schema import Experiment, json_schema
 from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Signal
 from mjfim.experiment.task_tables import Cost, Descent, Limits, Robust
@@ -983,7 +983,7 @@ def test_a_file_that_is_nested_too_deeply(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without an end")
 def test_a_file_without_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schema, "MAX_FILE_SIZE", 1 << 20)
+    monkeypatch.setattr(experiment_file, "MAX_FILE_SIZE", 1 << 20)
     with pytest.raises(ExperimentError, match="more than 1 million characters"):
         Experiment.from_file("/dev/zero")
 

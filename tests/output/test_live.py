@@ -21,7 +21,8 @@ from mjfim.cli.common import with_live_address
 from mjfim.errors import ExperimentError, NoResultError
 from mjfim.experiment.system import System
 from mjfim.output import live as live_module
-from mjfim.output.live import HERE, live, url_of
+from mjfim.output.live import live
+from mjfim.output.live_address import HERE, url_of
 from mjfim.output.rerun.live import OTHER_STARTS, UPDATE_SECONDS, LiveShow
 from mjfim.records.design import Design
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent

@@ -269,6 +269,7 @@ def test_without_the_extra_it_says_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(sysid, "ModelSequences", raising=False)
+    (tmp_path / "recording.csv").touch()
     words = (CART, tmp_path / "recording.csv", "-o", tmp_path / "out")
     misused(run("export-sysid", *words), "pip install 'mjfim[sysid]'")
     assert not (tmp_path / "out").exists()

@@ -18,7 +18,7 @@ from typer.testing import Result
 import mjfim
 from mjfim.arrays import Array
 from mjfim.budget import StopToken
-from mjfim.cli.campaign import with_target_accuracies
+from mjfim.cli.campaign_run import with_target_accuracies
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask

@@ -10,7 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.model.inertia import INERTIA_COLUMNS, INERTIA_ROWS, body_inertia
@@ -106,7 +106,9 @@ def _write_inertia(
         return
 
     # A matrix that is still diagonal in the present axes keeps them.
-    R = Rotation.from_quat(old.body_iquat[body], scalar_first=True).as_matrix()
+    R = scipy.spatial.transform.Rotation.from_quat(
+        old.body_iquat[body], scalar_first=True
+    ).as_matrix()
     in_old_axes = R.T @ after @ R
     products = np.abs(in_old_axes[INERTIA_ROWS[3:], INERTIA_COLUMNS[3:]]).max()
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
@@ -245,7 +245,7 @@ def _reweighted_bodies(a: Any, b: Any, same_class: bool) -> list[str]:
 
 def _inertia_matrices(model: Any) -> Array:
     """Return the (nbody, 3, 3) inertias in the axes of their bodies [kg m²]."""
-    R = Rotation.from_quat(model.body_iquat, scalar_first=True).as_matrix()
+    R = scipy.spatial.transform.Rotation.from_quat(model.body_iquat, scalar_first=True).as_matrix()
     return np.asarray(np.einsum("bij,bj,bkj->bik", R, model.body_inertia, R))
 
 

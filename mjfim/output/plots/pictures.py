@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable
 from functools import partial, singledispatch
 
@@ -14,6 +13,7 @@ from mjfim.errors import MjfimError, unknown
 from mjfim.output import plots
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.labels import complete_labels
+from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
 from mjfim.output.plots.pairs import has_pairs
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -157,23 +157,3 @@ def _(campaign: Campaign) -> Pictures:
         return {}
     parameters = CampaignParameters.recorded(campaign)
     return {"campaign": partial(plots.campaign_figure, campaign, parameters)}
-
-
-def fit_names(count: int) -> tuple[str, ...]:
-    """Return the names of the figures of the fits of `count` recordings."""
-    if count == 1:
-        return ("fit",)
-    return tuple(f"fit_{i + 1}" for i in range(count))
-
-
-def held_out_names(count: int) -> tuple[str, ...]:
-    """Return the names of the figures of the predictions of `count` held-out recordings."""
-    if count == 1:
-        return ("held_out",)
-    return tuple(f"held_out_{i + 1}" for i in range(count))
-
-
-def histogram_name(parameter: str) -> str:
-    """Return the name of the histogram of a parameter."""
-    safe_name = re.sub(r"[^\w.-]", "_", parameter)
-    return f"histogram_{safe_name}"

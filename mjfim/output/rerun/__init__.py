@@ -1,8 +1,6 @@
 """Results as Rerun recordings, and the viewer. Only the modules of this package import rerun."""
 
-from __future__ import annotations
+import lazy_loader
 
-from mjfim.output.rerun.documents import log_design, log_estimate, log_trajectories
-from mjfim.output.rerun.viewer import show
-
-__all__ = ["log_design", "log_estimate", "log_trajectories", "show"]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

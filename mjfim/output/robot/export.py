@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
@@ -14,14 +14,11 @@ from mjfim.output.robot.joint_trajectory import (
     write_trajectory_yaml,
 )
 from mjfim.output.robot.lerobot_dataset import ANGLE_UNITS, DATASET_FILES, write_lerobot_dataset
-from mjfim.output.robot.options import chosen
+from mjfim.output.robot.options import Target, chosen
 from mjfim.output.robot.plan import RobotPlan
 from mjfim.output.robot.player_script import write_player
 from mjfim.output.robot.ros2_bag import ENDINGS, bag_files, write_bag
 from mjfim.records.design import Design
-
-# Programs for which a design can be exported.
-Target = Literal["ros2", "ros2-bag", "player", "lerobot"]
 
 
 @dataclass(frozen=True, kw_only=True)

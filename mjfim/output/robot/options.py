@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from mjfim.errors import ExperimentError, unknown
+
+# Programs for which a design can be exported.
+Target = Literal["ros2", "ros2-bag", "player", "lerobot"]
 
 Word = TypeVar("Word", bound=str)
 

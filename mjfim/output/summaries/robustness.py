@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import binom
+import scipy
 
 from mjfim.output.summary_parts import (
     Emphasis,
@@ -138,7 +138,7 @@ def robustness_sentences(result: Robustness) -> Iterator[str]:
 def _coverage_sentences(result: Robustness) -> Iterator[str]:
     """Yield sentences on the intervals and on the fits."""
     n = result.runs
-    low, high = (int(k) for k in binom.interval(0.99, n, CONFIDENCE))
+    low, high = (int(k) for k in scipy.stats.binom.interval(0.99, n, CONFIDENCE))
     inside = result.inside[result.identified]
     stated, every = result.joint
     yield (

@@ -1,7 +1,6 @@
 """Videos of robots, drawn by MuJoCo without a display."""
 
-from __future__ import annotations
+import lazy_loader
 
-from mjfim.output.video.record import NoVideoError, Video
-
-__all__ = ["NoVideoError", "Video"]
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

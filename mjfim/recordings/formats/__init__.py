@@ -3,4 +3,7 @@
 No content of a file is executed or unpickled.
 """
 
-from __future__ import annotations
+import lazy_loader
+
+# A name is imported from its module, which `__init__.pyi` states, when it is used first.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import minimize
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken
@@ -582,7 +581,7 @@ class ScipyDescent:
         weights = Weights(Q=barrier.Q, S=barrier.S, R=barrier.R + np.diag(ridge), W=barrier.W)
         H = BasisMetric.from_weights(expansion, weights, self.run.basis).H
         jitter = METRIC_JITTER * np.trace(H) * np.eye(len(H))
-        return np.asarray(cholesky(H + jitter, lower=True))
+        return np.asarray(scipy.linalg.cholesky(H + jitter, lower=True))
 
     def control(self, s: Array) -> Array:
         """(N, nu) control of (M, nu) coefficients [unit of the actuator]."""
@@ -628,7 +627,7 @@ class _ScipyStage:
     def minimise(self) -> None:
         """Run SciPy until the stage ends."""
         first = self.factor.T @ self.descent.s.reshape(-1)
-        minimize(
+        scipy.optimize.minimize(
             self._value_and_slope,
             first,
             jac=True,
@@ -639,7 +638,9 @@ class _ScipyStage:
 
     def _coefficients(self, y: Array) -> Array:
         """(M, nu) coefficients from whitened coefficients: (M nu,)."""
-        return np.asarray(solve_triangular(self.factor.T, y).reshape(self.descent.s.shape))
+        return np.asarray(
+            scipy.linalg.solve_triangular(self.factor.T, y).reshape(self.descent.s.shape)
+        )
 
     def _value_and_slope(self, y: Array) -> tuple[float, Array]:
         """The merit and its derivative by whitened coefficients: (M nu,).
@@ -672,7 +673,7 @@ class _ScipyStage:
         slope = descent.slope(self.problem, point)
         if slope is None:
             return diverged
-        return value, np.asarray(solve_triangular(self.factor, slope, lower=True))
+        return value, np.asarray(scipy.linalg.solve_triangular(self.factor, slope, lower=True))
 
     def _accept(self, y: Array) -> None:
         """Accept an iterate of SciPy.

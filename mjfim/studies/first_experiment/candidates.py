@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +12,7 @@ from mjfim.errors import ExperimentError, unknown
 from mjfim.model.elements import element_name, identifier, names_of
 from mjfim.model.inertia import body_inertia
 from mjfim.model.servos import servo_kind
-
-Group = Literal["payload", "friction", "inertia", "motors"]
-
-# Groups of parameters, in the order of preference.
-GROUPS: tuple[Group, ...] = ("payload", "friction", "inertia", "motors")
+from mjfim.studies.first_experiment.groups import GROUPS, Group
 
 # Bodies at the end of the chain whose mass and centre of mass are proposed.
 LAST_BODIES = 3

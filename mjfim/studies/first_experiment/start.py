@@ -8,7 +8,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.optimize import lsq_linear
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import joint_dofs
@@ -229,7 +229,7 @@ def _holding_control(model: Any, data: Any, qpos: Array, guess: Array) -> Array:
         # Controls are scaled by their width, so that their units do not matter.
         room_low = np.minimum((low - control) / width, -np.finfo(float).tiny)
         room_high = np.maximum((high - control) / width, np.finfo(float).tiny)
-        step = lsq_linear(J * width, -base, (room_low, room_high)).x
+        step = scipy.optimize.lsq_linear(J * width, -base, (room_low, room_high)).x
         control = np.clip(control + step * width, low, high)
     return np.asarray(control)
 

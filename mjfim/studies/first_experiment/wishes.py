@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.studies.first_experiment.candidates import GROUPS, Group
+from mjfim.studies.first_experiment.groups import GROUPS, Group
 
 # Largest deviation of a sample period from a whole number of timesteps, relative to a timestep.
 STEP_TOLERANCE = 1e-6

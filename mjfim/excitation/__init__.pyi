@@ -1,0 +1,9 @@
+from .constraints import ConstraintSet
+from .objective import DesignProblem
+from .task import DesignTask
+
+__all__ = [
+    "ConstraintSet",
+    "DesignProblem",
+    "DesignTask",
+]

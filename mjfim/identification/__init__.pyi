@@ -1,0 +1,7 @@
+from .residuals import FitProblem
+from .task import FitTask
+
+__all__ = [
+    "FitProblem",
+    "FitTask",
+]

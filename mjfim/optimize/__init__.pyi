@@ -1,0 +1,22 @@
+from .barrier import Bounds, relaxed_log_barrier
+from .bracketing import SampleGrid, smallest_feasible
+from .condensed_least_squares import Condensed
+from .directions import LBFGS, MetricDescent
+from .levenberg_marquardt import minimise
+from .lq import regulator
+from .robust_losses import RobustLoss
+from .structured_bfgs import StructuredBFGS
+
+__all__ = [
+    "LBFGS",
+    "Bounds",
+    "Condensed",
+    "MetricDescent",
+    "RobustLoss",
+    "SampleGrid",
+    "StructuredBFGS",
+    "minimise",
+    "regulator",
+    "relaxed_log_barrier",
+    "smallest_feasible",
+]

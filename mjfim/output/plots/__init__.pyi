@@ -1,0 +1,37 @@
+from .campaign import campaign_figure
+from .check import check_figure
+from .compare import compare_figure
+from .convergence import convergence
+from .design import sensitivity_phase, trajectories
+from .limit_usage import limits
+from .monte_carlo import histogram, study_overview
+from .pairs import check_pairs, estimate_pairs
+from .parameter_trace import parameter_trace
+from .parameters import parameter_intervals, std_bars
+from .recording_fit import fit, held_out
+from .residuals import predictions, residual_spectra
+from .robustness import robustness_figure
+from .style import save
+
+__all__ = [
+    "campaign_figure",
+    "check_figure",
+    "check_pairs",
+    "compare_figure",
+    "convergence",
+    "estimate_pairs",
+    "fit",
+    "held_out",
+    "histogram",
+    "limits",
+    "parameter_intervals",
+    "parameter_trace",
+    "predictions",
+    "residual_spectra",
+    "robustness_figure",
+    "save",
+    "sensitivity_phase",
+    "std_bars",
+    "study_overview",
+    "trajectories",
+]

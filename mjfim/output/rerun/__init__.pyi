@@ -1,0 +1,4 @@
+from .documents import log_design, log_estimate, log_trajectories
+from .viewer import show
+
+__all__ = ["log_design", "log_estimate", "log_trajectories", "show"]

@@ -1,0 +1,120 @@
+"""What a program imports before it is known what is wanted: nothing that takes long.
+
+Which modules are imported is asserted, instead of a time, which depends on the computer.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+from typer.main import get_command
+
+from mjfim.cli.main import ORDER, app
+from tests.support.cli import MODELS, run
+from tests.support.paths import ROOT
+
+# Packages that take long to import, and that no help and no message about misuse needs.
+SLOW = (
+    "PIL",
+    "av",
+    "jinja2",
+    "matplotlib",
+    "mujoco",
+    "multiprocessing",
+    "numpy",
+    "plotly",
+    "psutil",
+    "pyarrow",
+    "rerun",
+    "scipy",
+)
+
+# Packages and modules that only drawing, recordings or parts of the statistics need.
+UNUSED_WITHOUT_FOLDER = (
+    "PIL",
+    "av",
+    "jinja2",
+    "matplotlib",
+    "plotly",
+    "rerun",
+    "scipy.optimize",
+    "scipy.signal",
+    "scipy.stats",
+)
+
+# A program that calls the command line several times, and prints after each call its exit code and
+# which of the modules that it is asked about are imported.
+CALLS = """
+import contextlib, io, json, sys
+
+words, modules = json.loads(sys.argv[1])
+import mjfim
+
+report = [["import mjfim", 0, [name for name in modules if name in sys.modules]]]
+from mjfim.__main__ import main
+
+for call in words:
+    sys.argv[1:], code = call, 0
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            main()
+    except SystemExit as end:
+        code = end.code
+    report.append([" ".join(call), code, [name for name in modules if name in sys.modules]])
+print(json.dumps(report))
+"""
+
+
+def imported(calls: list[list[str]], modules: tuple[str, ...]) -> list[tuple[str, int, list[str]]]:
+    """Each call with its exit code and the modules that are imported after it."""
+    asked = json.dumps([calls, modules])
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", CALLS, asked],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=True,
+        timeout=120.0,
+    )
+    return [tuple(row) for row in json.loads(done.stdout)]
+
+
+def verbs() -> dict[str, Any]:
+    """The verbs of the command line by their names."""
+    return dict(get_command(app).commands)  # type: ignore[attr-defined]
+
+
+def test_help_and_misuse_import_nothing_slow() -> None:
+    helps = [["--help"], *([name, "--help"] for name in verbs())]
+    misuses = [
+        ["dessign"],
+        ["design", "--unknown"],
+        ["check", "gone.toml"],
+        ["list", "gone.xml"],
+        ["identify", str(MODELS / "cart_pendulum.toml"), "gone.csv", "-o", "out"],
+        ["simulate", str(MODELS / "cart_pendulum.toml"), "gone.npz"],
+    ]
+    report = imported([*helps, *misuses], SLOW)
+    assert [row for row in report if row[2]] == []
+    assert [code for _, code, _ in report] == [0] * (1 + len(helps)) + [2] * len(misuses)
+
+
+@pytest.mark.slow
+def test_a_check_without_a_folder_imports_nothing_that_draws() -> None:
+    model, experiment = str(MODELS / "cart_pendulum.xml"), str(MODELS / "cart_pendulum.toml")
+    calls = [["list", model], ["validate", experiment], ["check", experiment]]
+    report = imported(calls, UNUSED_WITHOUT_FOLDER)
+    assert report == [(name, 0, []) for name, _, _ in report]
+
+
+def test_help_lists_every_verb_with_its_first_sentence() -> None:
+    shown = " ".join(re.sub(r"[│╭╮╰╯─]", " ", run("--help").stdout).split())
+    assert set(verbs()) == set(ORDER)
+    for name, command in verbs().items():
+        paragraph = " ".join(command.help.split("\n\n")[0].split())
+        assert f" {name} {paragraph}" in shown
