@@ -31,7 +31,7 @@ INDENTATION = "  "
 UNIT = "unit"
 
 # Words, each with the numbers before it and the spaces behind it.
-WORD = re.compile(r"(?:[\d.,]+ )*\S+\s*")
+WORD = re.compile(r"(?:\(?[\d.,]+ )*\S+\s*")
 
 # Parts of names and sentences, behind each of which a line may end.
 FOLDED_PART = re.compile(r"[^\s_/:.,-]*[\s_/:.,-]?")

@@ -191,6 +191,11 @@ class _Block:
         return not (self.is_whole and all(unit.is_whole for unit in self.units))
 
     @property
+    def is_derived(self) -> bool:
+        """Whether it holds results that are computed from the rows of a table."""
+        return any(unit.emphasis is Emphasis.DERIVED for unit in self.units)
+
+    @property
     def is_explanation(self) -> bool:
         """Whether nobody misses it where there is no room."""
         return not self.kind and bool(self.units)
@@ -221,7 +226,9 @@ def _shorten(blocks: Sequence[_Block], width: int) -> None:
     tables = [block for block in blocks if block.is_table and block.kind != "sentence"]
     results = [block for block in tables[:1] if block.units]
     others = [block for block in blocks if block not in results]
-    remarks = [block for block in others if block.kind in ("sentence", "remark")]
+    remarks = [
+        block for block in others if block.kind in ("sentence", "remark") and not block.is_derived
+    ]
     _reduce(others, blocks, width, fewest=FEWEST)
     _reduce(results, blocks, width, fewest=FEWEST_RESULTS)
     _reduce(others, blocks, width, fewest=1)

@@ -39,6 +39,8 @@ FEW = ("m", "l", "c")
 # Begins of the first row of the first table.
 BEGINS = ("m ", "nominal", "▶", "left_")
 
+DERIVED = Emphasis.DERIVED
+
 WARNING = (
     "not smooth: derivatives with two different difference steps disagree by 2.6 % for "
     f"{MANY[0]}, first at sample 174; σ and the design are unreliable"
@@ -282,6 +284,17 @@ def numbers_in(table: SummaryTable) -> list[str]:
     return [part for cell in cells for part in cell.split()]
 
 
+def test_combinations_are_shown_before_further_findings_and_explanations() -> None:
+    """They are results, although they stand below the table."""
+    items = ("a, b, c only as\n  a + b = 1\n  b + c = 2",)
+    found = Listing(title="Combinations:", items=items, emphasis=DERIVED)
+    rows = tuple(Row(cells=(f"p{k}",)) for k in range(10))
+    table = SummaryTable(key="t", title="Values", columns=columns("parameter"), rows=rows)
+    findings = Listing(title="Findings", items=(WARNING,))
+    lines = printed(Summary(title="", outcome="Done", parts=(findings, table, found)), 80)
+    assert "    b + c = 2" in lines and "p9" in lines and "Findings" not in lines
+
+
 def test_units_have_a_column() -> None:
     table = SummaryTable(
         key="t",
@@ -336,6 +349,7 @@ def test_lists_keep_their_first_sentences() -> None:
         ("left_forearm_mass", 12, ["left_", "forearm_mass"]),
         ("x" * 30, 12, ["x" * 12, "x" * 12, "x" * 6]),
         ("lasts for 3 s", 11, ["lasts for", "3 s"]),
+        ("enough (19 s) here", 11, ["enough", "(19 s) here"]),
         ("a\nb", 80, ["a", "b"]),
         ("", 80, [""]),
     ],

@@ -40,15 +40,14 @@ def describe_check(check: Check) -> Summary:
 
     for title, groups in (
         (
-            "Identifiable only in combination, with this control and with random controls from "
-            "this initial state",
+            "Identifiable only in combination, with this control and with random ones",
             check.not_separable,
         ),
         ("Not excited by this control, but by another one", check.not_excited),
     ):
         if groups:
             items = tuple(_group_lines(group, check) for group in groups)
-            parts.append(Listing(title=f"{title}:", items=items))
+            parts.append(Listing(title=f"{title}:", items=items, emphasis=Emphasis.DERIVED))
 
     of_size = size_sentence([row.value for row in check.rows], [row.size for row in check.rows])
     if of_size:
