@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
 from mjfim.output import plots
@@ -80,6 +81,14 @@ def test_a_random_search_at_the_end_is_marked_and_has_no_slope() -> None:
     assert "random search" in all_text(figure)
     assert "random search" not in all_text(plots.convergence(design))
 
+    # A search may go on by descents.
+    middle = dataclasses.replace(design.history[4], slope=np.nan)
+    both = (*design.history[:4], middle, *searched.history[5:])
+    panel = plots.convergence(dataclasses.replace(design, history=both)).axes[1]
+    shaded = [patch for patch in panel.patches if isinstance(patch, Rectangle)]
+    spans = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in shaded]
+    np.testing.assert_allclose(spans, [(3.5, 4.5), (6.5, panel.get_xlim()[1])])
+
     # The designed trajectory has a dot where it has a value.
     dots = [sum(line.get_marker() == "o" for line in axes.get_lines()) for axes in figure.axes]
     assert dots == [2, 1, 2]
@@ -90,6 +99,13 @@ def test_a_random_search_at_the_end_is_marked_and_has_no_slope() -> None:
 )
 def test_panels_of_a_robot_leave_few_places_empty(counts: tuple[int, ...], columns: int) -> None:
     assert panel_columns(counts) == columns
+
+
+def test_notes_explain_only_what_is_drawn() -> None:
+    design = make_design()
+    assert "blue box" in all_text(plots.sensitivity_phase(design, make_labels(2, 3)))
+    same = dataclasses.replace(design, initial=design.final)
+    assert "blue box" not in all_text(plots.sensitivity_phase(same, make_labels(2, 3)))
 
 
 # ---- estimates

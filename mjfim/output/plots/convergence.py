@@ -162,15 +162,20 @@ def _mark_rates(panels: NDArray[np.object_], design: Design, iterations: Array) 
 
 
 def _mark_random_search(panels: NDArray[np.object_], iterations: Array, slope: Array) -> list[str]:
-    """Shade the last iterations if they have no slope; return a sentence about it."""
-    known = np.flatnonzero(np.isfinite(slope))
-    if not known.size or known[-1] == len(slope) - 1:
+    """Shade the iterations without a slope if others have one; return a sentence about it."""
+    unknown = ~np.isfinite(slope)
+    if not unknown.any() or unknown.all():
         return []
 
-    for axes in panels:
-        begin = 0.5 * float(iterations[known[-1]] + iterations[known[-1] + 1])
-        axes.axvspan(begin, axes.get_xlim()[1], color=GRID_COLOUR, alpha=0.5, linewidth=0.0)
-    return ["Shaded: a random search went on, which has no slope."]
+    # Each run of iterations is shaded from half an iteration before it to half of one behind it.
+    change = np.flatnonzero(np.diff(np.concatenate([[False], unknown, [False]]).astype(int)))
+    for begin, end in change.reshape(-1, 2):
+        for axes in panels:
+            low, high = axes.get_xlim()
+            left = max(float(iterations[begin]) - 0.5, low)
+            right = min(float(iterations[end - 1]) + 0.5, high)
+            axes.axvspan(left, right, color=GRID_COLOUR, alpha=0.5, linewidth=0.0)
+    return ["Shaded: a random search, which has no slope."]
 
 
 def _mark_barrier_stages(

@@ -140,8 +140,10 @@ def trajectories(design: Design, labels: Labels) -> Figure:
 
     note = (
         "λ_min: smallest eigenvalue of the Fisher information up to time t, divided by the "
-        "measurement rate. All horizontal axes: time [s]. Grey background: controls."
+        "measurement rate. All horizontal axes: time [s]."
     )
+    if any(group.held for group in groups):
+        note += " Grey background: controls."
     title = "Trajectories and the information that they gather"
     add_title(figure, title, trajectory_handles(), note)
     return figure
@@ -267,10 +269,9 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
         write_message(figure.add_subplot(grid[0, 0]), "the motion depends on no parameter")
 
     total = int(np.count_nonzero(relative > NEGLIGIBLE_SENSITIVITY * relative.max(initial=0.0)))
-    note = (
-        "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative. "
-        "A blue box shows the initial curve enlarged."
-    )
+    note = "Each curve starts at the dot (time 0, no sensitivity); ′ is the time derivative."
+    if any(axes.child_axes for axes in figure.axes):
+        note += " A blue box shows the initial curve enlarged."
     if len(loops) < total:
         note += (
             f" Shown: {len(loops)} of {total} pairs of a degree of freedom and a parameter: the "
