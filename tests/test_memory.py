@@ -92,6 +92,14 @@ def test_long_trials_are_stepped_in_smaller_blocks(tmp_path: Path) -> None:
     assert chunk_size(system, 10_000_000, 1500) == 1
 
 
+def test_trials_that_take_long_are_stepped_in_smaller_blocks(tmp_path: Path) -> None:
+    """A study that is stopped loses the block that is stepped, which would take minutes."""
+    system = System.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
+    assert chunk_size(system, 400, 3000) == 300
+    assert chunk_size(system, 2500, 3000) == 100
+    assert chunk_size(system, 5000, 3000) == 64
+
+
 def test_recordings_are_compared_with_the_memory_that_is_there(tmp_path: Path) -> None:
     """The blocks of simulations are bounded, the recorded numbers are not."""
     task = DesignTask.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))

@@ -64,6 +64,10 @@ LARGEST_CHUNK_BYTES = 1e9
 # Number of chunks of many trials. A study that is stopped keeps the chunks that are finished.
 CHUNKS = 10
 
+# Largest number of engine steps for one Jacobian of all trials that are stepped together, beyond
+# the smallest chunk. With more, the first chunk would take minutes, which a stop would lose.
+CHUNK_STEPS = 1e6
+
 # Difference step for the Jacobian of each trial, relative to the size of each parameter.
 JACOBIAN_STEP = 1e-6
 
@@ -217,7 +221,8 @@ def chunk_size(system: System, samples: int, trials: int) -> int:
         The number, at least 1.
     """
     jacobian = NUMBER_BYTES * _measurements(system, samples) * len(system.parameters)
-    most = min(int(CHUNK_BYTES / jacobian), -(-trials // CHUNKS))
+    steps = samples * system.grid.substeps * (len(system.parameters) + 1)
+    most = min(int(CHUNK_BYTES / jacobian), int(CHUNK_STEPS / steps), -(-trials // CHUNKS))
     fitting = int(LARGEST_CHUNK_BYTES / _trial_bytes(system, samples))
     return min(max(MIN_CHUNK, most), max(fitting, 1), trials)
 
