@@ -73,6 +73,7 @@ class Interruption:
         self._announce = announce
         self._requests: list[Request] = []
         self._has_result = False
+        self._has_work_to_finish = False
         self._is_optional = False
         self._before: dict[int, Any] = {}
 
@@ -117,6 +118,10 @@ class Interruption:
             UnfinishedError: The second press, while something is written that may be left out.
         """
         self.presses += 1
+
+        # The thread that announces the first press must not see what this function changes later.
+        if self.presses == 1:
+            self._has_work_to_finish = bool(self._requests) or self._has_result
         self._pressed.put(self.presses)
 
         for request in self._requests:
@@ -179,7 +184,7 @@ class Interruption:
         """Announce the first press, press again after a time, and end the process at last."""
         if self._pressed.get() is None:
             return
-        if self._requests or self._has_result:
+        if self._has_work_to_finish:
             self._announce(FIRST_SENTENCE)
 
         # Without a second press of the user, results are finished for a limited time.
