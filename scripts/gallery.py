@@ -61,6 +61,9 @@ CALLS = "calls.json"
 # Names of browsers with the DevTools protocol, the usual one first.
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
+# Time after which all plots of a report must stand [ms].
+PATIENCE = 120_000
+
 # Widths of the windows in which reports are looked at [pixels].
 WINDOW_WIDTHS = {"desktop": 1280, "phone": 390}
 
@@ -439,7 +442,8 @@ def report_screenshots(report: Path, folder: Path) -> dict[str, Path]:
                     viewport={"width": width, "height": 800}, color_scheme=scheme
                 )
                 page.goto(report.resolve().as_uri())
-                page.wait_for_timeout(1000)
+                page.wait_for_selector("body[data-ready=yes]", timeout=PATIENCE)
+                page.wait_for_timeout(500)
                 picture = folder / f"report-{window}-{scheme}.png"
                 page.screenshot(path=str(picture), full_page=True)
                 pictures[picture.stem] = picture

@@ -38,7 +38,7 @@ def campaign_page(campaign: Campaign) -> Page:
         summary = describe_campaign(campaign, parameters)
 
         estimates = [*summary.parts, *_last_correlation(campaign)]
-        sections.append(Section(title="Estimates", parts=estimates))
+        sections.append(Section(title="Parameters", parts=estimates))
         rounds = [_std_plots(campaign, parameters), _estimate_plots(campaign, parameters)]
         sections.append(Section(title="Rounds", parts=rounds))
         last = campaign.rounds[-1].estimate

@@ -22,6 +22,10 @@ from mjfim.output.summary_parts import Listing, Part, Quantity
 from mjfim.output.vocabulary import INITIAL
 from mjfim.records.check import Check
 
+# Ratio of the wanted to the predicted standard deviation below which the mark of the wanted one
+# would stand in the text behind the bar.
+CROSSED_RATIO = 4.0
+
 # Names of the curves in the legend.
 PREDICTED, WANTED = "predicted σ", "wanted σ"
 
@@ -82,7 +86,11 @@ def _accuracy_plots(check: Check) -> Iterator[Part | PlotGroup]:
     places = np.arange(float(len(rows)))
     marks = dots(wanted, places, WANTED, "text", size=16, symbol="line-ns-open", texts=targets)
     marks["marker"]["line"] = {"width": 2.5, "color": "role:text"}
-    traces = [rows_of_bars(bars, PREDICTED, INITIAL.word, texts=texts), marks]
+    drawn = rows_of_bars(bars, PREDICTED, INITIAL.word, texts=texts)
+    is_crossed = (wanted > bars) & (wanted < CROSSED_RATIO * bars)
+    drawn["textposition"] = ["inside" if crossed else "outside" for crossed in is_crossed]
+    drawn["insidetextanchor"] = "end"
+    traces = [drawn, marks]
     panels = [
         Panel(
             title="predicted σ [% of the parameter's size]",

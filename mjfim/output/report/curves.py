@@ -30,6 +30,10 @@ MAX_PLAIN_POWER = 4.0
 # Characters to which names are shortened on an axis with names.
 AXIS_NAME_WIDTH = 22
 
+# Characters of the names beside and below a matrix, and largest number of columns whose names stand
+# level.
+ROW_NAME_WIDTH, COLUMN_NAME_WIDTH, MAX_LEVEL_NAMES = 20, 12, 3
+
 # Largest number of parameters for which correlations are written into the cells.
 MAX_WRITTEN_CELLS = 14
 
@@ -328,7 +332,9 @@ def shortened_name(name: str, width: int = AXIS_NAME_WIDTH) -> str:
     return f"{name[:kept]}…{name[-kept:]}"
 
 
-def level(value: float, role: str, *, across: str = "x", dash: str = "dash") -> Plotly:
+def level(
+    value: float, role: str, *, across: str = "x", dash: str = "dash", layer: str = "above"
+) -> Plotly:
     """Return a straight line through a plot.
 
     Args:
@@ -336,12 +342,13 @@ def level(value: float, role: str, *, across: str = "x", dash: str = "dash") -> 
         role: Role of its colour.
         across: "x" for a line along the horizontal axis, "y" for one along the vertical axis.
         dash: "solid", "dot" or "dash".
+        layer: "above" for a line over grid, bars and curves, or "below".
     """
     ends = {"xref": "x domain", "x0": 0, "x1": 1, "y0": value, "y1": value}
     if across == "y":
         ends = {"yref": "y domain", "y0": 0, "y1": 1, "x0": value, "x1": value}
     line = {"color": f"role:{role}", "width": 1, "dash": dash}
-    return {"type": "line", **ends, "line": line, "layer": "below"}
+    return {"type": "line", **ends, "line": line, "layer": layer}
 
 
 def band(low: float, high: float, role: str = "band", *, across: str = "x") -> Plotly:
@@ -390,7 +397,8 @@ def correlation_panel(correlation: Array, names: Sequence[str], title: str) -> P
     ]
     trace: Plotly = {
         "type": "heatmap",
-        "z": [[None if np.isnan(v) else round(float(v), 4) for v in row] for row in shown],
+        "z": [[None if np.isnan(v) else round(float(v), 2) + 0.0 for v in row] for row in shown],
+        "meta": "correlation",
         "hovertext": texts,
         "hoverinfo": "text",
         "hoverongaps": False,
@@ -403,11 +411,17 @@ def correlation_panel(correlation: Array, names: Sequence[str], title: str) -> P
     }
     if count <= MAX_WRITTEN_CELLS:
         trace["texttemplate"] = "%{z:+.2f}"
-    columns = row_axis(names, 14)
-    columns.update(range=[-0.5, count - 0.5], side="bottom")
-    if count > 3:
+
+    # Long names would be cut below the columns; numbers stand for them.
+    is_numbered = count > MAX_LEVEL_NAMES and max(map(len, names)) > COLUMN_NAME_WIDTH
+    numbers = [str(i + 1) for i in range(count)]
+    columns = row_axis(numbers if is_numbered else names, COLUMN_NAME_WIDTH)
+    columns.update(range=[-0.5, count - 0.5], side="bottom", tickangle=0)
+    if count > MAX_LEVEL_NAMES and not is_numbered:
         columns["tickangle"] = -45
-    rows = row_axis(names, 16)
+    pairs = zip(numbers, names, strict=True)
+    numbered = [f"{shortened_name(name, ROW_NAME_WIDTH)}  {number}" for number, name in pairs]
+    rows = row_axis(numbered if is_numbered else names, ROW_NAME_WIDTH + 4)
     rows["range"] = [count - 0.5, -0.5]
     return Panel(
         title=title,

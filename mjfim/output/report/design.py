@@ -174,8 +174,9 @@ def _motion_plots(design: Design, labels: Labels) -> Iterator[PlotGroup]:
             _signal_panel(design, quantity, i, name, bounds.get((quantity, name), ()))
             for i, name in enumerate(names[:MAX_PANELS])
         ]
-        has_bounds = any((quantity, name) in bounds for name in names)
-        note = "Dashed lines: limits. " if has_bounds else ""
+        note = "Dashed lines: limits. " if any(panel.layout["shapes"] for panel in panels) else ""
+        if any(panel.remark for panel in panels):
+            note += "Limits far from the motion stand above the plots. "
         if len(names) > MAX_PANELS:
             note += (
                 f"The first {MAX_PANELS} of {len(names)} columns are shown; all of them are in "
@@ -220,16 +221,20 @@ def _signal_panel(
         traces.append(curve(t, values, term.word, term.word, held=held))
         extremes += [float(values.min()), float(values.max())]
 
+    # A bound that the motion comes near is inside the plot; one far away would flatten the curves.
     lines = [bound for bound in bounds if np.isfinite(bound)]
-    layout: Plotly = {"xaxis": axis("time [s]"), "shapes": [level(y, "bound") for y in lines]}
     reach = NEAR_BOUND * float(np.ptp(extremes))
     near = [y for y in lines if min(extremes) - reach <= y <= max(extremes) + reach]
+    layout: Plotly = {"xaxis": axis("time [s]"), "shapes": [level(y, "bound") for y in near]}
     if near:
-        # A bound that the motion comes near is inside the plot.
         ends = [*extremes, *near]
         room = 0.06 * float(np.ptp(ends))
         layout["yaxis"] = axis(range=[min(ends) - room, max(ends) + room])
-    return Panel(title=label, traces=traces, layout=layout, linked="time")
+    remark = ""
+    if len(near) < len(lines):
+        values = " and ".join(f"{y:.4g}" for y in lines)
+        remark = f"limits {values}" if len(lines) > 1 else f"limit {values}"
+    return Panel(title=label, traces=traces, layout=layout, linked="time", remark=remark)
 
 
 def _information_plot(design: Design) -> PlotGroup:
@@ -297,8 +302,9 @@ def _limit_panel(design: Design, kind: str, usages: list[LimitUsage]) -> Panel:
     if not one_sided:
         shapes += [level(-100.0, "bound"), band(-reach, -100.0, "forbidden")]
 
+    share = f"{largest:.4g}" if abs(largest - 100.0) < 0.5 else f"{largest:.0f}"
     margin = design.limits.get(kind, float("nan"))
-    remark = f"violated by {-margin:.3g}" if margin < 0.0 else f"smallest margin {margin:.3g}"
+    remark = f"violated: {share} % used" if margin < 0.0 else f"at most {share} % used"
     more = len(usages) - len(shown)
     return Panel(
         title=f"{kind.replace('_', ' ')}: {_limit_title(kind, is_dense=is_dense)}",

@@ -9,6 +9,7 @@ from pathlib import PurePath
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.errors import first_ones
 from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import complete_labels
 from mjfim.output.report.correlations import correlation_of_covariance
@@ -26,7 +27,7 @@ from mjfim.output.report.curves import (
 )
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
 from mjfim.output.report.residual_curves import Residuals
-from mjfim.output.summaries.estimate import describe_estimate
+from mjfim.output.summaries.estimate import FITTED_MARK, FITTED_NOTE, describe_estimate
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.summary_parts import Listing, Part, Quantity, Summary
 from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
@@ -39,6 +40,9 @@ MAX_OUTPUTS = 12
 
 # Largest number of recordings whose signals are drawn.
 MAX_RECORDINGS = 8
+
+# Largest number of predicted recordings with a plot each; of more, there is a plot for each output.
+MAX_PREDICTION_PLOTS = 3
 
 # Name of the identified parameters in the legend.
 WITH_INTERVAL = f"{IDENTIFIED.word}, 95 % interval"
@@ -105,7 +109,8 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
     yield table
 
     names = list(estimate.parameters)
-    panels = [_interval_panel(estimate, names)]
+    shares = np.flatnonzero(estimate.guess_sizes > 0.0).tolist()
+    panels = [_interval_panel(estimate, shares)] if shares else []
     correlation = correlation_of_covariance(estimate.covariance)
     if len(names) > 1 and np.isfinite(correlation).any():
         panels.append(correlation_panel(correlation, names, "correlation of the estimates [–]"))
@@ -116,30 +121,33 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
     note = (
         "The interval allows for residuals that are not white noise and for recordings that "
         "disagree. The difference of an entry of a vector or tensor is a share of the magnitude of "
-        "the whole; a nominal value of 0 has no relative difference, see the table."
+        "the whole."
     )
-    yield PlotGroup(title="", panels=panels, keys=keys, note=note)
+    absent = [name for j, name in enumerate(names) if j not in shares]
+    if absent:
+        note += f" Nominal values of 0 have no relative difference: {first_ones(absent)}."
+    if panels:
+        yield PlotGroup(title="", panels=panels, keys=keys if shares else (), note=note)
     for part in summary.parts:
         if part is not table and getattr(part, "key", "") not in elsewhere:
             yield part
 
 
-def _interval_panel(estimate: Estimate, names: Sequence[str]) -> Panel:
-    """Return the plot of the estimates with their intervals, relative to the nominal values."""
-    guess = estimate.initial_theta
-    sizes = estimate.guess_sizes
-    percent = np.where(sizes > 0.0, sizes, np.nan) / 100.0
-    centre = (estimate.theta - guess) / percent
-    low, high = (estimate.interval.T - guess) / percent
-    rows = np.arange(len(names), dtype=np.float64)
-    known = np.isfinite(estimate.std)
+def _interval_panel(estimate: Estimate, shown: Sequence[int]) -> Panel:
+    """Return the plot of estimates with their intervals, relative to sizes beside 0."""
+    chosen = list(shown)
+    guess, percent = estimate.initial_theta[chosen], estimate.guess_sizes[chosen] / 100.0
+    centre = (estimate.theta[chosen] - guess) / percent
+    low, high = (estimate.interval[chosen].T - guess) / percent
+    rows = np.arange(len(chosen), dtype=np.float64)
+    known = np.isfinite(estimate.std[chosen])
 
     texts = []
-    for j, name in enumerate(names):
-        unit = estimate.units[j]
+    for row, j in enumerate(chosen):
         left, right = estimate.interval[j]
-        text = f"{name}: {Quantity(value=float(estimate.theta[j]), digits=5)} {unit}"
-        texts.append(f"{text} (95 %: {left:.4g} to {right:.4g})" if known[j] else text)
+        value = Quantity(value=float(estimate.theta[j]), digits=5)
+        text = f"{estimate.parameters[j]}: {value} {estimate.units[j]}"
+        texts.append(f"{text} (95 %: {left:.4g} to {right:.4g})" if known[row] else text)
 
     estimates = dots(centre, rows, WITH_INTERVAL, IDENTIFIED.word, size=9, texts=texts)
     estimates["error_x"] = {
@@ -160,11 +168,11 @@ def _interval_panel(estimate: Estimate, names: Sequence[str]) -> Panel:
         traces=[zero, estimates],
         layout={
             "xaxis": axis("difference from the nominal value [%]"),
-            "yaxis": row_axis(names),
-            "shapes": [level(0.0, NOMINAL.word, across="y", dash="solid")],
+            "yaxis": row_axis([estimate.parameters[j] for j in chosen]),
+            "shapes": [level(0.0, NOMINAL.word, across="y", dash="solid", layer="below")],
             "hovermode": "closest",
         },
-        height=rows_height(len(names), 44),
+        height=rows_height(len(chosen), 44),
     )
 
 
@@ -180,22 +188,68 @@ def _prediction_plots(estimate: Estimate, labels: Labels) -> PlotGroup:
     """Return a plot of the prediction errors for every output."""
     found = estimate.predictions
     outputs = found[0].identified.outputs
-    panels = [
-        _prediction_panel(found, j, labels.output(name))
-        for j, name in enumerate(outputs)
+    known = [
+        j
+        for j in range(len(outputs))
         if any(np.isfinite(prediction.identified.rms[j]) for prediction in found)
     ]
+    over_noise = len(found) <= MAX_PREDICTION_PLOTS and all(
+        estimate.sigma.get(outputs[j], 0.0) > 0.0 for j in known
+    )
+    if over_noise:
+        panels = [_noise_panel(estimate, prediction, known, labels) for prediction in found]
+    else:
+        panels = [_prediction_panel(found, j, labels.output(outputs[j])) for j in known]
+
     keys = [
         Key(name=NOMINAL.word, role=NOMINAL.word, shape="bar"),
         Key(name=IDENTIFIED.word, role=IDENTIFIED.word, shape="bar"),
     ]
-    note = "Of a predicted recording, only the initial state is estimated."
+    notes = ["Of a predicted recording, only the initial state is estimated."]
+    if over_noise:
+        notes.append("Dashed line: the noise, below which no prediction of measurements can be.")
+    if not all(prediction.held_out for prediction in found):
+        notes.append(f"{FITTED_NOTE}.")
     return PlotGroup(
         title="Errors on recordings that were not fitted",
         panels=panels[:MAX_OUTPUTS],
         keys=keys,
-        note=note,
+        note=" ".join(notes),
     )
+
+
+def _noise_panel(
+    estimate: Estimate, prediction: Prediction, columns: Sequence[int], labels: Labels
+) -> Panel:
+    """Return the plot of the errors of all outputs in one recording, relative to the noise."""
+    outputs = prediction.identified.outputs
+    sigma = np.array([estimate.sigma[outputs[j]] for j in columns])
+    names, units = zip(*(split_unit(labels.output(outputs[j])) for j in columns), strict=True)
+    traces, largest = [], 1.0
+    for term, errors in ((NOMINAL, prediction.nominal), (IDENTIFIED, prediction.identified)):
+        rms = errors.rms[list(columns)]
+        texts = [
+            f"{Quantity(value=float(error))} {unit}".rstrip()
+            for error, unit in zip(rms, units, strict=True)
+        ]
+        traces.append(rows_of_bars(rms / sigma, term.word, term.word, texts=texts))
+        largest = float(np.nanmax(np.append(rms / sigma, largest)))
+    return Panel(
+        title=f"{_prediction_name(prediction)}: rms error of the prediction / σ of the noise [–]",
+        traces=traces,
+        layout={
+            "xaxis": axis("rms error / σ of the noise [–]", range=[0.0, 1.3 * largest]),
+            "yaxis": row_axis(names),
+            "shapes": [level(1.0, "text", across="y")],
+            "bargap": 0.25,
+        },
+        height=rows_height(len(names), 40),
+    )
+
+
+def _prediction_name(prediction: Prediction) -> str:
+    """Return the name of a predicted recording, with a mark where it is part of the last fit."""
+    return PurePath(prediction.name).name + ("" if prediction.held_out else FITTED_MARK)
 
 
 def _prediction_panel(found: Sequence[Prediction], j: int, label: str) -> Panel:
@@ -207,7 +261,7 @@ def _prediction_panel(found: Sequence[Prediction], j: int, label: str) -> Panel:
         errors = np.array([errors.rms[j] for errors in of_term])
         texts = [str(Quantity(value=float(error))) for error in errors]
         traces.append(rows_of_bars(errors, term.word, term.word, texts=texts))
-    names = [PurePath(p.name).name + ("" if p.held_out else " *") for p in found]
+    names = [_prediction_name(prediction) for prediction in found]
     return Panel(
         title=f"{name}: rms error of the prediction [{unit or '–'}]",
         traces=traces,
@@ -455,7 +509,7 @@ def _autocorrelation_panel(estimate: Estimate, residuals: Residuals, j: int, nam
         layout={
             "xaxis": axis("lag [rows]"),
             "yaxis": axis(range=[-reach, reach]),
-            "shapes": [band(-bound, bound), level(0.0, "muted", dash="solid")],
+            "shapes": [band(-bound, bound), level(0.0, "muted", dash="solid", layer="below")],
         },
         remark=remark,
         linked="lag",
@@ -472,7 +526,7 @@ def _spectrum_panel(residuals: Residuals, name: str) -> Panel:
         layout={
             "xaxis": log_axis("frequency [Hz]", frequencies),
             "yaxis": log_axis("", np.append(power, [low, high]), room=(0.1, 0.1)),
-            "shapes": [band(low, high), level(1.0, "muted", dash="solid")],
+            "shapes": [band(low, high), level(1.0, "muted", dash="solid", layer="below")],
         },
         linked="frequency",
     )

@@ -124,6 +124,7 @@ def _template(file: str) -> Template:
         base64=lambda content: base64.b64encode(content).decode("ascii"),
         capital=capitalised,
         colours=_plain_colours,
+        column_labels=_column_labels,
         emphasis_class=CLASSES.__getitem__,
         group_heads=lambda table: list(_group_heads(table)),
         kind_of=lambda part: type(part).__name__,
@@ -233,6 +234,15 @@ class _GroupHead:
     span: int
     trajectory: str
     word: str
+
+
+def _column_labels(table: SummaryTable) -> list[str]:
+    """Return the heading of every column with that above it, for rows that stand alone."""
+    labels = [str(column.heading) for column in table.columns]
+    for group in table.groups:
+        for column in range(group.first, group.last + 1):
+            labels[column] = f"{shown_word(group.trajectory)} {labels[column]}"
+    return labels
 
 
 def _group_heads(table: SummaryTable) -> Iterator[_GroupHead]:

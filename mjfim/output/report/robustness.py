@@ -160,7 +160,7 @@ def _error_plots(result: Robustness) -> PlotGroup:
             "yaxis": row_axis(names),
             "shapes": [
                 level(100.0 * CONFIDENCE, "text", across="y", dash="solid"),
-                level(100.0 * REQUIRED_COVERAGE, "muted", across="y"),
+                level(100.0 * REQUIRED_COVERAGE, "text", across="y"),
             ],
             "hovermode": "closest",
         },

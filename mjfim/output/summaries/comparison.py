@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import PurePath
+
 import numpy as np
 
 from mjfim.output.summaries.accuracy import BEST_CASE
@@ -47,7 +49,7 @@ def describe_comparison(comparison: Comparison) -> Summary:
     parts.append(Paragraph(text=f"{legend} {BEST_CASE}", emphasis=Emphasis.WEAK))
     parts.append(_method_accuracy_table(comparison))
     return Summary(
-        title=f"{comparison.source}: each method with {budget_in_words(comparison)}",
+        title=f"{PurePath(comparison.source).name}: each method with {budget_in_words(comparison)}",
         outcome=comparison.verdict[0],
         parts=tuple(parts),
     )
@@ -74,7 +76,7 @@ def _method_table(comparison: Comparison) -> SummaryTable:
     headings += ["time", "steps", "worst margin"]
     return SummaryTable(
         key="methods",
-        title=f"{comparison.source}: each method with {budget_in_words(comparison)}",
+        title=f"{PurePath(comparison.source).name}: each method with {budget_in_words(comparison)}",
         columns=columns(*headings, details=["time", "steps"]),
         rows=tuple(
             Row(cells=_method_cells(comparison, row), emphasis=_method_emphasis(comparison, row))

@@ -4,6 +4,7 @@
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   const touch = window.matchMedia("(pointer: coarse)");
   const plots = Array.from(document.querySelectorAll(".plot"));
+  const phone = window.matchMedia("(max-width: 700px)");
   let printing = false;
   let unfolded = [];
 
@@ -57,9 +58,32 @@
     return panel.traces.map((trace) => {
       const shown = coloured(trace, colours);
       if (hidden.has(trace.legendgroup)) shown.visible = false;
+      if (shown.type === "heatmap" && phone.matches && !printing) narrowed(shown);
       if (shown.type === "heatmap") shown.colorbar = merged(shown.colorbar || {}, { tickfont: { color: colours.muted } });
       return shown;
     });
+  }
+
+  // On a phone, cells with a number need no scale beside them, and correlations few characters.
+  function narrowed(trace) {
+    if (!trace.texttemplate) return;
+    trace.showscale = false;
+    trace.textfont = { size: 10 };
+    if (trace.meta === "correlation") {
+      const short = (value) => value === null ? "" : value.toFixed(2).replace("0.", ".").replace("-", "−");
+      trace.text = trace.z.map((row) => row.map(short));
+      trace.texttemplate = "%{text}";
+    }
+  }
+
+  // On a phone, a table that is too wide becomes one block per row; one with very many columns is scrolled.
+  function fitTables() {
+    for (const table of document.querySelectorAll(".scroll > table")) {
+      table.classList.remove("stacked");
+      const wide = table.scrollWidth > table.parentElement.clientWidth + 1;
+      const columns = table.tHead.rows[table.tHead.rows.length - 1].cells.length;
+      if (wide && phone.matches && !printing && columns <= 12) table.classList.add("stacked");
+    }
   }
 
   function hiddenOf(node) {
@@ -111,7 +135,9 @@
   }
 
   function drawAll(nodes) {
-    return nodes.reduce((work, node) => work.then(() => draw(node)).then(() => new Promise((next) => setTimeout(next, 0))), Promise.resolve());
+    // A plot that fails does not keep the others away.
+    const failed = (node) => (error) => { console.error(error); node.textContent = "This plot could not be drawn."; };
+    return nodes.reduce((work, node) => work.then(() => draw(node)).catch(failed(node)).then(() => new Promise((next) => setTimeout(next, 0))), Promise.resolve());
   }
 
   for (const key of document.querySelectorAll(".keys button")) {
@@ -125,20 +151,26 @@
   // A folded plot has no size; it is drawn when it is unfolded.
   for (const fold of document.querySelectorAll("details")) {
     fold.addEventListener("toggle", () => {
-      if (fold.open) fold.querySelectorAll(".plot").forEach(draw);
+      if (!fold.open) return;
+      fitTables();
+      fold.querySelectorAll(".plot").forEach(draw);
     });
   }
 
+  window.addEventListener("resize", fitTables);
+  phone.addEventListener("change", () => drawAll(plots.filter((node) => node._fullLayout)));
   dark.addEventListener("change", () => drawAll(plots.filter((node) => node._fullLayout)));
   window.addEventListener("beforeprint", () => {
     printing = true;
     unfolded = Array.from(document.querySelectorAll("details:not([open])"));
     unfolded.forEach((fold) => { fold.open = true; });
+    fitTables();
     plots.forEach(draw);
   });
   window.addEventListener("afterprint", () => {
     printing = false;
     unfolded.forEach((fold) => { fold.open = false; });
+    fitTables();
     document.body.dataset.busy = "yes";
     drawAll(plots.filter((node) => node._fullLayout)).then(() => { delete document.body.dataset.busy; });
   });
@@ -148,5 +180,6 @@
     document.querySelectorAll("video").forEach((video) => { video.play().catch(() => {}); });
   }
 
+  fitTables();
   drawAll(plots).then(() => { document.body.dataset.ready = "yes"; });
 })();
