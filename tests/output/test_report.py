@@ -17,8 +17,8 @@ from mjfim.errors import MjfimError, RecordingError
 from mjfim.output.report import REPORT, VERBS
 from mjfim.output.report.build import KINDS, page_of, rewrite_reports, write_report
 from mjfim.output.report.correlations import correlation_of
-from mjfim.output.report.curves import packed, points_per_curve, thinned
-from mjfim.output.report.page import PlotGroup
+from mjfim.output.report.curves import correlation_panel, packed, points_per_curve, thinned
+from mjfim.output.report.page import Panel, PlotGroup
 from mjfim.output.report.render import is_page_of, no_video_in, rendered, video_in
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
 from mjfim.output.video import Video
@@ -160,7 +160,7 @@ def test_a_design_shows_its_tables_and_curves() -> None:
     for heading in ("Accuracy", "Motion", "Limits", "Optimisation"):
         assert f"<h2>{heading}</h2>" in html
     assert "Ready to play" in html
-    assert "<td>÷ 10.0</td>" in html
+    assert '<td data-label="change of σ">÷ 10.0</td>' in html
 
     maps = [t for p in data["panels"] for t in p["traces"] if t["type"] == "heatmap"]
     assert maps[0]["z"][0][1] == pytest.approx(results.CORRELATION)
@@ -218,6 +218,47 @@ def test_a_limit_that_swings_fast_is_drawn_as_an_envelope() -> None:
     assert len(values) == 150
     assert values.max() == pytest.approx(100.0 * np.abs(share).max())
     assert panel["layout"]["yaxis"]["range"][0] == 0.0
+
+
+def test_a_limit_far_away_is_named_and_does_not_flatten_the_motion() -> None:
+    """It is drawn where the motion comes near; elsewhere its value stands above the plot."""
+
+    def position(bound: float) -> Panel:
+        usage = replace(results.design().usage[0], lower=-bound, upper=bound)
+        sections = {s.title: s.parts for s in page_of(results.design(usage=(usage,))).sections}
+        groups = [part for part in sections["Motion"] if isinstance(part, PlotGroup)]
+        return next(group.panels[0] for group in groups if group.title == "Positions")
+
+    near, far = position(1.125), position(50.0)
+    assert len(near.layout["shapes"]) == 2
+    assert not near.remark
+    assert (far.layout["shapes"], far.remark) == ([], "limits -50 and 50")
+    assert "yaxis" not in far.layout
+
+
+def test_few_predictions_are_shown_over_the_noise() -> None:
+    """One plot for each recording, with a row for each output; a mark is explained."""
+    estimate = results.estimate()
+    prediction = replace(estimate.predictions[0], held_out=False)
+    known = results.estimate(predictions=(prediction,), sigma={"qpos:hinge": 0.5})
+    sections = {section.title: section.parts for section in page_of(known).sections}
+    groups = [part for part in sections["Predictions"] if isinstance(part, PlotGroup)]
+    errors = next(group for group in groups if group.title.startswith("Errors"))
+    (panel,) = errors.panels
+    assert panel.title.endswith(" *: rms error of the prediction / σ of the noise [–]")
+    assert "* predicted by a fit to the other recordings" in errors.note
+    assert numbers(panel.traces[1]["x"])[0] == pytest.approx(prediction.identified.rms[0] / 0.5)
+
+
+def test_long_names_of_correlations_become_numbers() -> None:
+    """They would be cut below the columns; a correlation of -0.001 is no negative zero."""
+    names = ["a", "b", "c", "damping_of_the_shoulder"]
+    panel = correlation_panel(np.full((4, 4), -0.001), names, "correlation [–]")
+    assert panel.layout["xaxis"]["ticktext"] == ["1", "2", "3", "4"]
+    assert panel.layout["yaxis"]["ticktext"][:2] == ["a  1", "b  2"]
+    assert str(panel.traces[0]["z"][0][1]) == "0.0"
+    short = correlation_panel(np.eye(2), ["a", "b"], "correlation [–]")
+    assert short.layout["xaxis"]["ticktext"] == ["a", "b"]
 
 
 def test_a_rough_design_asks_for_another_motion_not_for_more_time() -> None:

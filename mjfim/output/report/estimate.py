@@ -207,7 +207,7 @@ def _prediction_plots(estimate: Estimate, labels: Labels) -> PlotGroup:
     ]
     notes = ["Of a predicted recording, only the initial state is estimated."]
     if over_noise:
-        notes.append("Dashed line: the noise, below which no prediction of measurements can be.")
+        notes.append("Dashed line: the noise that the fit assumes.")
     if not all(prediction.held_out for prediction in found):
         notes.append(f"{FITTED_NOTE}.")
     return PlotGroup(
