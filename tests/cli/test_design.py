@@ -143,6 +143,7 @@ def test_budget_used_up_where_derivatives_do_not_exist(tmp_path: Path) -> None:
     assert (result.exit_code, loads(result.stdout)["status"]) == (1, "rough")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_files")
 @pytest.mark.parametrize(("prior", "code"), [("", 1), ("prior = 0.1\n", 0)])
 def test_parameters_that_do_the_same_give_the_code_of_check(

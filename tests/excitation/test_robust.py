@@ -167,6 +167,7 @@ def phis(task: DesignTask, control: Array, thetas: Array) -> Array:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_the_cost_is_the_pooled_criterion_of_separate_experiments_at_the_samples(tmp_path) -> None:
     task = vague_task(tmp_path, robust={"over": "worst", "samples": 5, "seed": 2})
     thetas = task.samples_of_parameters.thetas

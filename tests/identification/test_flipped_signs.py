@@ -49,6 +49,7 @@ def said(system: System, recording: Recording) -> list[str]:
     return [text for text in found.warnings if "looks flipped" in text]
 
 
+@pytest.mark.slow
 def test_a_flipped_control_is_found(system: System, recording: Recording) -> None:
     (sentence,) = said(system, flipped(recording, control=True))
     assert sentence.startswith("the sign of control force looks flipped")

@@ -374,6 +374,7 @@ def test_a_robust_fit_tests_the_size_of_its_residuals(
     )
 
 
+@pytest.mark.slow
 def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
     """Their covariance is infinite; other correlations are computed without a warning of NumPy."""
     experiment = Experiment.from_file(ROOT / "models" / "ball_pendulum.toml")
