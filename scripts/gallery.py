@@ -35,7 +35,7 @@ import tomlkit
 from PIL import Image
 
 from mjfim.output.vocabulary import TERMS
-from scripts.rerun_screenshot import every_tab, screenshot
+from scripts.rerun_screenshot import Shot, every_tab, screenshot
 from scripts.verbs import call_verb
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -405,7 +405,7 @@ def _pictures(folder: Path) -> dict[str, Path]:
         picture = folder / "screenshots" / f"rerun-{recording.stem}.png"
         picture.parent.mkdir(exist_ok=True)
         try:
-            screenshot(recording, picture, SHOWN_TIME)
+            screenshot(Shot(rrd=recording, time_s=SHOWN_TIME), picture)
         except ConnectionError as error:
             print(f"{recording}: no viewer: {error}", file=sys.stderr)
         else:
@@ -480,7 +480,8 @@ def save_every_tab(folder: Path) -> None:
     for recording in sorted(folder.glob("*/*.rrd")):
         for size in VIEWER_SIZES:
             try:
-                every_tab(recording, recording.parent / "screenshots", SHOWN_TIME, size=size)
+                shot = Shot(rrd=recording, time_s=SHOWN_TIME, size=size)
+                every_tab(shot, recording.parent / "screenshots")
             except ConnectionError as error:
                 print(f"{recording}: no viewer: {error}", file=sys.stderr)
 

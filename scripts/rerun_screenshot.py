@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -32,54 +33,46 @@ SETTLE, START = 3.0, 20.0
 SIZE = (1920, 1080)
 
 
-def screenshot(
-    rrd: Path,
-    png: Path,
-    time_s: float = 0.0,
-    iteration: int | None = None,
-    *,
-    size: tuple[int, int] = SIZE,
-    tabs: Sequence[str] = (),
-) -> None:
-    """Save the picture that the viewer shows.
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """What a picture shows of a recording.
 
-    Args:
+    Attributes:
         rrd: Rerun recording.
-        png: File to write.
         time_s: Simulated time [s].
         iteration: Iteration of the optimiser that is shown instead of a time.
         size: Width and height of the window [pixels].
+    """
+
+    rrd: Path
+    time_s: float = 0.0
+    iteration: int | None = None
+    size: tuple[int, int] = SIZE
+
+
+def screenshot(shot: Shot, png: Path, tabs: Sequence[str] = ()) -> None:
+    """Save the picture that the viewer shows.
+
+    Args:
+        shot: What the picture shows.
+        png: File to write.
         tabs: Names of the tabs that are opened, such as "limits" or "overlay".
 
     Raises:
         ConnectionError: No viewer can start.
     """
-    with _viewer(size) as viewer:
-        viewer.open(str(rrd.resolve()))
-        time.sleep(SETTLE)
+    with _viewer(shot) as viewer:
         if tabs:
             _open_tabs(viewer, tabs)
-        _go_to(viewer, time_s, iteration)
-        time.sleep(SETTLE)
-        viewer.save_screenshot(str(png.resolve()))
+        _save(viewer, shot, png)
 
 
-def every_tab(
-    rrd: Path,
-    folder: Path,
-    time_s: float = 0.0,
-    iteration: int | None = None,
-    *,
-    size: tuple[int, int] = SIZE,
-) -> list[Path]:
+def every_tab(shot: Shot, folder: Path) -> list[Path]:
     """Save a picture of each tab, also of those that are not open at first.
 
     Args:
-        rrd: Rerun recording.
+        shot: What the pictures show.
         folder: Folder for the pictures, which are named after the recording, the size and the tab.
-        time_s: Simulated time [s].
-        iteration: Iteration of the optimiser that is shown instead of a time.
-        size: Width and height of the window [pixels].
 
     Returns:
         The pictures.
@@ -89,45 +82,47 @@ def every_tab(
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = []
-    with _viewer(size) as viewer:
-        viewer.open(str(rrd.resolve()))
-        time.sleep(SETTLE)
+    with _viewer(shot) as viewer:
         for tabs in _paths_of_tabs(viewer.get_blueprint().blueprint):
             found = viewer.get_blueprint()
             for container, tab in tabs:
                 found.blueprint[container]["ContainerBlueprint"]["active_tab"] = tab
             viewer.set_blueprint(found.blueprint, store_id=found.store_id)
             time.sleep(SETTLE)
-            _go_to(viewer, time_s, iteration)
-            time.sleep(SETTLE)
 
+            width, height = shot.size
             words = [_name(found.blueprint, tab) for _, tab in tabs]
-            name = "-".join([f"{rrd.stem}-{size[0]}x{size[1]}", *words])
+            name = "-".join([f"{shot.rrd.stem}-{width}x{height}", *words])
             plain_name = re.sub(r"[^\w.]+", "-", name)
             picture = folder / f"{plain_name}.png"
-            viewer.save_screenshot(str(picture.resolve()))
+            _save(viewer, shot, picture)
             pictures.append(picture)
     return pictures
 
 
-def _go_to(viewer: ViewerClient, time_s: float, iteration: int | None) -> None:
-    """Show a simulated time [s], or an iteration."""
-    if iteration is None:
-        viewer.set_time(timeline="sim_time", duration=time_s, play_state="paused")
+def _save(viewer: ViewerClient, shot: Shot, picture: Path) -> None:
+    """Save what the viewer shows at the time or at the iteration."""
+    if shot.iteration is None:
+        viewer.set_time(timeline="sim_time", duration=shot.time_s, play_state="paused")
     else:
-        viewer.set_time(timeline="iteration", sequence=iteration, play_state="paused")
+        viewer.set_time(timeline="iteration", sequence=shot.iteration, play_state="paused")
+    time.sleep(SETTLE)
+    viewer.save_screenshot(str(picture.resolve()))
 
 
 @contextmanager
-def _viewer(size: tuple[int, int]) -> Iterator[ViewerClient]:
-    """Start a viewer without a window, whose pictures have a size [pixels]."""
+def _viewer(shot: Shot) -> Iterator[ViewerClient]:
+    """Start a viewer without a window, and open the recording in it."""
     # The path names the executable of the wheel, because PATH may lack this environment.
     port = _free_port()
     command = [str(files("rerun_cli") / "rerun"), "--headless", "--port", str(port)]
-    command += ["--window-size", f"{size[0]}x{size[1]}"]
+    command += ["--window-size", f"{shot.size[0]}x{shot.size[1]}"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        yield _connected(process, port)
+        viewer = _connected(process, port)
+        viewer.open(str(shot.rrd.resolve()))
+        time.sleep(SETTLE)
+        yield viewer
     finally:
         process.terminate()
         process.wait()
@@ -216,13 +211,12 @@ def main() -> int:
     )
     parser.add_argument("--every-tab", action="store_true", help="save a picture of every tab")
     args = parser.parse_args()
+    shot = Shot(rrd=args.rrd, time_s=args.time, iteration=args.iteration, size=args.size)
     try:
         if args.every_tab:
-            every_tab(args.rrd, args.png, args.time, args.iteration, size=args.size)
-            return 0
-        screenshot(
-            args.rrd, args.png, args.time, args.iteration, size=args.size, tabs=tuple(args.tab)
-        )
+            every_tab(shot, args.png)
+        else:
+            screenshot(shot, args.png, args.tab)
     except ConnectionError as error:
         print(f"no viewer: {error}", file=sys.stderr)
         return 2

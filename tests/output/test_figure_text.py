@@ -17,13 +17,20 @@ from mjfim.output import plots
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.check import Check, ParameterCheck, SelfTest
-from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
+from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors, Whiteness
 from mjfim.records.labels import Labels
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
 from tests.support.figure_text import misplaced_texts
-from tests.support.made_records import make_design, make_estimate, make_labels, make_study
+from tests.support.made_records import (
+    make_comparison,
+    make_design,
+    make_estimate,
+    make_labels,
+    make_method_result,
+    make_study,
+)
 
 # Number of characters of a long name.
 LONG = 40
@@ -177,36 +184,24 @@ def comparison(size: Size) -> Comparison:
     std = np.linspace(0.01, 0.02, size.parameters)
     titles = ("chirp", "multisine " + "m" * 30, "steps", "splines", "random", "mjfim's design")
     rows = [
-        MethodResult(
-            method=DESIGN if "design" in title else title,
+        make_method_result(
+            DESIGN if "design" in title else title,
+            1.0 + i,
             title=title,
             outcome=MethodOutcome.OUTSIDE if title == "steps" else MethodOutcome.INSIDE,
-            control=None,
-            cost=1.0 + i,
-            criterion=1.0,
             std=(1.0 + i) * std,
-            min_eigenvalue=1.0,
             worst_relative_std=0.02 * (1.0 + i),
-            seconds=1.0,
-            steps=100,
             margins={"control_rate": 0.1},
             relative_margins={"control_rate": 0.01},
         )
         for i, title in enumerate(titles)
     ]
-    return Comparison(
-        source="e",
-        criterion="E",
-        nats=0.0,
+    return make_comparison(
+        *rows,
         parameters=size.labels.parameters,
         units=size.labels.parameter_units,
         scale=np.ones(size.parameters),
-        nuisance=(),
-        rows=tuple(rows),
         seconds=6.0,
-        steps=np.inf,
-        seed=0,
-        weighted=False,
     )
 
 

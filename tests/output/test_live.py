@@ -146,15 +146,24 @@ def watched(
     return received
 
 
+@pytest.fixture(scope="module")
+def received(
+    searched: tuple[Design, list[DesignEvent]],
+    experiment: mjfim.Experiment,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Received:
+    """What a viewer receives from the whole design."""
+    folder = tmp_path_factory.mktemp("live")
+    return watched(searched[1], experiment, folder, step=2.0 * UPDATE_SECONDS)
+
+
 class TestShown:
     def test_every_iterate_of_a_design_changes_curves_robot_and_path(
         self,
         searched: tuple[Design, list[DesignEvent]],
-        experiment: mjfim.Experiment,
-        tmp_path: Path,
+        received: Received,
     ) -> None:
         design, events = searched
-        received = watched(events, experiment, tmp_path, step=2.0 * UPDATE_SECONDS)
 
         costs = [row.cost for row in design.history]
         eigenvalues = [row.min_eigenvalue for row in design.history]
@@ -176,11 +185,9 @@ class TestShown:
     def test_curves_over_time_show_the_positions_and_the_controls(
         self,
         searched: tuple[Design, list[DesignEvent]],
-        experiment: mjfim.Experiment,
-        tmp_path: Path,
+        received: Received,
     ) -> None:
         design, events = searched
-        received = watched(events, experiment, tmp_path, step=2.0 * UPDATE_SECONDS)
         shown = {
             "/positions/hinge\\ \\[rad\\]": design.trajectory.qpos[:, 1],
             "/controls/force\\ \\[N\\]": design.trajectory.ctrl[:, 0],

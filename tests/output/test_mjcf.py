@@ -19,7 +19,7 @@ from mjfim.experiment.system import System
 from mjfim.model.paths import KINDS, fields_of
 from mjfim.output.mjcf.actuators import SHORTCUTS
 from mjfim.output.mjcf.document import MjcfDocument
-from mjfim.output.mjcf.write import COMPARED, NOT_DYNAMICS, write_identified
+from mjfim.output.mjcf.write import COMPARED, NOT_DYNAMICS, same_dynamics, write_identified
 from mjfim.output.mjcf.xml_edit import XmlText
 from tests.support.examples import design_file
 from tests.support.numerics import make_task, shared_model
@@ -660,3 +660,30 @@ def test_models_of_other_projects(name: str, tmp_path: Path) -> None:
     else:
         assert said is None
     assert_is_identified_model(tmp_path / "identified.xml", task, theta)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ((4e-13, 4e-13), (4e-13, 8e-13), False),  # a small robot in large units
+        ((1.0, 1e-13), (1.0, 0.0), True),  # rounding beside a large number
+        ((1e6, 1e-7), (1e6, 0.0), True),
+        ((1e6, 1e-5), (1e6, 0.0), False),
+    ],
+)
+def test_what_counts_as_rounding_does_not_depend_on_units(
+    one: tuple[float, float], other: tuple[float, float], same: bool
+) -> None:
+    def model(armatures: tuple[float, float]) -> mujoco.MjModel:
+        joints = "".join(
+            f'<body><joint armature="{armature!r}"/><geom size="0.1"/></body>'
+            for armature in armatures
+        )
+        return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{joints}</worldbody></mujoco>")
+
+    # The inverse inertias at the reference position follow from the armatures.
+    first, second = model(one), model(other)
+    first.dof_invweight0[:] = second.dof_invweight0
+    first.dof_M0[:] = second.dof_M0
+    first.body_invweight0[:] = second.body_invweight0
+    assert same_dynamics(first, second) == same

@@ -16,10 +16,16 @@ from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.plots.design import panel_columns
 from mjfim.output.plots.style import log_ticks, plain_number, without_zeros
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
-from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
+from mjfim.records.comparison import DESIGN
 from mjfim.records.design import Design, LimitUsage
 from mjfim.records.robustness import RobotConditions, Robustness
-from tests.support.made_records import make_design, make_estimate, make_labels
+from tests.support.made_records import (
+    make_comparison,
+    make_design,
+    make_estimate,
+    make_labels,
+    make_method_result,
+)
 
 
 def all_text(figure: Figure) -> str:
@@ -209,38 +215,11 @@ def test_a_campaign_of_one_round_counts_in_whole_rounds() -> None:
 @pytest.mark.parametrize("limited", [False, True])
 def test_a_comparison_shows_margins_or_the_cost(limited: bool) -> None:
     margins = {"control": 0.1} if limited else {}
-    rows = tuple(
-        MethodResult(
-            method=method,
-            title=method,
-            outcome=MethodOutcome.INSIDE,
-            control=None,
-            cost=cost,
-            criterion=1.0,
-            std=np.array([0.01]),
-            min_eigenvalue=1.0,
-            worst_relative_std=0.02,
-            seconds=1.0,
-            steps=100,
-            margins=margins,
-            relative_margins=margins,
-        )
+    rows = (
+        make_method_result(method, cost, margins=margins, relative_margins=margins)
         for method, cost in ((DESIGN, 1.25), ("chirp", 1.5))
     )
-    comparison = Comparison(
-        source="e",
-        criterion="E",
-        nats=0.0,
-        parameters=("m",),
-        units=("kg",),
-        scale=np.ones(1),
-        nuisance=(),
-        rows=rows,
-        seconds=6.0,
-        steps=np.inf,
-        seed=0,
-        weighted=False,
-    )
+    comparison = make_comparison(*rows)
     text = all_text(plots.compare_figure(comparison))
     assert ("J 1.25" in text) != limited
     assert ("10 % control" in text) == limited

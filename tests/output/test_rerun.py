@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from tests.support.made_records import make_row
 from tests.support.paths import ROOT, SHARED_MODELS
 
 pytest.importorskip("rerun")
@@ -134,10 +135,9 @@ def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Eva
 def designed(model: mujoco.MjModel) -> Design:
     """Make a design by hand: a small and a large control, three iterations."""
     history = tuple(
-        HistoryRow(
+        make_row(
             iteration=k,
             cost=2.0 / 4**k,
-            criterion=1.0,
             min_eigenvalue=4.0**k,
             slope=0.1**k,
             gamma=0.5,
@@ -1037,16 +1037,7 @@ class TestLabels:
 
     def test_costs_that_change_sign_are_not_logarithmic(self) -> None:
         rows = [
-            HistoryRow(
-                iteration=k,
-                cost=1.0 - k,
-                criterion=0.0,
-                min_eigenvalue=1.0,
-                slope=0.0,
-                gamma=float("nan"),
-                seconds=0.0,
-                steps=0,
-            )
+            make_row(iteration=k, cost=1.0 - k, criterion=0.0, slope=0.0, gamma=float("nan"))
             for k in range(3)
         ]
         series = history_series(rows)

@@ -25,11 +25,12 @@ from mjfim.output.summary_parts import (
 from mjfim.output.terminal_tables import fold
 from mjfim.output.text import MAX_LINES, render
 from mjfim.records.check import Check, ParameterCheck, SelfTest
-from mjfim.records.comparison import Comparison, MethodOutcome, MethodResult
+from mjfim.records.comparison import Comparison
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
 from mjfim.records.recording import Recording
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
 from mjfim.records.shown import ShownRecord
+from tests.support.made_records import make_comparison, make_method_result
 
 # A name of 40 characters, and many of them.
 LONG = "left_forearm_and_hand_with_gripper_mass_"
@@ -128,13 +129,11 @@ def a_check(names: tuple[str, ...]) -> Check:
 def a_comparison(names: tuple[str, ...]) -> Comparison:
     """Four methods under limits."""
     p = len(names)
-    rows = tuple(
-        MethodResult(
-            method=method,
+    rows = (
+        make_method_result(
+            method,
+            0.123456 * (1 + k),
             title=title,
-            outcome=MethodOutcome.INSIDE,
-            control=None,
-            cost=0.123456 * (1 + k),
             criterion=12.3456,
             std=np.full(p, 1.2345e-5),
             min_eigenvalue=0.1,
@@ -148,18 +147,14 @@ def a_comparison(names: tuple[str, ...]) -> Comparison:
             (("design", "this design"), ("a", "multisine, best of 8"), ("b", "Fourier series"))
         )
     )
-    return Comparison(
+    return make_comparison(
+        *rows,
         source="an experiment",
-        criterion="E",
-        nats=0.0,
         parameters=names,
         units=("kg m²",) * p,
         scale=np.ones(p),
-        nuisance=(),
-        rows=rows,
         seconds=60.0,
         steps=1e6,
-        seed=0,
         weighted=True,
     )
 

@@ -8,23 +8,12 @@ import numpy as np
 import pytest
 
 from mjfim.records.design import HistoryRow, Status, improvement_per_iteration
-from tests.support.made_records import make_design
+from tests.support.made_records import make_design, make_row
 
 
-def rows(costs: list[float], **fields: float) -> list[HistoryRow]:
+def rows(costs: list[float], rate: float = 100.0, **fields: float) -> list[HistoryRow]:
     """Iterates of these costs, with further fields that all have in common."""
-    row = HistoryRow(
-        iteration=0,
-        cost=1.0,
-        criterion=1.0,
-        min_eigenvalue=1.0,
-        slope=1.0,
-        gamma=1.0,
-        seconds=0.0,
-        steps=0,
-        rate=100.0,
-    )
-    return [replace(row, iteration=i, cost=cost, **fields) for i, cost in enumerate(costs)]
+    return [make_row(iteration=i, cost=cost, rate=rate, **fields) for i, cost in enumerate(costs)]
 
 
 def test_it_is_the_share_of_the_last_ten_iterations() -> None:

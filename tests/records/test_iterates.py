@@ -9,6 +9,7 @@ import numpy as np
 from mjfim.records.design import HistoryRow, extended, without_motions
 from mjfim.records.iterates import MAX_MOTIONS, MOTION_SAMPLES, IterateMotion, superfluous
 from mjfim.records.trajectory import Trajectory
+from tests.support.made_records import make_row
 
 
 def moved(samples: int) -> Trajectory:
@@ -16,21 +17,6 @@ def moved(samples: int) -> Trajectory:
     t = 0.01 * np.arange(samples + 1)
     empty = np.zeros((samples + 1, 0))
     return Trajectory(t=t, qpos=t[:, None], qvel=t[:, None], act=empty, ctrl=t[:-1, None])
-
-
-def row(iteration: int, motion: IterateMotion | None) -> HistoryRow:
-    """An iterate with a motion."""
-    return HistoryRow(
-        iteration=iteration,
-        cost=1.0,
-        criterion=1.0,
-        min_eigenvalue=1.0,
-        slope=1.0,
-        gamma=1.0,
-        seconds=0.0,
-        steps=0,
-        motion=motion,
-    )
 
 
 def test_a_motion_has_both_ends_and_evenly_spread_samples() -> None:
@@ -57,7 +43,7 @@ def test_many_iterates_keep_few_motions_evenly_spread() -> None:
     history: tuple[HistoryRow, ...] = ()
     motion = IterateMotion.of(moved(5))
     for iteration in range(500):
-        history = extended(history, [row(iteration, motion)])
+        history = extended(history, [make_row(iteration=iteration, motion=motion)])
     kept = [entry.iteration for entry in history if entry.motion is not None]
     assert len(history) == 500 and len(kept) == MAX_MOTIONS
     assert kept[0] == 0 and kept[-1] == 499
@@ -65,7 +51,8 @@ def test_many_iterates_keep_few_motions_evenly_spread() -> None:
 
 
 def test_motions_are_separated_from_the_history() -> None:
-    rows = [row(0, None), row(1, IterateMotion.of(moved(9))), row(4, IterateMotion.of(moved(5)))]
+    by_iteration = {0: None, 1: IterateMotion.of(moved(9)), 4: IterateMotion.of(moved(5))}
+    rows = [make_row(iteration=i, motion=motion) for i, motion in by_iteration.items()]
     history, motions = without_motions(rows)
     assert all(entry.motion is None for entry in history)
     assert motions is not None and motions.iteration.tolist() == [1.0, 4.0]

@@ -25,13 +25,14 @@ from mjfim.excitation.verification import verify
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.plots.compare import compare_figure
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
-from mjfim.records.design import Design, HistoryRow
+from mjfim.records.design import Design
 from mjfim.records.events import DesignEvent, Event, StudyEvent
 from mjfim.studies import compare as compare_module
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.compare import DesignWatch, MethodEvaluation, chosen_methods
 from tests.support.baselines import pendulum, played
 from tests.support.cli import loads, names, read, run, write_experiment
+from tests.support.made_records import make_comparison, make_method_result, make_row
 
 LIMITS = "\n[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\n"
 
@@ -45,38 +46,26 @@ def small() -> Comparison:
 def row(method: str, cost: float, outcome: MethodOutcome = MethodOutcome.INSIDE) -> MethodResult:
     """A made-up result."""
     std = np.full(2, np.sqrt(abs(cost)))
-    return MethodResult(
-        method=method,
-        title=method,
+    return make_method_result(
+        method,
+        cost,
         outcome=outcome,
         control=np.zeros((4, 1)),
-        cost=cost,
-        criterion=cost,
         std=std,
         min_eigenvalue=1.0 / cost,
         worst_relative_std=std[0],
-        seconds=1.0,
-        steps=10,
-        margins={},
-        relative_margins={},
     )
 
 
 def made(*rows: MethodResult, nats: float = 0.0) -> Comparison:
     """A made-up comparison."""
-    return Comparison(
-        source="e",
+    return make_comparison(
+        *rows,
         criterion="D" if nats else "E",
         nats=nats,
         parameters=("a", "b"),
         units=("", ""),
         scale=np.ones(2),
-        nuisance=(),
-        rows=rows,
-        seconds=1.0,
-        steps=np.inf,
-        seed=0,
-        weighted=False,
     )
 
 
@@ -210,17 +199,7 @@ def test_a_design_is_stopped_at_its_steps() -> None:
     watch = DesignWatch(search=search, progress=lambda share, cost: shares.append(share))
 
     def iterate(steps: int) -> DesignEvent:
-        row = HistoryRow(
-            iteration=0,
-            cost=1.0,
-            criterion=1.0,
-            min_eigenvalue=1.0,
-            slope=1.0,
-            gamma=1.0,
-            seconds=0.0,
-            steps=steps,
-        )
-        return DesignEvent(start="initial", row=row)
+        return DesignEvent(start="initial", row=make_row(steps=steps))
 
     watch(iterate(400))
     watch(iterate(300))  # another task

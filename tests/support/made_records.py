@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.records.comparison import Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, Evaluation, HistoryRow, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
@@ -61,16 +64,30 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
     )
 
 
+def make_row(**changes: object) -> HistoryRow:
+    """Make an iterate whose numbers are one, with other values of some fields."""
+    row = HistoryRow(
+        iteration=0,
+        cost=1.0,
+        criterion=1.0,
+        min_eigenvalue=1.0,
+        slope=1.0,
+        gamma=1.0,
+        seconds=0.0,
+        steps=0,
+    )
+    return replace(row, **changes)
+
+
 def ten_iterates() -> tuple[HistoryRow, ...]:
     """Ten iterates, each with half of the cost of the one before."""
     return tuple(
-        HistoryRow(
+        make_row(
             iteration=i,
             cost=2.0**-i,
             criterion=2.0**-i,
             min_eigenvalue=2.0**i,
             slope=-(4.0**-i),
-            gamma=1.0,
             seconds=0.1 * i,
             steps=100 * i,
         )
@@ -163,3 +180,42 @@ def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estima
         predicted=(predicted,),
         recordings=(recording,),
     )
+
+
+def make_method_result(method: str, cost: float, **changes: object) -> MethodResult:
+    """Make what a method of a comparison found for one parameter, without limits."""
+    found = MethodResult(
+        method=method,
+        title=method,
+        outcome=MethodOutcome.INSIDE,
+        control=None,
+        cost=cost,
+        criterion=cost,
+        std=np.array([0.01]),
+        min_eigenvalue=1.0,
+        worst_relative_std=0.01,
+        seconds=1.0,
+        steps=100,
+        margins={},
+        relative_margins={},
+    )
+    return replace(found, **changes)
+
+
+def make_comparison(*rows: MethodResult, **changes: object) -> Comparison:
+    """Make a comparison of methods by their largest sigma, of one parameter."""
+    made = Comparison(
+        source="e",
+        criterion="E",
+        nats=0.0,
+        parameters=("m",),
+        units=("kg",),
+        scale=np.ones(1),
+        nuisance=(),
+        rows=rows,
+        seconds=1.0,
+        steps=np.inf,
+        seed=0,
+        weighted=False,
+    )
+    return replace(made, **changes)

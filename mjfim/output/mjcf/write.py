@@ -13,6 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
@@ -57,9 +58,10 @@ NOT_DYNAMICS = (
     "dof_simplenum",
 )
 
-# Relative and absolute difference below which numbers of two models count as equal.
+# Difference below which numbers of two models count as equal: share of the number itself, and share
+# of the largest finite number of its array, which the rounding of MuJoCo's compiler is relative to.
 RELATIVE_TOLERANCE = 1e-9
-ABSOLUTE_TOLERANCE = 1e-12
+ROUNDING = 1e-12
 
 # Constraint weights of bodies, which MuJoCo averages differently for 'simple' bodies.
 INVERSE_WEIGHT = "body_invweight0"
@@ -221,9 +223,14 @@ def _differences(a: Any, b: Any) -> list[str]:
 def _equal(x: Any, y: Any) -> bool:
     """Return whether two arrays have the same shape and nearly the same numbers."""
     x, y = np.asarray(x), np.asarray(y)
-    return x.shape == y.shape and np.allclose(
-        x, y, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE
-    )
+    return x.shape == y.shape and bool(_close(x, y).all())
+
+
+def _close(x: Array, y: Array) -> NDArray[np.bool_]:
+    """Return which numbers of two arrays of the same shape are nearly the same, in any unit."""
+    finite = np.abs(y[np.isfinite(y)])
+    rounding = ROUNDING * float(finite.max(initial=0.0))
+    return np.isclose(x, y, rtol=RELATIVE_TOLERANCE, atol=rounding)
 
 
 def _reweighted_bodies(a: Any, b: Any, same_class: bool) -> list[str]:
@@ -233,9 +240,7 @@ def _reweighted_bodies(a: Any, b: Any, same_class: bool) -> list[str]:
     of a simple body differently. With `same_class`, only bodies count that are 'simple' in both
     models or in neither; without it, only bodies that are 'simple' in one of them.
     """
-    close = np.isclose(
-        a.body_invweight0, b.body_invweight0, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE
-    )
+    close = _close(a.body_invweight0, b.body_invweight0)
     in_same_class = (a.body_simple > 0) == (b.body_simple > 0)
     bodies = np.flatnonzero(~close.all(axis=1) & (in_same_class == same_class))
 

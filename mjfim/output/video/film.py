@@ -113,7 +113,7 @@ class Film:
 
     @property
     def caption(self) -> str:
-        """What the film shows, in one or two sentences."""
+        """One or two sentences that describe the film."""
         pictures = [" and ".join(_robot(track) for track in view.tracks) for view in self.views]
         shown = " beside ".join(pictures)
         sentences = [f"{shown[:1].upper()}{shown[1:]}, {speed_text(self.speed)}."]
