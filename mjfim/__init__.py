@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mjfim.output.live import live
     from mjfim.output.robot.export import export_design
     from mjfim.output.video.results import save_video
-    from mjfim.parallel import Pool
+    from mjfim.parallel import Pool, Workers
     from mjfim.records.campaign import Campaign
     from mjfim.records.check import Check
     from mjfim.records.comparison import Comparison
@@ -57,6 +57,7 @@ __all__ = [
     "ShortestExperiment",
     "StopToken",
     "Trajectory",
+    "Workers",
     "assess_robustness",
     "check",
     "compare",
@@ -93,6 +94,7 @@ MODULES = {
     "live": "mjfim.output.live",
     "save_video": "mjfim.output.video.results",
     "Pool": "mjfim.parallel",
+    "Workers": "mjfim.parallel",
     "Campaign": "mjfim.records.campaign",
     "Check": "mjfim.records.check",
     "Comparison": "mjfim.records.comparison",

@@ -10,19 +10,20 @@ from pathlib import Path
 import psutil
 import pytest
 
-from mjfim import atomic_io, parallel
+from mjfim import atomic_io
+from mjfim.parallel import threads
 from tests.support.paths import ROOT
 
 
 def test_windows_waits_for_at_most_61_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Python refuses pools of more processes there; other systems have no such bound."""
-    monkeypatch.setattr(parallel, "cores", lambda: 128)
-    assert parallel.process_count(None) == 128
+    monkeypatch.setattr(threads, "cores", lambda: 128)
+    assert threads.process_count(None) == 128
 
     monkeypatch.setattr(sys, "platform", "win32")
-    assert parallel.process_count(None) == 61
-    assert parallel.process_count(100) == 61
-    assert parallel.process_count(3) == 3
+    assert threads.process_count(None) == 61
+    assert threads.process_count(100) == 61
+    assert threads.process_count(3) == 3
 
 
 def test_left_over_files_are_removed_on_windows_without_a_signal(

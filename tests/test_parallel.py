@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation import constrained
 from mjfim.excitation.design import design_task
 from mjfim.excitation.interior_point import BarrierIterate, InteriorPointMethod
+from mjfim.parallel import dispatch
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 from tests.support.cli import names, read, write_experiment
@@ -66,13 +66,14 @@ def test_processes_of_a_pool_are_others_and_see_the_request_to_stop(pool: mjfim.
 
 @pytest.mark.slow
 def test_a_stopped_pool_can_be_used_again_once_nothing_runs() -> None:
+    stop = StopToken()
     with mjfim.Pool(1) as pool:
-        assert pool.submit(identity).result()
-        waiting = [pool.submit(wait_for_stop, 60.0) for _ in range(3)]
-        time.sleep(0.5)
-        first = workers.collect_finished(pool, waiting)[0]
-        assert first[0]
-        assert pool.submit(wait_for_stop, 0.1).result(timeout=30.0) == (False, first[1])
+        process = pool.submit(identity).result()
+        threading.Timer(0.5, stop.request).start()
+        budget = Budget(stop=stop)
+        found = list(workers.carry_out(pool, wait_for_stop, [60.0, 60.0, 60.0], budget))
+        assert found[0].result == (True, process)
+        assert pool.submit(wait_for_stop, 0.1).result(timeout=30.0) == (False, process)
 
 
 def offer_and_go_on(result: int) -> int:
@@ -87,61 +88,42 @@ def test_a_task_that_does_not_end_in_time_hands_over_its_best_so_far(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As an optimisation whose single iterate takes longer than anybody waits."""
-    monkeypatch.setattr(workers, "GRACE", 2.0)
+    monkeypatch.setattr(dispatch, "GRACE", 2.0)
     stop = StopToken()
     with mjfim.Pool(1) as pool:
-        assert pool.submit(identity).result()
-        futures = [pool.submit(offer_and_go_on, 7)]
+        process = pool.submit(identity).result()
         threading.Timer(1.0, stop.request).start()
         begin = time.monotonic()
-        found = list(workers.results_in_order(pool, futures, Budget(stop=stop)))
-    assert found == [7]
-    assert time.monotonic() - begin < 8.0
-    assert not Path(pool._address).exists()
+        found = list(workers.carry_out(pool, offer_and_go_on, [7], Budget(stop=stop)))
+        assert [each.result for each in found] == [7]
+        assert time.monotonic() - begin < 8.0
+        assert not Path(pool._address).exists()
+
+        # The process that goes on is ended, and another one does what follows.
+        assert pool.submit(identity).result(timeout=30.0) != process
+        assert not pool.has_lost_worker
 
 
-def end_worker(number: int) -> int:
-    """End this process as the system does where the memory is full, for the number 1."""
-    if number == 1:
-        time.sleep(0.5)
+def end_worker(order: tuple[Path, int]) -> int:
+    """End this process as the system does where the memory is full, as often as is stated."""
+    folder, number = order
+    count = len(list(folder.iterdir()))
+    if number == 1 and count < 2:
+        (folder / f"{count}").touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return number
 
 
 @pytest.mark.slow
-def test_the_work_of_a_killed_worker_is_done_again() -> None:
-    here = []
-
-    def again(number: int) -> int:
-        here.append(number)
-        return number
-
+def test_the_work_of_a_killed_worker_is_done_again(tmp_path: Path) -> None:
+    orders = [(tmp_path, number) for number in range(4)]
     with mjfim.Pool(2) as pool:
-        assert list(workers.run_in_order(pool, end_worker, [0, 1, 2], Budget(), again)) == [0, 1, 2]
+        found = workers.carry_out(pool, end_worker, orders, Budget())
+        assert [each.result for each in found] == [0, 1, 2, 3]
         assert pool.has_lost_worker
-        assert 1 in here
 
-        # Later work does not need the pool any more.
-        assert list(workers.run_in_order(pool, end_worker, [3], Budget(), again)) == [3]
-    assert here[-1] == 3
-
-
-def test_finished_tasks_are_collected_in_order_and_the_others_are_left(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    done: list[Future[int]] = [Future() for _ in range(4)]
-    for i, future in enumerate(done[:3]):
-        future.set_running_or_notify_cancel()
-        if i == 1:
-            future.set_exception(ValueError())
-        else:
-            future.set_result(i)
-    done[3].set_running_or_notify_cancel()  # and never ends
-    monkeypatch.setattr(workers, "GRACE", 0.2)
-    with ThreadPoolExecutor(1) as executor:
-        assert workers.collect_finished(executor, [done[2], done[3], done[1], done[0]]) == [2, 0]
-    assert workers.workers_of(None) == 1
-    assert workers.workers_of(ThreadPoolExecutor(3)) == 3
+        # Later work uses the new processes.
+        assert pool.submit(identity).result(timeout=30.0) != os.getpid()
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.verification import verify
-from mjfim.parallel import run_in_order, workers_of
+from mjfim.parallel import Workers, results_or_here
 from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
 
@@ -349,7 +349,8 @@ class Multistart:
 
     def _turns(self, count: int) -> int:
         """Number of runs that each worker does one after the other, of `count` runs."""
-        return -(-max(count, 1) // workers_of(self.executor))
+        workers = 1 if self.executor is None else Workers.of(self.executor).count
+        return -(-max(count, 1) // workers)
 
     # ---- choice of the survivors
 
@@ -508,7 +509,7 @@ class Multistart:
         # Workers share the threads; without an executor a search uses all of them.
         threads = task.system.threads
         if self.executor is not None:
-            threads = max(workers_of(self.executor) // len(starts), 1)
+            threads = Workers.of(self.executor).threads_for(len(starts))
 
         searches = [
             ConstrainedSearch(
@@ -553,7 +554,7 @@ class Multistart:
             """Run a search whose process was ended from outside."""
             return consume(search.run(), None)
 
-        for result in run_in_order(executor, run_in_worker, searches, self.budget, here):
+        for result in results_or_here(executor, run_in_worker, searches, self.budget, here):
             results.append(result)
 
             for row in result.history:

@@ -27,7 +27,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
-from mjfim.parallel import run_in_order, workers_of
+from mjfim.parallel import Workers, results_or_here
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
@@ -284,7 +284,7 @@ class _MethodRun:
         Returns:
             The best result; None where no part has a result.
         """
-        count = workers_of(executor)
+        count = Workers.of(executor).count
         parts = [
             replace(self.search, part=(i, count), steps=self.search.steps / count, threads=1)
             for i in range(count)
@@ -294,7 +294,7 @@ class _MethodRun:
             """Run a part whose process was ended from outside."""
             return run_baseline(part, None, self.stop)
 
-        results = list(run_in_order(executor, run_baseline, parts, Budget(stop=self.stop), here))
+        results = list(results_or_here(executor, run_baseline, parts, Budget(stop=self.stop), here))
         if not results:
             return None
 

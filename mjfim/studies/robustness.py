@@ -26,7 +26,7 @@ from mjfim.errors import (
 from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.parallel import pool_stop_token, run_in_order
+from mjfim.parallel import pool_stop_token, results_or_here
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.progress import shown_progress
 from mjfim.records.robustness import (
@@ -269,7 +269,7 @@ def _play_all(
     if executor is not None:
         play = partial(_run_in_worker, study)
         here = partial(_run_until_stopped, bench, stop=stop)
-        for finished in run_in_order(executor, play, range(count), Budget(stop=stop), here):
+        for finished in results_or_here(executor, play, range(count), Budget(stop=stop), here):
             if finished is not None:
                 yield finished
         return

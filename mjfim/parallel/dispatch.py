@@ -1,0 +1,291 @@
+"""Orders under way on workers: lost ones are done again, and a request to stop is heeded."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Future, wait
+from dataclasses import dataclass
+from queue import Empty, SimpleQueue
+from typing import Generic, TypeVar
+
+from mjfim.budget import StopToken
+from mjfim.errors import ExperimentError, MjfimError
+from mjfim.interruption import hurried
+from mjfim.parallel.losses import is_loss, is_refused_by_pickle, is_shared_loss
+from mjfim.parallel.workers import Workers
+
+T = TypeVar("T")
+Order = TypeVar("Order")
+
+# Time for which running tasks are waited for after a request to stop [s]. The tasks of a pool check
+# the request after each iterate; those of other executors end after their slice. A second Ctrl-C
+# ends the waiting.
+GRACE = 4.0
+
+# Period at which the stop token is checked while tasks run [s].
+POLL_INTERVAL = 0.2
+
+# An order whose worker was lost this many times is given up.
+MAX_LOSSES = 3
+
+
+class LostWorkError(MjfimError):
+    """An order has no result, because its worker was lost each time that it was begun."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome(Generic[T]):
+    """What became of an order.
+
+    Attributes:
+        index: Number of the order.
+        found: The result; empty where the order is lost.
+        loss: Why there is no result, as a sentence; empty where there is one.
+    """
+
+    index: int
+    found: tuple[T, ...] = ()
+    loss: str = ""
+
+    @property
+    def is_lost(self) -> bool:
+        """True where there is no result."""
+        return not self.found
+
+    @property
+    def result(self) -> T:
+        """The result.
+
+        Raises:
+            LostWorkError: The order is lost.
+        """
+        if self.is_lost:
+            raise LostWorkError(self.loss)
+        return self.found[0]
+
+
+@dataclass(kw_only=True, eq=False)
+class _Work(Generic[Order]):
+    """An order that has no result yet.
+
+    Attributes:
+        index: Number of the order.
+        order: The order.
+        losses: How often its worker was lost.
+        needs_isolation: True where it may be the cause of the losses, and where others are lost
+            together with it.
+    """
+
+    index: int
+    order: Order
+    losses: int = 0
+    needs_isolation: bool = False
+
+
+class Dispatch(Generic[Order, T]):
+    """Orders under way on workers; an order can be added at any time.
+
+    A task whose worker is killed is submitted again. Where all tasks of an executor are lost
+    together, it is not known which of them was the cause: an order that is lost for the last time
+    but one is therefore done while nothing else runs.
+
+    Args:
+        workers: The workers.
+        function: Carries out an order; both can be pickled, and the result depends on the order
+            alone.
+        stop: Token that ends the work early.
+    """
+
+    def __init__(self, workers: Workers, function: Callable[[Order], T], stop: StopToken) -> None:
+        self._workers = workers
+        self._function = function
+        self._stop = stop
+        self._waiting: deque[_Work[Order]] = deque()
+        self._running: dict[Future[T], _Work[Order]] = {}
+        self._ended: SimpleQueue[Future[T]] = SimpleQueue()
+
+    def add(self, index: int, order: Order, *, next_one: bool = False) -> None:
+        """Add an order.
+
+        Args:
+            index: Number under which its outcome is reported.
+            order: The order.
+            next_one: Do it before all others that are not begun.
+        """
+        work = _Work(index=index, order=order)
+        if next_one:
+            self._waiting.appendleft(work)
+        else:
+            self._waiting.append(work)
+
+    def withdraw(self) -> None:
+        """Forget the orders that have not begun."""
+        self._waiting.clear()
+        for future in [each for each in self._running if self._may_cancel(each)]:
+            if future.cancel():
+                del self._running[future]
+
+    def arrivals(self) -> Iterator[Outcome[T]]:
+        """Carry out all orders, also those that are added meanwhile.
+
+        After a request to stop nothing more is begun, and what has ended within `GRACE` seconds is
+        reported. If the caller ends the iteration, what runs is stopped.
+
+        Yields:
+            The outcome of every order, in the order of arrival.
+
+        Raises:
+            Exception: The error of an order that failed; the others are stopped.
+            ExperimentError: An order or its function cannot be sent to the workers.
+        """
+        try:
+            while not self._stop.requested:
+                self._fill()
+                if not self._running:
+                    return
+
+                outcome = self._next_outcome()
+                if outcome is not None:
+                    yield outcome
+
+            yield from self._collected()
+        finally:
+            # If the caller ended the iteration or an order failed, the others are stopped.
+            if self._running:
+                self._collected()
+
+    def _fill(self) -> None:
+        """Submit orders while there are workers for them."""
+        while self._waiting and len(self._running) < self._workers.window:
+            in_isolation = self._waiting[0].needs_isolation or any(
+                work.needs_isolation for work in self._running.values()
+            )
+            if in_isolation and self._running:
+                return
+
+            self._submit(self._waiting.popleft())
+
+    def _submit(self, work: _Work[Order]) -> None:
+        """Submit an order; in an executor whose processes have ended, it is lost at once."""
+        try:
+            future = self._workers.submit(self._function, work.order)
+        except BrokenExecutor as error:
+            future = Future()
+            future.set_exception(error)
+
+        self._running[future] = work
+        future.add_done_callback(self._ended.put)
+
+    def _next_outcome(self) -> Outcome[T] | None:
+        """Wait for a task for a while; None where none has ended, or where it is done again."""
+        try:
+            future = self._ended.get(timeout=POLL_INTERVAL)
+        except Empty:
+            return None
+
+        # A task that was withdrawn has no outcome.
+        work = self._running.pop(future, None)
+        if work is None:
+            return None
+        if not _is_lost(future):
+            return Outcome(index=work.index, found=(_result_of(future),))
+
+        return self._done_again(work, is_shared=_is_shared(future))
+
+    def _done_again(self, work: _Work[Order], *, is_shared: bool) -> Outcome[T] | None:
+        """Put an order that was lost among the waiting ones, or report it after the last loss."""
+        work.losses += 1
+        work.needs_isolation = is_shared and work.losses == MAX_LOSSES - 1
+        if work.losses < MAX_LOSSES:
+            self._waiting.appendleft(work)
+            return None
+
+        sentence = (
+            f"the worker was lost {work.losses} times while it did this work (its process was "
+            "ended from outside, perhaps because the memory was full), so this work is left out"
+        )
+        return Outcome(index=work.index, loss=sentence)
+
+    # ---- the end before all orders are carried out
+
+    def _collected(self) -> list[Outcome[T]]:
+        """Stop all tasks, and collect what has ended within `GRACE`, or was offered until then."""
+        self.withdraw()
+        pool = self._workers.pool
+        if pool is not None and self._running:
+            pool.stop()
+        left = _wait_for_all(list(self._running))
+
+        found: list[Outcome[T]] = []
+        for future, work in self._running.items():
+            if future in left:
+                offered = [] if pool is None else pool.offered(future)
+                found += [Outcome(index=work.index, found=(result,)) for result in offered]
+            elif not future.cancelled() and future.exception() is None:
+                found.append(Outcome(index=work.index, found=(future.result(),)))
+
+        # Nobody waits any longer for a task that does not look at the request.
+        for future in left:
+            future.cancel()
+        if pool is not None and left:
+            pool.end_running()
+        elif pool is not None:
+            pool.resume()
+
+        self._running.clear()
+        return found
+
+    def _may_cancel(self, future: Future[T]) -> bool:
+        """Check whether a task can be cancelled without the loss of work that is done already.
+
+        Dask does not say which tasks are running: they are those that were submitted first.
+        """
+        if not self._workers.is_cluster:
+            return True
+        first = list(self._running)[: self._workers.count]
+        return future not in first
+
+
+def _is_lost(future: Future[T]) -> bool:
+    """Return whether a task that has ended was lost with its worker."""
+    return future.cancelled() or is_loss(future.exception())
+
+
+def _is_shared(future: Future[T]) -> bool:
+    """Return whether a lost task was lost together with all others of its executor."""
+    return not future.cancelled() and is_shared_loss(future.exception())
+
+
+def _result_of(future: Future[T]) -> T:
+    """Result of a task that has ended.
+
+    Raises:
+        Exception: The error of the task.
+        ExperimentError: The task could not be sent to a worker.
+    """
+    error = future.exception()
+    if is_refused_by_pickle(error):
+        raise ExperimentError(
+            f"executor: the work cannot be sent to other processes ({error}). Functions, such as "
+            "parameters that are Python functions, must be stated at the top of a module that the "
+            "workers can import; lambdas and functions inside functions can be used without an "
+            "executor, or with threads"
+        ) from error
+
+    return future.result()
+
+
+def _wait_for_all(futures: list[Future[T]]) -> set[Future[T]]:
+    """Wait for tasks until `GRACE` is over, or until the user presses Ctrl-C a second time.
+
+    Returns:
+        The tasks that have not ended.
+    """
+    deadline = time.monotonic() + GRACE
+    _, left = wait(futures, timeout=0.0)
+    while left and time.monotonic() < deadline and not hurried():
+        _, left = wait(futures, timeout=min(POLL_INTERVAL, GRACE))
+
+    return left

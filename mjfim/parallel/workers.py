@@ -1,0 +1,141 @@
+"""One view of all executors: how many workers there are, and how a task reaches them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future
+from typing import Any, TypeVar
+
+from mjfim.errors import ExperimentError
+from mjfim.parallel.losses import renewed
+from mjfim.parallel.pool import Pool
+
+T = TypeVar("T")
+
+# Attributes with the number of workers: of mjfim and executorlib, of mpi4py, and of
+# `concurrent.futures` and loky, which have no public name for it.
+COUNT_NAMES = ("max_workers", "num_workers", "_max_workers")
+
+# Period after which a Dask cluster, which may grow, is asked again how large it is [s].
+COUNT_PERIOD = 2.0
+
+# Tasks that are submitted at once for each worker, so that it need not wait for the next one.
+TASKS_PER_WORKER = 2
+
+
+class Workers(Executor):
+    """Workers of an executor, each of which does one task at a time.
+
+    Every function of mjfim with an argument `executor` takes the executor itself as well. Wrap it
+    to state what cannot be found out: the number of workers, or the threads that a task may use.
+
+    Args:
+        executor: An executor of the kind of `concurrent.futures` (`mjfim.Pool`, loky, mpi4py,
+            executorlib, threads), a Dask `Client`, or what its method `get_executor` returns.
+        count: Number of tasks that run at once; default: what the executor says, else 1. A Dask
+            cluster may grow and shrink meanwhile.
+        threads: Threads that each task may use; default: 1 on a cluster, and elsewhere an equal
+            share of the workers where there are fewer tasks than workers.
+
+    Raises:
+        ExperimentError: The object cannot run tasks, or a number is not positive.
+    """
+
+    def __init__(self, executor: Any, count: int | None = None, threads: int | None = None) -> None:
+        for name, number in (("count", count), ("threads", threads)):
+            if number is not None and number < 1:
+                raise ExperimentError(f"Workers: {name} is {number}; it must be at least 1")
+        if not hasattr(executor, "submit"):
+            raise ExperimentError(
+                f"executor: {type(executor).__name__} has no method `submit`; pass an executor of "
+                "the kind of concurrent.futures, such as mjfim.Pool(), or a Dask Client"
+            )
+
+        # A client of Dask has futures of its own; its executor has those of concurrent.futures.
+        if hasattr(executor, "get_executor"):
+            executor = executor.get_executor()
+        self._executor: Executor = executor
+        self._client: Any = getattr(executor, "_client", None)
+        self._stated_count = count
+        self._stated_threads = threads
+        self._known_count = 0
+        self._count_until = 0.0
+
+    @classmethod
+    def of(cls, executor: Any) -> Workers:
+        """View an executor as workers; what is viewed so already remains as it is."""
+        return executor if isinstance(executor, Workers) else cls(executor)
+
+    @property
+    def pool(self) -> Pool | None:
+        """The pool, whose tasks can be asked to stop; None for other executors."""
+        return self._executor if isinstance(self._executor, Pool) else None
+
+    @property
+    def is_cluster(self) -> bool:
+        """True for a Dask cluster, whose tasks can always be cancelled, even while they run."""
+        return self._client is not None
+
+    @property
+    def count(self) -> int:
+        """Number of tasks that run at once, at least 1."""
+        return max(self._stated_count or self._found_count(), 1)
+
+    @property
+    def window(self) -> float:
+        """Number of tasks that are submitted at once; infinite where the count is not known."""
+        known = self._stated_count or self._found_count() or self.is_cluster
+        return TASKS_PER_WORKER * self.count if known else float("inf")
+
+    def threads_for(self, tasks: int) -> int:
+        """Number of threads that each task may use.
+
+        Args:
+            tasks: Number of tasks that are to be done.
+        """
+        if self._stated_threads is not None:
+            return self._stated_threads
+        return 1 if self.is_cluster else max(self.count // max(tasks, 1), 1)
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Submit a task; the arguments are those of `concurrent.futures.Executor.submit`.
+
+        A broken executor is made anew where that is possible.
+        """
+        # Dask would take the result of an equal task, even of one that failed.
+        if self.is_cluster:
+            kwargs = {**kwargs, "pure": False}
+
+        try:
+            return self._executor.submit(fn, *args, **kwargs)
+        except BrokenExecutor:
+            executor = renewed(self._executor)
+            if executor is None:
+                raise
+            self._executor = executor
+            return executor.submit(fn, *args, **kwargs)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the executor; the arguments are those of `concurrent.futures.Executor.shutdown`."""
+        # The executor of Dask cannot cancel here what is not begun.
+        options = {"cancel_futures": True} if cancel_futures else {}
+        self._executor.shutdown(wait, **options)
+
+    def _found_count(self) -> int:
+        """Number of workers that the executor states; 0 where it is not known."""
+        if self._client is not None:
+            return self._cluster_size()
+
+        for name in COUNT_NAMES:
+            number = getattr(self._executor, name, None)
+            if isinstance(number, int):
+                return number
+        return 0
+
+    def _cluster_size(self) -> int:
+        """Number of threads of all workers of a Dask cluster; each of them does one task."""
+        if time.monotonic() >= self._count_until:
+            self._known_count = sum(self._client.nthreads().values())
+            self._count_until = time.monotonic() + COUNT_PERIOD
+        return self._known_count

@@ -1,0 +1,249 @@
+"""Orders on executors that lose tasks, fail, are slow, or do not say how large they are."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+)
+from typing import Any
+
+import pytest
+
+from mjfim.budget import Budget, StopToken
+from mjfim.errors import ExperimentError
+from mjfim.parallel import (
+    Dispatch,
+    LostWorkError,
+    Outcome,
+    Pool,
+    Workers,
+    carry_out,
+    dispatch,
+    results_or_here,
+)
+
+
+class FakeExecutor(Executor):
+    """Does each task at once, except those that a test wants to lose.
+
+    Args:
+        lose: Given the order and how often it was submitted, the error with which it is lost.
+        count: Number of workers that it states; None where it does not.
+    """
+
+    def __init__(
+        self, lose: Callable[[int, int], BaseException | None], count: int | None = 2
+    ) -> None:
+        self.lose = lose
+        self.submitted: list[int] = []
+        if count is not None:
+            self._max_workers = count
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        order = args[0]
+        self.submitted.append(order)
+        error = self.lose(order, self.submitted.count(order))
+        future: Future[Any] = Future()
+        if error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def squares(executor: Any, count: int = 5) -> list[Outcome[int]]:
+    return list(carry_out(executor, square, range(count), Budget()))
+
+
+@pytest.mark.parametrize("error", [BrokenExecutor("killed"), CancelledError()])
+def test_lost_orders_are_done_again_and_the_results_are_the_same(error: BaseException) -> None:
+    executor = FakeExecutor(lambda order, times: error if times <= order % 3 else None)
+    assert [each.result for each in squares(executor)] == [0, 1, 4, 9, 16]
+    assert executor.submitted.count(2) == 3
+
+
+def test_an_error_of_dask_counts_as_a_loss_though_dask_is_not_imported() -> None:
+    kind = type("KilledWorker", (Exception,), {"__module__": "distributed.scheduler"})
+    executor = FakeExecutor(lambda order, times: kind() if times == 1 else None)
+    assert [each.result for each in squares(executor)] == [0, 1, 4, 9, 16]
+
+
+def test_an_order_that_is_lost_three_times_is_reported_and_the_others_go_on() -> None:
+    executor = FakeExecutor(lambda order, times: BrokenExecutor() if order == 1 else None)
+    found = squares(executor)
+    assert [each.is_lost for each in found] == [False, True, False, False, False]
+    assert executor.submitted.count(1) == 3
+    assert "lost 3 times" in found[1].loss
+    with pytest.raises(LostWorkError, match="lost 3 times"):
+        _ = found[1].result
+
+    here = list(results_or_here(executor, square, range(3), Budget(), lambda order: -order))
+    assert here == [0, -1, 4]
+
+
+def test_where_all_are_lost_together_the_suspect_runs_alone_in_the_end() -> None:
+    """Order 1 kills the pool; without isolation, its neighbours would be given up with it."""
+    running: list[int] = []
+    alone: list[int] = []
+
+    class Together(Executor):
+        """Loses all running tasks when order 1 runs."""
+
+        _max_workers = 2
+
+        def __init__(self) -> None:
+            self.futures: list[tuple[int, Future[int]]] = []
+
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            future: Future[int] = Future()
+            self.futures.append((args[0], future))
+            threading.Timer(0.01, self.end).start()
+            return future
+
+        def end(self) -> None:
+            """End what runs: with losses if order 1 is among it."""
+            ended, self.futures = self.futures, []
+            running[:] = [order for order, _ in ended]
+            if len(ended) == 1:
+                alone.append(running[0])
+            for order, future in ended:
+                if 1 in running:
+                    future.set_exception(BrokenExecutor())
+                else:
+                    future.set_result(square(order))
+
+    found = squares(Together(), 6)
+    assert [each.index for each in found if each.is_lost] == [1]
+    assert 1 in alone
+
+
+def test_outcomes_come_in_the_order_of_the_orders_and_the_callback_has_them_at_once() -> None:
+    def slow_first(order: int) -> int:
+        time.sleep(0.1 if order == 0 else 0.0)
+        return order
+
+    early: list[int] = []
+    with ThreadPoolExecutor(2) as executor:
+        found = carry_out(
+            executor, slow_first, range(4), Budget(), lambda each: early.append(each.index)
+        )
+        assert [each.index for each in found] == [0, 1, 2, 3]
+    assert early == [1, 2, 3, 0]
+
+
+def test_orders_may_be_added_while_others_are_carried_out() -> None:
+    with ThreadPoolExecutor(2) as executor:
+        work = Dispatch[int, int](Workers(executor), square, StopToken())
+        work.add(0, 3)
+        found = []
+        for outcome in work.arrivals():
+            found.append(outcome.result)
+            if len(found) < 3:
+                work.add(len(found), found[-1])
+    assert found == [9, 81, 6561]
+
+
+def test_a_request_to_stop_is_heeded_in_time_by_tasks_that_do_not_see_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(dispatch, "GRACE", 0.1)
+    stop, go_on = StopToken(), threading.Event()
+
+    def work(order: int) -> int:
+        if order == 1:
+            go_on.wait(20.0)
+        if order == 2:
+            stop.request()
+        return order
+
+    with ThreadPoolExecutor(2) as executor:
+        found = list(carry_out(executor, work, range(9), Budget(stop=stop)))
+        go_on.set()
+    assert {each.result for each in found} >= {0, 2}
+    assert {each.result for each in found}.isdisjoint({1, 8})
+
+
+def test_without_time_the_first_order_is_carried_out_and_the_rest_is_left_out() -> None:
+    executor = FakeExecutor(lambda order, times: None)
+    found = list(carry_out(executor, square, range(9), Budget(seconds=0.0)))
+    assert found[0].result == 0
+    assert len(found) <= Workers(executor).window
+
+
+def test_the_error_of_an_order_is_raised() -> None:
+    executor = FakeExecutor(lambda order, times: ValueError("wrong") if order == 2 else None)
+    with pytest.raises(ValueError, match="wrong"):
+        squares(executor)
+
+
+@pytest.mark.slow
+def test_a_function_that_cannot_be_sent_is_explained() -> None:
+    with Pool(1) as pool, pytest.raises(ExperimentError, match="at the top of a module"):
+        list(carry_out(pool, lambda order: order, [1], Budget()))
+
+
+def test_the_number_of_workers_is_stated_or_found() -> None:
+    assert Workers(ThreadPoolExecutor(3)).count == 3
+    assert Workers(ThreadPoolExecutor(3), count=5).count == 5
+    assert Workers(ThreadPoolExecutor(4)).threads_for(2) == 2
+    assert Workers(ThreadPoolExecutor(4), threads=3).threads_for(2) == 3
+
+    # Where it is not known, all tasks are submitted, so that no worker is idle.
+    unknown = FakeExecutor(lambda order, times: None, count=None)
+    assert Workers(unknown).count == 1
+    assert math.isinf(Workers(unknown).window)
+
+    workers = Workers(unknown)
+    assert Workers.of(workers) is workers
+
+
+class FakeClient:
+    """As a Dask client: it has an executor, and a number of threads per worker that changes."""
+
+    def __init__(self) -> None:
+        self.sizes = itertools.chain([{}], itertools.repeat({"a": 2, "b": 3}))
+
+    def submit(self) -> None:
+        """Only its executor is used."""
+
+    def nthreads(self) -> dict[str, int]:
+        return next(self.sizes)
+
+    def get_executor(self) -> FakeExecutor:
+        executor = FakeExecutor(lambda order, times: None, count=None)
+        executor._client = self  # type: ignore[attr-defined]
+        return executor
+
+
+def test_a_cluster_has_as_many_workers_as_threads_and_may_grow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mjfim.parallel.workers.COUNT_PERIOD", -1.0)
+    cluster = Workers(FakeClient())
+    assert [cluster.count, cluster.count] == [1, 5]
+    assert cluster.is_cluster
+    assert cluster.threads_for(1) == 1
+
+
+@pytest.mark.parametrize("numbers", [{"count": 0}, {"threads": -1}])
+def test_impossible_numbers_of_workers_are_refused(numbers: dict[str, int]) -> None:
+    with pytest.raises(ExperimentError, match="must be at least 1"):
+        Workers(ThreadPoolExecutor(1), **numbers)
+
+
+def test_something_else_than_an_executor_is_refused() -> None:
+    with pytest.raises(ExperimentError, match="has no method `submit`"):
+        Workers(3)
