@@ -11,6 +11,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.packing import opened
 from mjfim.recordings.control_table import read_control
 from mjfim.signals import fourier_basis
 
@@ -85,8 +86,8 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
 
 def control_of_earlier_design(task: DesignTask, path: str) -> Array:
     """(N, nu) control of the design.csv of an earlier design, repeated where it is shorter."""
-    file = task.experiment.directory / path
-    return read_control(file, task.t, task.dt, task.controls, repeat=True)
+    with opened(task.experiment, path) as file:
+        return read_control(file, task.t, task.dt, task.controls, repeat=True)
 
 
 def _multisines(task: DesignTask, rng: np.random.Generator) -> Iterator[InitialControl]:

@@ -26,6 +26,7 @@ from mjfim.excitation.target_accuracy import (
 )
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
+from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
@@ -470,7 +471,8 @@ def _default_longest(task: DesignTask) -> float:
     if isinstance(experiment.initial.control, Signal):
         return longest
 
-    columns = formats.read_table(experiment.directory / str(experiment.initial.control))
+    with opened(experiment, str(experiment.initial.control)) as file:
+        columns = formats.read_table(file)
     name = task.controls[0]
     values = columns[name if name in columns else f"ctrl:{name}"]
     t = columns["t"][np.isfinite(values)]

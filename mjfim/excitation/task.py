@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,6 +27,7 @@ from mjfim.excitation.task_parts import (
     tracking_weights_of,
 )
 from mjfim.experiment.initial_state import keyframe
+from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System
 from mjfim.information.fisher import FisherInformation
@@ -168,8 +170,9 @@ class DesignTask:
         if experiment.cost.control_about is not None:
             about = by_name("cost.control_about", experiment.cost.control_about, names, "actuator")
 
-        files = [experiment.directory / path for path in experiment.earlier]
-        prior = information_of(files, system.parameters.names)
+        with ExitStack() as stack:
+            files = [stack.enter_context(opened(experiment, path)) for path in experiment.earlier]
+            prior = information_of(files, system.parameters.names)
         if added is not None:
             prior = prior + added
 

@@ -10,6 +10,7 @@ from mjfim.excitation.design_memory import require_memory_for_design
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.robust import ParameterSamples
 from mjfim.experiment.control_signal import generate
+from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import Signal
@@ -150,7 +151,8 @@ def stated_control(system: System) -> Array:
 
     if isinstance(source, Signal):
         return generate(source, t, system.controls, system.rest)
-    return read_control(experiment.directory / str(source), t, grid.dt, system.controls)
+    with opened(experiment, str(source)) as file:
+        return read_control(file, t, grid.dt, system.controls)
 
 
 def require_bounded_controls(system: System, limits: tuple[Limit, ...], weight: Array) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import mujoco
-
+from mjfim.experiment.packing import tables_of
 from mjfim.experiment.schema import Experiment
+from mjfim.model.model_files import files_of_model
 
 
 def input_files(experiment: Experiment, further: Iterable[Path | None] = ()) -> tuple[Path, ...]:
@@ -21,21 +21,10 @@ def input_files(experiment: Experiment, further: Iterable[Path | None] = ()) -> 
         The experiment file, the model with its included files and assets, controls, earlier
         results, and the further files. In place of a folder, all files in it.
     """
-    named = [*experiment.descent.previous, *experiment.earlier]
-    if isinstance(experiment.initial.control, str):
-        named.append(experiment.initial.control)
-
-    files = [Path(experiment.source), *_model_files(experiment.directory / experiment.model)]
-    files += [experiment.directory / name for name in named]
+    model = experiment.directory / experiment.model
+    files = [Path(experiment.source), *files_of_model(model)]
+    files += [experiment.directory / name for name in tables_of(experiment)]
     for path in further:
         if path is not None:
             files += sorted(path.iterdir()) if path.is_dir() else [path]
     return tuple(files)
-
-
-def _model_files(path: Path) -> list[Path]:
-    """List an MJCF file, the files that it includes, and its assets."""
-    try:
-        return [path, *map(Path, mujoco.mju_getXMLDependencies(str(path)))]
-    except (ValueError, mujoco.FatalError):
-        return [path]

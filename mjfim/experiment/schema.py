@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field, SkipValidation, ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
 from mjfim.arrays import Array
@@ -16,10 +16,12 @@ from mjfim.experiment.experiment_file import read_tables
 from mjfim.experiment.messages import explain, valid_keys
 from mjfim.experiment.system_tables import Correlated, Initial, NoiseSpec, Nuisance, ParameterSpec
 from mjfim.experiment.task_tables import Boundary, Cost, Descent, FitSpec, Limits, Robust
+from mjfim.model.packed_files import PackedFiles
 from mjfim.recordings.spec import Hertz, PositiveWithUnit, RecordingSpec, Seconds, Section
 
 ONLY_IN_PYTHON = ("function",)  # Keys of a parameter that a file cannot state.
-RESERVED = ("directory", "source")  # Attributes of an experiment that are no keys of the file.
+# Attributes of an experiment that are no keys of the file.
+RESERVED = ("directory", "source", "files")
 DIALECT = "https://json-schema.org/draft/2020-12/schema"  # Dialect of the JSON schema.
 
 
@@ -123,6 +125,11 @@ class Experiment(Section):
         exclude=True,
         description="Name of the experiment in messages, the path of its file.",
     )
+    files: SkipJsonSchema[SkipValidation[PackedFiles | None]] = Field(
+        default=None,
+        exclude=True,
+        description="Files of a packed experiment, which are not read from the disk any more.",
+    )
 
     def __init__(self, **values: Any) -> None:
         """Check the values of an experiment.
@@ -183,7 +190,39 @@ class Experiment(Section):
             else:
                 values[key] = value
 
-        return Experiment(**{"directory": self.directory, "source": self.source, **values})
+        return self.restated(values)
+
+    def restated(self, values: Mapping[str, Any]) -> Experiment:
+        """Make an experiment of other keys with the folder, the name and the files of this one.
+
+        Args:
+            values: All keys and tables, with the names of the experiment file.
+
+        Raises:
+            ExperimentError: A value is not valid.
+        """
+        place = {"directory": self.directory, "source": self.source, "files": self.files}
+        return Experiment(**{**place, **values})
+
+    def packed(self) -> Experiment:
+        """Make a copy that contains all its files, for a process that has none of them.
+
+        The copy holds the model with its included files and assets, the table of the initial
+        control, previous designs and earlier results as bytes. It can be pickled, and a worker
+        process on another computer computes with it to the last digit what this process does.
+        The files are read now; what changes in them later does not concern the copy.
+
+        Returns:
+            The copy; this experiment itself if it contains all its files already.
+
+        Raises:
+            ExperimentError: A file cannot be read.
+            ModelError: There is no such model file.
+        """
+        # The model is not needed where an experiment is only read.
+        from mjfim.experiment.packing import packed
+
+        return packed(self)
 
 
 def json_schema() -> dict[str, Any]:

@@ -18,6 +18,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError
 from mjfim.experiment.initial_state import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
+from mjfim.experiment.packing import model_of
 from mjfim.experiment.parameters import MeasurementSizes, resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import require_units
@@ -96,7 +97,7 @@ class System:
     ) -> System:
         """Resolve an experiment; error messages do not name the experiment file yet."""
         if source is None:
-            source = ModelSource(experiment.directory / experiment.model)
+            source = model_of(experiment)
         _require_supported(source)
         require_units(experiment, source)
         model = source.model

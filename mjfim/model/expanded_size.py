@@ -17,6 +17,7 @@ from xml.parsers import expat
 
 from mjfim.errors import ModelError
 from mjfim.model.included_files import read_with_included_files
+from mjfim.model.model_files import FOLDERS
 
 # Factors of the letters with which MuJoCo states the size of the arena.
 MEMORY_UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
@@ -30,9 +31,6 @@ GRIDS = {"hfield": ("nrow", "ncol"), "texture": ("width", "height")}
 
 # Attributes of a texture that name images: one, or one for each side of a cube.
 IMAGES = ("file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback")
-
-# Attributes of <compiler> that state the folder of meshes or images.
-FOLDERS = ("assetdir", "meshdir", "texturedir")
 
 # First bytes of a PNG image; the width and the height in pixels begin at byte 16.
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"

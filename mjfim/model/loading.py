@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -36,9 +37,29 @@ def load_spec(path: Path) -> Any:
         )
     check_file_numbers(path)
     check_expanded_size(path)
+    return _parsed_spec(path, _engine_path(path), None)
+
+
+def load_packed_spec(path: Path, files: Any) -> Any:
+    """MjSpec of an MJCF or URDF file that is not on the disk.
+
+    The file was loaded from the disk before it was packed, so that it is not checked again.
+
+    Args:
+        path: The file.
+        files: Virtual file system (`mujoco.MjVfs`) that holds it.
+
+    Raises:
+        ModelError: MuJoCo cannot read it.
+    """
+    return _parsed_spec(path, path.as_posix(), files)
+
+
+def _parsed_spec(path: Path, name: str, files: Any) -> Any:
+    """MjSpec of a file by its name for MuJoCo, on the disk or in a virtual file system."""
     try:
         with collected_warnings(of_reader=True) as found:
-            spec = mujoco.MjSpec.from_file(_engine_path(path))
+            spec = mujoco.MjSpec.from_file(name, vfs=files)
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot read the model: {str(error).strip()}") from None
 
@@ -64,20 +85,21 @@ def _engine_path(path: Path) -> str:
         ) from None
 
 
-def compile_spec(spec: Any, path: Path, *, tells: bool = False) -> Any:
+def compile_spec(spec: Any, path: Path, *, tells: bool = False, files: Any = None) -> Any:
     """MjModel of a spec.
 
     Args:
         spec: The spec (`mujoco.MjSpec`).
         path: The file that it was read from, for the message.
         tells: Whether MuJoCo's warnings are told; those about an edited copy are not.
+        files: Virtual file system (`mujoco.MjVfs`) with the assets; None for the disk.
 
     Raises:
         ModelError: MuJoCo cannot compile the spec; the message is MuJoCo's.
     """
     try:
         with collected_warnings() as found:
-            model = spec.compile()
+            model = spec.compile(files)
     except (ValueError, mujoco.FatalError) as error:
         raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
 
@@ -115,23 +137,35 @@ class ModelSource:
         model: The user's compiled model (MjModel), never changed.
     """
 
-    def __init__(self, path: Path, spec: Any = None) -> None:
+    def __init__(self, path: Path, spec: Any = None, files: Any = None) -> None:
         """Parse and compile a file.
 
         Args:
             path: The MJCF file; relative paths inside are relative to its folder.
             spec: The parsed model, where there is one already.
+            files: Virtual file system (`mujoco.MjVfs`) with the file, what it includes, and its
+                assets; None for the disk.
 
         Raises:
             ModelError: The file is absent, MuJoCo cannot read or compile it, or a number is not
                 finite.
         """
         self.path = path
-        self.spec = load_spec(path) if spec is None else spec
-        self.model = compile_spec(self.spec, path, tells=True)
+        self.spec = self._loaded(path, files) if spec is None else spec
+        self.model = compile_spec(self.spec, path, tells=True, files=files)
         check_compiled_numbers(self.model, path)
+        self._files = files
+
+        # Several threads of a worker process may use the same model. The edit of a spec may ask for
+        # another compiled model.
+        self._lock = threading.RLock()
         self._compiled: dict[frozenset[str] | None, Any] = {}
         self._edited: dict[tuple[frozenset[str] | None, bytes], Any] = {}
+
+    @staticmethod
+    def _loaded(path: Path, files: Any) -> Any:
+        """The parsed model from the disk, or from a virtual file system."""
+        return load_spec(path) if files is None else load_packed_spec(path, files)
 
     @cached_property
     def coordinates(self) -> ModelCoordinates:
@@ -153,11 +187,11 @@ class ModelSource:
         Returns:
             MjModel that callers copy and never change.
         """
-        if moved_bodies not in self._compiled:
-            self._compiled[moved_bodies] = compile_spec(
-                self._editable_spec(moved_bodies), self.path
-            )
-        return self._compiled[moved_bodies]
+        with self._lock:
+            if moved_bodies not in self._compiled:
+                spec = self._editable_spec(moved_bodies)
+                self._compiled[moved_bodies] = compile_spec(spec, self.path, files=self._files)
+            return self._compiled[moved_bodies]
 
     def edited(
         self, moved_bodies: frozenset[str] | None, key: bytes, edit: Callable[[Any], None]
@@ -176,13 +210,14 @@ class ModelSource:
             ModelError: The edited spec does not compile.
         """
         place = (moved_bodies, key)
-        if place not in self._edited:
-            if len(self._edited) >= MAX_EDITED_MODELS:
-                self._edited.clear()
-            spec = self._editable_spec(moved_bodies)
-            edit(spec)
-            self._edited[place] = compile_spec(spec, self.path)
-        return self._edited[place]
+        with self._lock:
+            if place not in self._edited:
+                if len(self._edited) >= MAX_EDITED_MODELS:
+                    self._edited.clear()
+                spec = self._editable_spec(moved_bodies)
+                edit(spec)
+                self._edited[place] = compile_spec(spec, self.path, files=self._files)
+            return self._edited[place]
 
     def _editable_spec(self, moved_bodies: frozenset[str] | None) -> Any:
         """A copy of the spec in which the moved bodies are not compiled as "simple"."""

@@ -253,10 +253,11 @@ def _encode_table(value: BaseModel, path: str) -> dict[str, Any]:
     except PydanticSerializationError:
         raise TypeError(f"{path}: a parameter that is a Python function cannot be saved") from None
 
+    # The contents of packed files are not part of what an experiment states.
     hidden = {
         name: str(getattr(value, name))
         for name, field in type(value).model_fields.items()
-        if field.exclude
+        if field.exclude and isinstance(getattr(value, name), str | Path)
     }
     return {**stated, **hidden}
 

@@ -180,7 +180,7 @@ def restate_experiment(
     values = experiment.model_dump(exclude_unset=True)
     values["parameters"] = tables
     values["cost"] = {**values.get("cost", {}), "linearize_at": "guess"}
-    return Experiment(**values, directory=experiment.directory, source=experiment.source)
+    return experiment.restated(values)
 
 
 def _member_table(base: DesignTask, index: int) -> dict[str, Any]:

@@ -1,0 +1,85 @@
+"""Packed experiments, which contain their files, and access to the files of any experiment."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mjfim.errors import ModelError
+from mjfim.experiment.schema import Experiment
+from mjfim.model.loading import ModelSource
+from mjfim.model.model_files import files_of_model
+from mjfim.model.packed_files import PackedFiles
+from mjfim.model.packed_models import packed_model
+
+
+def packed(experiment: Experiment) -> Experiment:
+    """Make a copy that contains all its files. See `Experiment.packed`."""
+    files = experiment.files
+    model = experiment.directory / experiment.model
+    tables = [experiment.directory / name for name in tables_of(experiment)]
+
+    # A packed model contains what it includes.
+    has_model = files is not None and files.content(model) is not None
+    if has_model and all(files.content(table) is not None for table in tables):
+        return experiment
+    if not has_model and not model.is_file():
+        raise ModelError(f"{model}: no such model file")
+
+    kept = [Path(name) for name in files.contents] if files is not None else []
+    needed = kept if has_model else [*kept, *files_of_model(model)]
+    return experiment.model_copy(
+        update={"files": PackedFiles.read(dict.fromkeys([*needed, *tables]), files)}
+    )
+
+
+def tables_of(experiment: Experiment) -> tuple[str, ...]:
+    """Names of the files that an experiment states besides its model.
+
+    Returns:
+        The table of the initial control, previous designs and earlier results.
+    """
+    named = [*experiment.descent.previous, *experiment.earlier]
+    if isinstance(experiment.initial.control, str):
+        named.append(experiment.initial.control)
+    return tuple(dict.fromkeys(named))
+
+
+def model_of(experiment: Experiment) -> ModelSource:
+    """Load the model of an experiment.
+
+    Args:
+        experiment: The experiment. The model of a packed one is parsed once in a process.
+
+    Raises:
+        ModelError: The model cannot be used.
+    """
+    path = experiment.directory / experiment.model
+    if experiment.files is None or experiment.files.content(path) is None:
+        return ModelSource(path)
+    return packed_model(experiment.files, path)
+
+
+@contextmanager
+def opened(experiment: Experiment, name: str) -> Iterator[Path]:
+    """Give a file that an experiment states, other than its model.
+
+    Args:
+        experiment: The experiment.
+        name: Path as the experiment states it.
+
+    Yields:
+        The file on the disk. That of a packed experiment exists inside the block only.
+    """
+    path = experiment.directory / name
+    content = None if experiment.files is None else experiment.files.content(path)
+    if content is None:
+        yield path
+        return
+
+    with tempfile.TemporaryDirectory(prefix="mjfim-") as folder:
+        file = Path(folder) / path.name
+        file.write_bytes(content)
+        yield file

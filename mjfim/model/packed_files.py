@@ -1,0 +1,76 @@
+"""Files as bytes, which can be sent to a process that has none of these files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mjfim.errors import ExperimentError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackedFiles:
+    """Files by their paths, as bytes. They can be pickled.
+
+    Attributes:
+        digest: Hash of all paths and contents; equal for equal files only.
+        contents: Bytes of each file by its path, with slashes.
+    """
+
+    digest: str
+    contents: Mapping[str, bytes] = field(repr=False, compare=False)
+
+    @classmethod
+    def of(cls, contents: Mapping[Path, bytes]) -> PackedFiles:
+        """Pack files.
+
+        Args:
+            contents: Bytes of each file by its path.
+        """
+        named = {name_of(path): content for path, content in contents.items()}
+        ordered = dict(sorted(named.items()))
+
+        # The length of each part tells where it ends, so that other files have another hash.
+        hashed = hashlib.sha256()
+        for name, content in ordered.items():
+            for part in (name.encode(), content):
+                hashed.update(len(part).to_bytes(8, "big"))
+                hashed.update(part)
+        return cls(digest=hashed.hexdigest(), contents=ordered)
+
+    @classmethod
+    def read(cls, paths: Iterable[Path], packed: PackedFiles | None = None) -> PackedFiles:
+        """Pack files from the disk.
+
+        Args:
+            paths: The files.
+            packed: Files that are packed already, which are not read again.
+
+        Raises:
+            ExperimentError: A file cannot be read.
+        """
+        contents = {}
+        for path in paths:
+            kept = None if packed is None else packed.content(path)
+            contents[path] = _read(path) if kept is None else kept
+        return cls.of(contents)
+
+    def content(self, path: Path) -> bytes | None:
+        """Return the bytes of a file; None if it is not among the packed files."""
+        return self.contents.get(name_of(path))
+
+
+def name_of(path: Path) -> str:
+    """Return the normalised path of a file with slashes."""
+    return Path(os.path.normpath(path)).as_posix()
+
+
+def _read(path: Path) -> bytes:
+    """Return the content of a file."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ExperimentError(f"{path}: cannot read the file: {error.strerror}") from None
