@@ -17,22 +17,19 @@ from mjfim.model.packed_models import packed_model
 
 def packed(experiment: Experiment) -> Experiment:
     """Make a copy that contains all its files. See `Experiment.packed`."""
-    files = experiment.files
+    before = experiment.files or PackedFiles.of({})
     model = experiment.directory / experiment.model
     tables = [experiment.directory / name for name in tables_of(experiment)]
+    if all(before.content(file) is not None for file in (model, *tables)):
+        return experiment
 
     # A packed model contains what it includes.
-    has_model = files is not None and files.content(model) is not None
-    if has_model and all(files.content(table) is not None for table in tables):
-        return experiment
-    if not has_model and not model.is_file():
-        raise ModelError(f"{model}: no such model file")
-
-    kept = [Path(name) for name in files.contents] if files is not None else []
-    needed = kept if has_model else [*kept, *files_of_model(model)]
-    return experiment.model_copy(
-        update={"files": PackedFiles.read(dict.fromkeys([*needed, *tables]), files)}
-    )
+    needed = [*map(Path, before.contents), *tables]
+    if before.content(model) is None:
+        if not model.is_file():
+            raise ModelError(f"{model}: no such model file")
+        needed += files_of_model(model)
+    return experiment.model_copy(update={"files": PackedFiles.read(needed, before)})
 
 
 def tables_of(experiment: Experiment) -> tuple[str, ...]:

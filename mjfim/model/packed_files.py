@@ -42,7 +42,7 @@ class PackedFiles:
         return cls(digest=hashed.hexdigest(), contents=ordered)
 
     @classmethod
-    def read(cls, paths: Iterable[Path], packed: PackedFiles | None = None) -> PackedFiles:
+    def read(cls, paths: Iterable[Path], packed: PackedFiles) -> PackedFiles:
         """Pack files from the disk.
 
         Args:
@@ -54,7 +54,7 @@ class PackedFiles:
         """
         contents = {}
         for path in paths:
-            kept = None if packed is None else packed.content(path)
+            kept = packed.content(path)
             contents[path] = _read(path) if kept is None else kept
         return cls.of(contents)
 
