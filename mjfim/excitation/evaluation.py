@@ -76,14 +76,14 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
         min_eigenvalue=information.accumulated_eigenvalue(point.sensitivity),
         criterion=point.criterion.value,
         cost=point.cost,
-        growth=largest_amplification(A, weights.state_sizes),
+        growth=largest_amplification(A, task.sizes[: task.space.nx]),
     )
 
 
 def growth_along(task: DesignTask, trajectory: Trajectory) -> float:
     """Largest open-loop amplification of a small deviation along a trajectory."""
     A = task.plant.derivatives.jacobians(task.theta, trajectory)[0]
-    return largest_amplification(A, regulator_for(task).state_sizes)
+    return largest_amplification(A, task.sizes[: task.space.nx])
 
 
 def growth_warning(growth: float) -> str | None:

@@ -26,7 +26,8 @@ from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
 from mjfim.records.iterates import IterateMotion
 
-# Growth of a small deviation along the trajectory above which the projection uses feedback.
+# Growth of a small deviation along the trajectory above which the projection uses feedback. It is
+# measured in the units of the state in which it is smallest.
 FEEDBACK_THRESHOLD = 10.0
 
 # Smallest tolerance on a coarse level. It is coarse, because the stated level refines the minimum.
@@ -98,7 +99,6 @@ def regulator_for(task: DesignTask) -> Regulator:
         R=np.diag(control_sizes**-2.0) * share,
         terminal=last,
         feedback_threshold=FEEDBACK_THRESHOLD,
-        state_sizes=state_sizes,
     )
 
 

@@ -110,6 +110,41 @@ def largest_amplification(A: Array, sizes: Array | None = None) -> float:
     """
     if sizes is not None:
         A = A * (sizes / sizes[:, None])
+
+    products = _products(A)
+    return float(max(np.linalg.norm(each, 2, axis=(1, 2)).max() for each in products))
+
+
+def amplification_in_any_units(A: Array) -> float:
+    """Largest amplification of a deviation, in the units of the state in which it is smallest.
+
+    The entry (i, j) of a matrix M is the largest deviation of component i that follows from a
+    deviation 1 of component j, over the deviations of `largest_amplification`. Units D of the state
+    turn M into `D^-1 M D`. Its largest row sum is smallest, over all units, where it is the spectral
+    radius of M (Perron and Frobenius).
+
+    So a position that only integrates a speed does not count, however long the motion is, nor does
+    a slow oscillation, whose speeds are small beside its positions.
+
+    Args:
+        A: (N, nx, nx) transition matrices.
+
+    Returns:
+        The spectral radius of M, at least 1; infinite where a deviation overflows.
+    """
+    largest = np.max([np.abs(each).max(axis=0) for each in _products(A)], axis=0)
+    if not np.isfinite(largest).all():
+        return np.inf
+
+    return float(np.abs(np.linalg.eigvals(largest)).max(initial=1.0))
+
+
+def _products(A: Array) -> tuple[Array, Array]:
+    """Products of transition matrices: (N, nx, nx).
+
+    Returns:
+        (N+1, nx, nx) products from the first sample to each one, and from each one to the last.
+    """
     N, nx, _ = A.shape
     recursion = LinearRecursion(A)
     zero = np.zeros((N, nx))
@@ -117,12 +152,7 @@ def largest_amplification(A: Array, sizes: Array | None = None) -> float:
 
     from_start = np.stack([recursion.forward(e, zero) for e in unit], axis=2)
     to_end = np.stack([recursion.adjoint(np.concatenate([zero, e[None]])) for e in unit], axis=1)
-    return float(
-        max(
-            np.linalg.norm(from_start, 2, axis=(1, 2)).max(),
-            np.linalg.norm(to_end, 2, axis=(1, 2)).max(),
-        )
-    )
+    return from_start, to_end
 
 
 def _solve_positive_definite(S: Array, rhs: Array) -> Array:

@@ -15,7 +15,12 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.eigenvalue_model import EigenvalueModel
-from mjfim.optimize.lq import CurveCoordinates, TangentCurve, largest_amplification, regulator
+from mjfim.optimize.lq import (
+    CurveCoordinates,
+    TangentCurve,
+    amplification_in_any_units,
+    regulator,
+)
 from mjfim.records.design import Status
 
 P = TypeVar("P")
@@ -289,10 +294,9 @@ class Regulator:
         R: (nu, nu) weight of the control, multiplied by the sample period.
         terminal: (nx, nx) weight of the last state.
         period: Number of iterates after which K is renewed.
-        feedback_threshold: Amplification of deviations along the open-loop trajectory, up to which
-            the projection needs no feedback and K is zero. With 0 there is always feedback.
-        state_sizes: (nx,) sizes of the state's components, in which deviations are measured
-            [x-unit]; default: 1.
+        feedback_threshold: Amplification of deviations along the open-loop trajectory, in the units
+            in which it is smallest, up to which the projection needs no feedback and K is zero.
+            With 0 there is always feedback.
     """
 
     Q: Array
@@ -300,7 +304,6 @@ class Regulator:
     terminal: Array
     period: int = 10
     feedback_threshold: float = 0.0
-    state_sizes: Array | None = None
 
     def gain(self, expansion: Expansion) -> Array:
         """Gain about the trajectory of an expansion.
@@ -312,7 +315,7 @@ class Regulator:
             K: (N, nu, nx).
         """
         if self.feedback_threshold:
-            growth = largest_amplification(expansion.A, self.state_sizes)
+            growth = amplification_in_any_units(expansion.A)
             if growth <= self.feedback_threshold:
                 N, nx, nu = expansion.B.shape
                 return np.zeros((N, nu, nx))

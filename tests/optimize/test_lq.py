@@ -16,6 +16,7 @@ from mjfim.optimize.lq import (
     RiccatiSolution,
     TangentCurve,
     Weights,
+    amplification_in_any_units,
     descent,
     largest_amplification,
     regulator,
@@ -308,3 +309,38 @@ def test_growth_is_the_largest_amplification_from_the_start_or_to_the_end() -> N
     assert largest_amplification(A) == pytest.approx(largest)
     late = np.concatenate([0.01 * A, 3.0 * A])  # forgets the start, then explodes
     assert largest_amplification(late) == pytest.approx(3.3**12)
+
+
+def test_growth_in_any_units_counts_neither_drift_nor_slow_oscillation() -> None:
+    # The position of a cart that keeps its speed for 100 s.
+    drift = np.tile([[1.0, 0.1], [0.0, 1.0]], (1000, 1, 1))
+    assert largest_amplification(drift) > 99.0
+    assert amplification_in_any_units(drift) == pytest.approx(1.0)
+
+    # A pendulum that swings once a minute.
+    turn = 2.0 * np.pi / 60.0
+    cosine, sine = np.cos(0.5 * turn), np.sin(0.5 * turn)
+    swing = np.tile([[cosine, sine / turn], [-turn * sine, cosine]], (240, 1, 1))
+    assert largest_amplification(swing) > 9.0
+    assert amplification_in_any_units(swing) == pytest.approx(2.0, rel=1e-2)
+
+
+def test_growth_in_any_units_is_that_of_an_unstable_motion() -> None:
+    # An inverted pendulum, whose deviations grow by a factor of e in 0.3 s.
+    rate = 1.0 / 0.3
+    cosh, sinh = np.cosh(0.01 * rate), np.sinh(0.01 * rate)
+    fall = np.tile([[cosh, sinh / rate], [rate * sinh, cosh]], (200, 1, 1))
+    assert amplification_in_any_units(fall) == pytest.approx(np.exp(2.0 * rate), rel=1e-6)
+
+    # Deviations that overflow have grown without a bound.
+    assert np.isinf(amplification_in_any_units(np.full((400, 1, 1), 10.0)))
+
+
+def test_growth_in_any_units_does_not_depend_on_the_units() -> None:
+    rng = np.random.default_rng(13)
+    A = rng.normal(size=(9, 4, 4))
+    units = np.array([1e-6, 1.0, 1e3, 25.4])
+    other = A * units / units[:, None]
+    expected = amplification_in_any_units(A)
+    assert expected > 1.0
+    assert amplification_in_any_units(other) == pytest.approx(expected, rel=1e-9)
