@@ -120,8 +120,8 @@ def amplification_in_any_units(A: Array) -> float:
 
     The entry (i, j) of a matrix M is the largest deviation of component i that follows from a
     deviation 1 of component j, over the deviations of `largest_amplification`. Units D of the state
-    turn M into `D^-1 M D`. Its largest row sum is smallest, over all units, where it is the spectral
-    radius of M (Perron and Frobenius).
+    turn M into `D^-1 M D`. The smallest value, over all units, of its largest row sum is the
+    spectral radius of M (Perron and Frobenius).
 
     So a position that only integrates a speed does not count, however long the motion is, nor does
     a slow oscillation, whose speeds are small beside its positions.
