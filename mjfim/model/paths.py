@@ -33,7 +33,7 @@ from mjfim.model.targets import (
     SpecField,
     TargetField,
 )
-from mjfim.model.units import ANGLE, FIELD_UNITS, JOINT_FIELD_UNITS, LENGTH
+from mjfim.model.units import ANGLE, FIELD_UNITS, JOINT_FIELD_UNITS, LENGTH, gain_unit
 
 # A parameter path: the kind, the name (absent for options and the delay), the field, and
 # optionally an index or the part of a joint.
@@ -224,8 +224,8 @@ def unit_of(model: Any, text: str) -> str:
         text: The path.
 
     Returns:
-        The unit; empty where the number has none, or where it depends on the model (gains,
-        tendons).
+        The unit; empty where the number has none, or where it is not evident from the model
+        (entries of gains, tendons).
     """
     path = ParameterPath.parse(text)
 
@@ -245,6 +245,8 @@ def unit_of(model: Any, text: str) -> str:
         slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
         return JOINT_FIELD_UNITS.get(path.field, {}).get(LENGTH if slides else ANGLE, "")
 
+    if path.field in SERVO_FIELDS:
+        return gain_unit(model, identifier(model, "actuator", path.name), path.field)
     return FIELD_UNITS.get(path.field, "")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import mujoco
 
-from mjfim.model.servos import actuator_gear, is_integrated, servo_kind
+from mjfim.model.servos import AT_JOINT, SCALAR_JOINTS, actuator_gear, is_integrated, servo_kind
 
 # Unit of the coordinate of a slide joint and of every other translation.
 LENGTH = "m"
@@ -36,6 +36,9 @@ JOINT_FIELD_UNITS = {
     "stiffness": {LENGTH: "N/m", ANGLE: "N m/rad"},
     "springref": {LENGTH: LENGTH, ANGLE: ANGLE},
 }
+
+# Fields of a joint whose units those of the gains of a servo at the joint have.
+FIELD_OF_GAIN = {"kp": "stiffness", "kv": "damping"}
 
 # Units of the other fields that a parameter path can name. Fields that are absent here have no unit
 # or one that depends on the model.
@@ -134,6 +137,27 @@ def force_unit(model: Any, actuator: int) -> str:
     if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
         return ""
     return FORCE_UNITS[joint_unit(model, int(model.actuator_trnid[actuator, 0]))]
+
+
+def gain_unit(model: Any, actuator: int, field: str) -> str:
+    """Unit of the gain `kp` or `kv` of a servo.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        actuator: Number of the actuator.
+        field: Name of the gain.
+
+    Returns:
+        The unit; empty where the servo does not act with a gear of 1 on a slide or hinge.
+    """
+    at_joint = mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
+    if not at_joint or actuator_gear(model, actuator) != 1:
+        return ""
+
+    joint = int(model.actuator_trnid[actuator, 0])
+    if mujoco.mjtJoint(int(model.jnt_type[joint])) not in SCALAR_JOINTS:
+        return ""
+    return JOINT_FIELD_UNITS[FIELD_OF_GAIN[field]][joint_unit(model, joint)]
 
 
 def control_unit(model: Any, actuator: int) -> str:

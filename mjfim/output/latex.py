@@ -1,4 +1,7 @@
-r"""Tables of results as LaTeX, for papers: `\input` the file; it needs the package booktabs."""
+r"""Tables of results as LaTeX, for papers: `\input` the file.
+
+It needs the packages booktabs and graphicx. Tables that are wider than the text are scaled down.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,9 @@ from mjfim.output.summary_parts import Cell, Quantity, Summary, SummaryTable
 from mjfim.output.vocabulary import shown_word
 
 # What stands at the top of the file.
-HEADER = r"% Tables of mjfim; the preamble of the document needs \usepackage{booktabs}."
+HEADER = r"""% Tables of mjfim; the preamble of the document needs \usepackage{booktabs,graphicx}.
+\providecommand{\atmostlinewidth}[1]{\sbox0{#1}%
+  \ifdim\wd0>\linewidth\resizebox{\linewidth}{!}{\usebox0}\else\usebox0\fi}"""
 
 # Characters that mean something else to LaTeX.
 SPECIAL = {
@@ -98,14 +103,14 @@ def render_table(table: SummaryTable) -> str:
         r"\begin{table}",
         r"  \centering",
         *([rf"  \caption{{{escape(table.title)}}}"] if table.title else []),
-        rf"  \begin{{tabular}}{{{alignment}}}",
+        rf"  \atmostlinewidth{{\begin{{tabular}}{{{alignment}}}",
         r"    \toprule",
         *_groups(table),
         _line([escape(str(column.heading)) for column in table.columns]),
         r"    \midrule",
         *(_line([_written(cell) for cell in row.cells]) for row in table.rows),
         r"    \bottomrule",
-        r"  \end{tabular}",
+        r"  \end{tabular}}",
     ]
     if table.note:
         lines.append(rf"  \par\smallskip {escape(table.note)}")

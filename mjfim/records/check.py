@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -108,22 +108,22 @@ class Roughness:
     causes: tuple[str, ...]
 
     def __str__(self) -> str:
-        cause = first_ones(self.causes) if self.causes else ""
-        if not cause:
-            cause = (
-                "no contact, friction or limit acts there; the motion may be chaotic, or depend "
-                "too strongly on this parameter"
-            )
-
+        """What disagrees, where and why; the cause is in the part that short forms keep."""
         # Two digits, and no power of ten for some hundred percent.
         size = "an unlimited amount"
         if np.isfinite(self.error):
             size = f"{float(f'{100.0 * self.error:.2g}'):g} %"
 
+        where, remark = f"with {first_ones(_grouped(self.causes))}", ""
+        if not self.causes:
+            where = "though no contact, friction or limit acts"
+            remark = "; the motion may be chaotic, or depend too strongly on this parameter"
+
         return (
-            f"not smooth: derivatives with two different difference steps disagree by {size} for "
-            f"{self.parameter}, first at sample {self.sample} (t = {self.time:.4g} s; {cause}); σ "
-            "and the design are unreliable, because they depend on these derivatives"
+            f"not smooth at t = {self.time:.4g} s, {where}: derivatives with two different "
+            f"difference steps disagree by {size} for {self.parameter}, first at sample "
+            f"{self.sample}{remark}; σ and the design are unreliable, because they depend on these "
+            "derivatives"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -135,6 +135,15 @@ class Roughness:
             "time": self.time,
             "causes": list(self.causes),
         }
+
+
+def _grouped(causes: Iterable[str]) -> list[str]:
+    """Return causes such as `dry friction of Jaw`, each kind once with all of its names."""
+    names: dict[str, list[str]] = {}
+    for cause in causes:
+        kind, of, name = cause.partition(" of ")
+        names.setdefault(kind + of, []).append(name)
+    return [kind + first_ones(found) for kind, found in names.items()]
 
 
 @dataclass(frozen=True, kw_only=True)

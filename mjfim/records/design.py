@@ -189,7 +189,8 @@ def without_motions(
 def improvement_per_iteration(history: Sequence[HistoryRow], size: float) -> float:
     """Share by which the last iterations of a search lowered the cost, per iteration.
 
-    Only iterates at the last sample rate count, and under hard limits only those inside.
+    Only iterates at the last sample rate count. Under hard limits only the last unbroken run of
+    iterates inside counts: what brings a search back inside is no improvement.
 
     Args:
         history: The iterates.
@@ -199,7 +200,7 @@ def improvement_per_iteration(history: Sequence[HistoryRow], size: float) -> flo
         A number from 0 to 1, by which an iteration reduces the cost; NaN where fewer than two
         iterates count.
     """
-    counted = [row for row in history if row.rate == history[-1].rate and not row.margin < 0.0]
+    counted = _last_run_inside(row for row in history if row.rate == history[-1].rate)
     counted = [row for row in counted if np.isfinite(row.cost)]
     if not counted or not 0.0 < size < np.inf:
         return float("nan")
@@ -215,6 +216,17 @@ def improvement_per_iteration(history: Sequence[HistoryRow], size: float) -> flo
         return float("nan")
     fall = min(row.cost for row in before) - min(row.cost for row in counted)
     return float(1.0 - (1.0 + fall / size) ** (-1.0 / iterations))
+
+
+def _last_run_inside(history: Iterable[HistoryRow]) -> list[HistoryRow]:
+    """Return the last iterates without one outside the limits between them."""
+    runs: list[list[HistoryRow]] = [[]]
+    for row in history:
+        if not row.margin < 0.0:
+            runs[-1].append(row)
+        elif runs[-1]:
+            runs.append([])
+    return runs[-1] or runs[max(len(runs) - 2, 0)]
 
 
 @dataclass(frozen=True, kw_only=True)

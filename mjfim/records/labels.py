@@ -7,6 +7,16 @@ from dataclasses import dataclass, field
 from mjfim.errors import MjfimError
 
 
+def with_unit(name: str, unit: str) -> str:
+    """Return the label of a quantity; only its name where no unit is known.
+
+    Args:
+        name: Name of the quantity.
+        unit: Its unit; may be empty.
+    """
+    return f"{name} [{unit}]" if unit else name
+
+
 @dataclass(frozen=True, kw_only=True)
 class Labels:
     """Labels of all columns that are shown, `<name> [<unit>]` unless stated otherwise.
@@ -42,7 +52,7 @@ class Labels:
 
     def parameter(self, j: int) -> str:
         """Return the label of parameter j."""
-        return f"{self.parameters[j]} [{self.parameter_units[j] or 'model unit'}]"
+        return with_unit(self.parameters[j], self.parameter_units[j])
 
     def output(self, column: str) -> str:
         """Return the label of a measured column."""

@@ -74,10 +74,7 @@ def test_combinations_of_a_double_pendulum_are_named_and_the_exit_code_is_1() ->
     assert "m1r1 + 0.3 m2" in result.stdout
     assert "I1 + 0.09 m2" in result.stdout
     assert "Not smooth" in result.stdout
-
-    # The long form says why.
-    complete = run("check", MODELS / "double_pendulum.toml", "--verbose")
-    assert "dry friction of" in complete.stdout
+    assert "dry friction of" in result.stdout
 
 
 def test_designs_and_recordings_are_checked(study: Path, archived: Path, recorded: Path) -> None:

@@ -4,6 +4,7 @@ cause, smooth models are not.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from mjfim.information.smoothness import (
     only_curved,
     roughness,
 )
+from mjfim.output.condensed import condensed
 from mjfim.plant.rollout_derivatives import RolloutDerivatives
 from mjfim.records.check import Roughness
 from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
@@ -151,15 +153,14 @@ def test_a_force_that_just_meets_its_range_is_named(
 
 
 def test_the_sentence_says_parameter_sample_time_and_cause() -> None:
-    said = str(
-        Roughness(
-            error=0.2345,
-            parameter="mass",
-            sample=17,
-            time=0.17,
-            causes=("contact floor - ball", "dry friction of rail"),
-        )
+    rough = Roughness(
+        error=0.2345,
+        parameter="mass",
+        sample=17,
+        time=0.17,
+        causes=("contact floor - ball", "dry friction of rail"),
     )
+    said = str(rough)
     for part in (
         "23 %",
         "mass",
@@ -168,6 +169,11 @@ def test_the_sentence_says_parameter_sample_time_and_cause() -> None:
         "contact floor - ball, dry friction of rail",
     ):
         assert part in said
+    assert "dry friction of rail" in condensed(said, 78, 1)
+
+    # Causes of a kind stand together.
+    both = replace(rough, causes=("dry friction of rail", "dry friction of hinge"))
+    assert "with dry friction of rail, hinge: " in str(both)
     lost = str(Roughness(error=np.inf, parameter="mass", sample=0, time=0.0, causes=()))
     assert "an unlimited amount" in lost
     assert "chaotic" in lost

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
-from mjfim.output import plots
+from mjfim.output import plots, vocabulary
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.plots.design import panel_columns
 from mjfim.output.plots.style import log_ticks, plain_number, without_zeros
@@ -180,6 +180,12 @@ def test_robots_without_limits_have_no_panel_of_limits() -> None:
     )
     figure = plots.robustness_figure(result)
     assert len(figure.axes) == 3
+
+    # The note says "red: outside": dots that let the paper shine through would be orange.
+    far = plots.robustness_figure(dataclasses.replace(result, z=np.full((runs, count), 3.0)))
+    dots = [line for line in far.axes[0].get_lines() if line.get_marker() == "o"]
+    red = [line for line in dots if line.get_color() == vocabulary.DESIGNED.colour]
+    assert red and all((line.get_alpha() or 1.0) > 0.9 for line in red)
     assert "planned" not in all_text(figure)
     assert "states no limits" in all_text(figure)
 

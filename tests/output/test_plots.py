@@ -24,7 +24,6 @@ from mjfim.errors import MjfimError
 from mjfim.model.coordinates import QUATERNION
 from mjfim.output import plots
 from mjfim.output.plots.limit_usage import joint_colours
-from mjfim.output.plots.positions import rotation_vectors
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     INITIAL_COLOUR,
@@ -33,6 +32,7 @@ from mjfim.output.plots.style import (
     quotient_unit,
     squared_unit,
 )
+from mjfim.output.positions import rotation_vectors
 from mjfim.records.design import Evaluation, LimitUsage
 from mjfim.records.labels import Labels
 from tests.support.made_records import make_design, make_estimate, make_labels, make_study

@@ -19,6 +19,7 @@ from mjfim.output.report.build import KINDS, page_of, rewrite_reports, write_rep
 from mjfim.output.report.correlations import correlation_of
 from mjfim.output.report.curves import correlation_panel, packed, points_per_curve, thinned
 from mjfim.output.report.page import Panel, PlotGroup
+from mjfim.output.report.palette import palettes
 from mjfim.output.report.render import is_page_of, no_video_in, rendered, video_in
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
 from mjfim.output.video import Video
@@ -220,6 +221,53 @@ def test_a_limit_that_swings_fast_is_drawn_as_an_envelope() -> None:
     assert panel["layout"]["yaxis"]["range"][0] == 0.0
 
 
+def test_a_joint_has_one_colour_in_all_plots_of_limits() -> None:
+    """The closest of each kind differ; a share below the bound is not rounded up to it."""
+    usage = results.design().usage[0]
+    used = tuple(
+        replace(usage, kind=kind, name=name, share=share * np.sin(usage.t))
+        for kind, name, share in (
+            ("position", "elbow", 0.5),
+            ("position", "wrist", 0.999),
+            ("force", "elbow", 0.7),
+            ("force", "wrist", 0.2),
+        )
+    )
+    sections = {s.title: s.parts for s in page_of(results.design(usage=used)).sections}
+    (group,) = (part for part in sections["Limits"] if isinstance(part, PlotGroup))
+    roles = [{key.name.split()[0]: key.role for key in panel.keys} for panel in group.panels]
+    assert roles[0] == roles[1] == {"wrist": "series0", "elbow": "series1"}
+    assert group.panels[0].keys[0].name == "wrist > 99 %"
+
+
+def test_orientations_are_rotation_vectors() -> None:
+    """A turn of a free body about z by up to 1 rad; its quaternion is not shown."""
+    design = results.design()
+    t = design.final.trajectory.t
+    angle = t / t[-1]
+    qpos = np.zeros((len(t), 7))
+    qpos[:, 3], qpos[:, 6] = np.cos(angle / 2.0), np.sin(angle / 2.0)
+    evaluations = {
+        name: replace(each, trajectory=replace(each.trajectory, qpos=qpos))
+        for name, each in (("initial", design.initial), ("final", design.final))
+    }
+    coordinates = ("x", "y", "z", "rx", "ry", "rz")
+    labels = replace(
+        results.labels(),
+        qpos=tuple(f"b.{name} [1]" for name in ("x", "y", "z", "qw", "qx", "qy", "qz")),
+        positions=tuple(f"b.{name} [rad]" for name in coordinates),
+    )
+    page = page_of(results.design(**evaluations, labels=labels))
+    (group,) = (
+        part
+        for section in page.sections
+        for part in section.parts
+        if isinstance(part, PlotGroup) and part.title == "Positions"
+    )
+    assert [panel.title for panel in group.panels] == list(labels.positions)
+    np.testing.assert_allclose(group.panels[5].traces[1]["y"], angle, atol=1e-6)
+
+
 def test_a_limit_far_away_is_named_and_does_not_flatten_the_motion() -> None:
     """It is drawn where the motion comes near; elsewhere its value stands above the plot."""
 
@@ -248,6 +296,41 @@ def test_few_predictions_are_shown_over_the_noise() -> None:
     assert panel.title.endswith(" *: rms error of the prediction / σ of the noise [–]")
     assert "* predicted by a fit to the other recordings" in errors.note
     assert numbers(panel.traces[1]["x"])[0] == pytest.approx(prediction.identified.rms[0] / 0.5)
+
+
+@pytest.mark.parametrize(("nominal", "kind"), [(900.0, "log"), (2.0, None)])
+def test_a_nominal_model_far_away_hides_no_small_error(nominal: float, kind: str | None) -> None:
+    """Errors of 1 and 900 times the noise are both seen, and so is the noise."""
+    prediction = results.estimate().predictions[0]
+    found = replace(
+        prediction,
+        identified=replace(prediction.identified, rms=np.array([1.1])),
+        nominal=replace(prediction.nominal, rms=np.array([nominal])),
+    )
+    estimate = results.estimate(predictions=(found,), sigma={"qpos:hinge": 1.0})
+    sections = {section.title: section.parts for section in page_of(estimate).sections}
+    groups = [part for part in sections["Predictions"] if isinstance(part, PlotGroup)]
+    (panel,) = next(group for group in groups if group.title.startswith("Errors")).panels
+    axis = panel.layout["xaxis"]
+    assert axis.get("type") == kind
+    low, high = axis["range"] if kind is None else np.power(10.0, axis["range"])
+    assert low < 1.0 and nominal < high
+    assert {trace["textposition"] for trace in panel.traces} == {"none"}
+
+
+def test_small_correlations_are_seen() -> None:
+    """A tenth has a third of the strongest colour, and the colours beside it stay in order."""
+    for theme in palettes().values():
+        scale = theme["diverging"]
+        places, colours = zip(*scale, strict=True)
+        assert (places[0], places[-1]) == (0.0, 1.0)
+        assert (np.diff(places) > 0.0).all()
+
+        channels = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in colours])
+        end, middle = channels[-1], channels[len(channels) // 2]
+        at_a_tenth = [np.interp(0.55, places, channels[:, i]) for i in range(3)]
+        share = np.linalg.norm(at_a_tenth - middle) / np.linalg.norm(end - middle)
+        assert share == pytest.approx(np.sqrt(0.1), abs=0.02)
 
 
 def test_long_names_of_correlations_become_numbers() -> None:

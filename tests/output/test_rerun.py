@@ -24,20 +24,28 @@ from mjfim.errors import MjfimError, RecordingError
 from mjfim.experiment.labels import labels_of_model
 from mjfim.model.coordinates import output_label
 from mjfim.output.rerun import log_design, log_estimate, log_trajectories, show
-from mjfim.output.rerun.camera import place_camera
+from mjfim.output.rerun.camera import (
+    FIELD_OF_VIEW,
+    camera_axes,
+    moving_points,
+    place_camera,
+    seen_points,
+)
 from mjfim.output.rerun.history import history_series
 from mjfim.output.rerun.iterates import POSES, IterateCurves
 from mjfim.output.rerun.limits import usage_plots
 from mjfim.output.rerun.outputs import output_plots, recording_tabs
-from mjfim.output.rerun.panels import dof_positions, fit_in_a_row, grid_tabs
+from mjfim.output.rerun.panels import dof_positions, fit_in_a_row, grid_tabs, plot_size
 from mjfim.output.rerun.scene import body_poses, entity_path
 from mjfim.output.rerun.series import (
     LARGEST_ZOOM,
+    NUMBERS_BESIDE,
     ROOM,
     TIME_ROOM,
     Curve,
     SeriesPlot,
     padded,
+    with_room_for_legends,
     with_two_numbers,
 )
 from mjfim.output.rerun.shapes import INFINITE_REACH, OUTLINE, SOLID
@@ -732,6 +740,20 @@ class TestAnyModel:
         cosine = ray @ towards / np.linalg.norm(towards) / np.linalg.norm(ray, axis=2)
         assert np.degrees(np.arccos(cosine.min())) < 40.0
 
+    def test_camera_is_as_near_as_the_motion_permits(self, name: str) -> None:
+        """Something moving is at an edge of the picture, and nothing is beyond it."""
+        model = load(name)
+        trajectory = simulated(model, 1.0)
+        poses = body_poses(model, trajectory.t, trajectory.qpos)
+        eye = place_camera(model, [poses], views=1, aspect=1.3, follow=False)
+        towards = np.subtract(eye.position, eye.target)
+        distance = np.linalg.norm(towards)
+        points = seen_points(model, moving_points(model, [poses]))
+        seen = (points - eye.target) @ camera_axes(towards / distance).T
+        slope = np.tan(FIELD_OF_VIEW / 2.0)
+        places = np.abs(seen[:, :2] / (distance - seen[:, 2:]) / slope / [1.3, 1.0])
+        assert places.max() == pytest.approx(1.0, abs=1e-6)
+
 
 @pytest.fixture(scope="module")
 def zoo_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -1003,6 +1025,24 @@ class TestLabels:
             ]
             plot = SeriesPlot(parts=("a",), title="a", curves=curves)
             assert plot.emptiest_corner == corner
+
+    def test_legends_of_limits_stand_behind_the_curves(self) -> None:
+        """The plots of the limits keep one axis of time."""
+        t = np.linspace(0.0, 2.0, 50)
+        plots = [
+            SeriesPlot(
+                parts=(name,),
+                title=name,
+                curves=[Curve(name=name, t=t, values=np.sin(9.0 * t), colour=(0, 0, 0))],
+                own_legend=True,
+            )
+            for name in ("elbow", "shoulder_pitch")
+        ]
+        roomy = with_room_for_legends(plots)
+        (room,) = {plot.room for plot in roomy}
+        legend, width = roomy[1].legend_width, plot_size(2)[0] - NUMBERS_BESIDE
+        assert width * room / (1.0 + room) == pytest.approx(legend)
+        assert legend > roomy[0].legend_width
 
     def test_names_of_tabs_fit_beside_each_other(self) -> None:
         views: list[rrb.View] = [rrb.TimeSeriesView(origin=f"/{k}") for k in range(20)]

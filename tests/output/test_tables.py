@@ -133,8 +133,14 @@ def test_tables_with_hostile_names_are_compiled(tmp_path: Path) -> None:
     if compiler is None:
         pytest.skip("pdflatex is not installed")
     table = made_table(title=HOSTILE + '"σ ± × ÷ ▶ 10⁻⁷', note="50 % of σ²; a_1 & b")
-    summary = Summary(title="", outcome="", parts=(table, table))
-    lines = [r"\documentclass{article}", r"\usepackage{booktabs}", r"\begin{document}"]
+    wide = SummaryTable(
+        key="wide",
+        title="Wide",
+        columns=tuple(Column(heading=f"a long heading {k}") for k in range(12)),
+        rows=(Row(cells=tuple(f"{k}" for k in range(12))),),
+    )
+    summary = Summary(title="", outcome="", parts=(table, table, wide))
+    lines = [r"\documentclass{article}", r"\usepackage{booktabs,graphicx}", r"\begin{document}"]
     lines += [latex.render_tables(summary), r"\end{document}", ""]
     (tmp_path / "tables.tex").write_text("\n".join(lines), encoding="utf-8")
 
@@ -151,3 +157,6 @@ def test_tables_with_hostile_names_are_compiled(tmp_path: Path) -> None:
     if "booktabs.sty' not found" in ended.stdout:
         pytest.skip("this LaTeX has no package booktabs")
     assert ended.returncode == 0, ended.stdout[-2000:]
+
+    # A table that is wider than the text is scaled down.
+    assert "Overfull" not in ended.stdout

@@ -155,6 +155,17 @@ class TestFilm:
         travelled = view.target[-1, 0] - view.target[0, 0]
         assert travelled == pytest.approx(scale * distance if follows else 0.0, rel=0.1)
 
+    @pytest.mark.parametrize(("axis", "size"), [("0 0 1", (640, 360)), ("0 1 0", (480, 480))])
+    def test_the_shape_of_a_view_makes_the_robot_large(
+        self, axis: str, size: tuple[int, int]
+    ) -> None:
+        """A rod that turns in the horizontal plane is wide, one in an upright plane is square."""
+        text = SWING.replace('axis="0 1 0"', f'axis="{axis}"').replace("0 0 -1", "0.8 0 -0.1")
+        t = np.linspace(0.0, 4.0, 81)
+        turning = motion(t, 2.0 * np.pi * t[:, None] / t[-1])
+        film = film_of_estimate(mujoco.MjModel.from_xml_string(text), turning, None)
+        assert film.camera.size == size
+
 
 class TestVideo:
     def test_other_endings_are_refused(self) -> None:

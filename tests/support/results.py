@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mjfim.arrays import Array
@@ -297,6 +299,7 @@ def study(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> MonteC
         "measure_rate": 100.0,
         "sets": sets,
         "information": {name: np.linalg.inv(found.crlb) for name, found in sets.items()},
+        "labels": replace(labels(), parameters=parameters),
     }
     return MonteCarloStudy(**{**fields, **changes})  # type: ignore[arg-type]
 

@@ -11,6 +11,7 @@ from matplotlib.ticker import FixedLocator, MaxNLocator
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.plots import style
 from mjfim.records.campaign import Campaign
+from mjfim.records.labels import with_unit
 
 # Largest number of parameters that are drawn; those with a target accuracy come first.
 MAX_PARAMETERS = 8
@@ -33,10 +34,10 @@ def campaign_figure(campaign: Campaign, parameters: CampaignParameters) -> Figur
     panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
     for (left, right), j in zip(panels, shown, strict=True):
         name = style.shorten(parameters.names[j], PARAMETER_NAME_WIDTH)
-        unit = parameters.units[j] or "model unit"
+        unit = parameters.units[j]
         guess = style.format_number(float(campaign.rounds[0].theta[j]), 4)
-        left.set_title(f"σ of {name} [{unit}]", loc="left")
-        right.set_title(f"{name} [{unit}], first design at {guess}", loc="left")
+        left.set_title(with_unit(f"σ of {name}", unit), loc="left")
+        right.set_title(f"{with_unit(name, unit)}, first design at {guess}", loc="left")
 
         true = None if parameters.true is None else float(parameters.true[j])
         _draw_std(left, campaign, j)

@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
+from mjfim.output.correlation_colours import SCALE_IN_WORDS, colour_strength
 from mjfim.output.plots.style import (
     GRID_COLOUR,
     LARGE_FONT,
@@ -48,7 +49,7 @@ NAME_WIDTH, CELL_NAME_WIDTH = 26, 18
 # Width that the cells have at least; names below them that need more are turned upright [inch].
 MATRIX_WIDTH = 3.6
 
-# Size of a correlation above which its cell is so dark that its number is white.
+# Strength of the colour of a cell above which its number is white.
 DARK_CELL = 0.6
 
 # Height of a row, and of all that is above and below the rows [inch].
@@ -242,9 +243,8 @@ def _draw_correlations(axes: Axes, check: Check) -> None:
     unknown = ~np.isfinite(correlation)
     np.fill_diagonal(correlation, np.nan)
 
-    axes.imshow(
-        np.ma.masked_invalid(correlation), cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto"
-    )
+    strength = np.ma.masked_invalid(colour_strength(correlation))
+    axes.imshow(strength, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto")
     _shade(axes, unknown, GRID_COLOUR)
     _shade(axes, np.eye(count, dtype=bool) & ~unknown, DIAGONAL_COLOUR)
     if count <= MAX_WRITTEN_CELLS:
@@ -261,7 +261,7 @@ def _draw_correlations(axes: Axes, check: Check) -> None:
     axes.grid(False)
 
     mark = "bold" if count <= MAX_WRITTEN_CELLS else "dot"
-    title = "correlation (red: positive, blue: negative)\n"
+    title = f"correlation (red: positive, blue: negative; {SCALE_IN_WORDS})\n"
     title += f"{mark}: beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
     if unknown.any():
         title += "\ngrey: not identifiable alone"
@@ -277,6 +277,7 @@ def _shade(axes: Axes, cells: NDArray[np.bool_], colour: str) -> None:
 
 def _write_correlations(axes: Axes, correlation: Array) -> None:
     """Write the finite correlations (n, n) into their cells."""
+    strength = np.abs(colour_strength(correlation))
     for (i, j), value in np.ndenumerate(correlation):
         if not np.isfinite(value):
             continue
@@ -288,7 +289,7 @@ def _write_correlations(axes: Axes, correlation: Array) -> None:
             ha="center",
             va="center",
             fontsize=SMALL_FONT,
-            color="white" if abs(value) > DARK_CELL else TEXT_COLOUR,
+            color="white" if strength[i, j] > DARK_CELL else TEXT_COLOUR,
             weight="bold" if confounded else "normal",
         )
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.model.units import per_second
-from mjfim.output.plots.positions import shown_positions
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     INITIAL_COLOUR,
@@ -34,6 +33,7 @@ from mjfim.output.plots.style import (
     trajectory_handles,
     write_message,
 )
+from mjfim.output.positions import shown_positions
 from mjfim.records.design import Design
 from mjfim.records.labels import Labels
 

@@ -240,7 +240,7 @@ def _label_ticks(axes: Axes, shown: _Estimates, i: int, j: int) -> None:
 def _label(shown: _Estimates, i: int) -> str:
     """Return the label of an axis: name and unit of a parameter, a line each."""
     name = fit_text(shown.names[i], LABEL_WIDTH, SMALL_FONT)
-    return f"{name}\n[{shown.units[i] or 'model unit'}]"
+    return f"{name}\n[{shown.units[i]}]" if shown.units[i] else name
 
 
 def _value(shown: _Estimates, i: int, stds: float) -> str:

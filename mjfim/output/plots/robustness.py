@@ -25,6 +25,9 @@ LEAST_DRAWN_MARGIN = -1.0
 # Characters to which the names of limits and of parameters are shortened.
 LIMIT_NAME_WIDTH, PARAMETER_NAME_WIDTH = 26, 24
 
+# Opacity of red dots, which look orange where the paper shines through.
+RED_OPACITY = 0.95
+
 # Largest number of parameters whose coverage is written, and the font size of more names [points].
 MAX_WRITTEN_NUMBERS, MANY_NAMES_FONT = 12, 6.0
 
@@ -85,10 +88,15 @@ def _draw_limits(axes: Axes, result: Robustness) -> None:
     style.format_axes(axes, "margin over half of the range [%]")
     axes.axvspan(low, 0.0, color=style.DESIGNED_COLOUR, alpha=0.10, linewidth=0.0)
     for i, row in enumerate(rows):
-        colour = style.MEASURED_COLOUR if result.kept[:, i].all() else style.DESIGNED_COLOUR
-        heights = row + rng.uniform(-0.22, 0.22, result.runs)
+        is_kept = bool(result.kept[:, i].all())
         axes.plot(
-            percent[:, i], heights, "o", color=colour, markersize=3.5, alpha=0.5, markeredgewidth=0
+            percent[:, i],
+            row + rng.uniform(-0.22, 0.22, result.runs),
+            "o",
+            color=style.MEASURED_COLOUR if is_kept else style.DESIGNED_COLOUR,
+            markersize=3.5,
+            alpha=0.5 if is_kept else RED_OPACITY,
+            markeredgewidth=0,
         )
 
         planned = 100.0 * result.planned[i]
@@ -158,9 +166,9 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
         z = np.clip(result.z[:, j], -LARGEST_DRAWN_ERROR, LARGEST_DRAWN_ERROR)
         x = j + rng.uniform(-0.28, 0.28, len(z))
         inside = np.abs(z) <= INTERVAL_HALF_WIDTH
-        for chosen, colour in (
-            (inside, style.IDENTIFIED_COLOUR),
-            (~inside, style.DESIGNED_COLOUR),
+        for chosen, colour, opacity in (
+            (inside, style.IDENTIFIED_COLOUR, 0.6),
+            (~inside, style.DESIGNED_COLOUR, RED_OPACITY),
         ):
             axes.plot(
                 x[chosen],
@@ -168,7 +176,7 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
                 "o",
                 color=colour,
                 markersize=3.5,
-                alpha=0.6,
+                alpha=opacity,
                 markeredgewidth=0.0,
             )
 

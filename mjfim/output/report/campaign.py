@@ -13,6 +13,7 @@ from mjfim.output.summaries.campaign import describe_campaign
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.vocabulary import IDENTIFIED, INITIAL, NOMINAL
 from mjfim.records.campaign import Campaign
+from mjfim.records.labels import with_unit
 
 # Largest number of parameters that are drawn; those with a target accuracy come first.
 MAX_PARAMETERS = 12
@@ -63,7 +64,7 @@ def _shown(campaign: Campaign, parameters: CampaignParameters) -> list[int]:
 
 def _label(parameters: CampaignParameters, j: int) -> str:
     """Return the label of parameter j."""
-    return f"{parameters.names[j]} [{parameters.units[j] or 'model unit'}]"
+    return with_unit(parameters.names[j], parameters.units[j])
 
 
 def _rounds_axis(campaign: Campaign) -> Plotly:

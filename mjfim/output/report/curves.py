@@ -34,6 +34,9 @@ AXIS_NAME_WIDTH = 22
 # level.
 ROW_NAME_WIDTH, COLUMN_NAME_WIDTH, MAX_LEVEL_NAMES = 20, 12, 3
 
+# Numbers beside the colours of correlations, which change fastest near 0.
+CORRELATION_TICKS = [-1, -0.5, -0.2, 0, 0.2, 0.5, 1]
+
 # Largest number of parameters for which correlations are written into the cells.
 MAX_WRITTEN_CELLS = 14
 
@@ -407,7 +410,7 @@ def correlation_panel(correlation: Array, names: Sequence[str], title: str) -> P
         "zmax": 1,
         "xgap": 1,
         "ygap": 1,
-        "colorbar": {"thickness": 10, "outlinewidth": 0, "tickvals": [-1, -0.5, 0, 0.5, 1]},
+        "colorbar": {"thickness": 10, "outlinewidth": 0, "tickvals": CORRELATION_TICKS},
     }
     if count <= MAX_WRITTEN_CELLS:
         trace["texttemplate"] = "%{z:+.2f}"

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import complete_labels
-from mjfim.output.limit_curves import largest_share, would_be_solid
+from mjfim.output.limit_curves import (
+    closest_to_bounds,
+    envelope,
+    largest_share,
+    whole_percent,
+    would_be_solid,
+)
+from mjfim.output.positions import shown_positions
 from mjfim.output.report.correlations import correlation_of
 from mjfim.output.report.curves import (
     axis,
@@ -47,11 +56,9 @@ NEAR_BOUND = 1.0
 # Largest number of curves of one kind of limit; of more, those that come closest to a bound.
 MAX_LIMIT_CURVES = 8
 
-# Number of intervals of the envelope of a curve that would be a solid area.
-ENVELOPE_INTERVALS = 150
-
-# Colours of the curves of limits, in the order of their closeness to a bound.
-LIMIT_ROLES = tuple(f"series{i}" for i in range(MAX_LIMIT_CURVES))
+# Colours of joints, actuators and pairs of geoms in the plots of limits, in the order of their
+# closeness to a bound, and that of all others.
+LIMIT_ROLES, OTHER_ROLE = tuple(f"series{i}" for i in range(MAX_LIMIT_CURVES)), "muted"
 
 
 def design_page(design: Design) -> Page:
@@ -158,67 +165,88 @@ def _std_bars(
 # ---- motion
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Signals:
+    """Positions, velocities or controls of both trajectories.
+
+    Attributes:
+        title: Title of their plots.
+        kind: Kind of their limits.
+        labels: n labels, `<name> [<unit>]`.
+        values: (N+1, n) or, of controls, (N, n) values of the initial and the designed trajectory.
+    """
+
+    title: str
+    kind: Literal["position", "velocity", "control"]
+    labels: tuple[str, ...]
+    values: tuple[Array, ...]
+
+
 def _motion_plots(design: Design, labels: Labels) -> Iterator[PlotGroup]:
     """Yield plots of positions, velocities, controls and of the information over time."""
+    initial, designed = design.initial.trajectory, design.final.trajectory
+    positions, both = shown_positions(labels, initial.qpos, designed.qpos)
     groups = (
-        ("Positions", "qpos", labels.qpos),
-        ("Velocities", "qvel", labels.velocities),
-        ("Controls", "ctrl", labels.controls),
+        _Signals(title="Positions", kind="position", labels=positions, values=both),
+        _Signals(
+            title="Velocities",
+            kind="velocity",
+            labels=labels.velocities,
+            values=(initial.qvel, designed.qvel),
+        ),
+        _Signals(
+            title="Controls",
+            kind="control",
+            labels=labels.controls,
+            values=(initial.ctrl, designed.ctrl),
+        ),
     )
-    bounds = _bounds_by_label(design, labels)
     yield _information_plot(design)
-    for title, quantity, names in groups:
-        if not names:
+    for group in groups:
+        if not group.labels:
             continue
+        bounds = _bounds_by_label(design, group)
         panels = [
-            _signal_panel(design, quantity, i, name, bounds.get((quantity, name), ()))
-            for i, name in enumerate(names[:MAX_PANELS])
+            _signal_panel(design, group, i, bounds.get(name, ()))
+            for i, name in enumerate(group.labels[:MAX_PANELS])
         ]
         note = "Dashed lines: limits. " if any(panel.layout["shapes"] for panel in panels) else ""
         if any(panel.remark for panel in panels):
             note += "Limits far from the motion stand above the plots. "
-        if len(names) > MAX_PANELS:
+        if len(group.labels) > MAX_PANELS:
             note += (
-                f"The first {MAX_PANELS} of {len(names)} columns are shown; all of them are in "
-                "design.npz."
+                f"The first {MAX_PANELS} of {len(group.labels)} columns are shown; all of them are "
+                "in design.npz."
             )
-        yield PlotGroup(title=title, panels=panels, keys=TRAJECTORY_KEYS, note=note)
+        yield PlotGroup(title=group.title, panels=panels, keys=TRAJECTORY_KEYS, note=note)
 
 
-def _bounds_by_label(design: Design, labels: Labels) -> dict[tuple[str, str], tuple[float, float]]:
-    """Return the finite bounds of positions, velocities and controls, by quantity and label."""
-    kinds = (
-        ("position", "qpos", labels.qpos, ""),
-        ("velocity", "qvel", labels.velocities, " velocity"),
-        ("control", "ctrl", labels.controls, ""),
-    )
-    bounds = {}
-    for kind, quantity, names, ending in kinds:
-        label_of = {split_unit(label)[0].removesuffix(ending): label for label in names}
-        for usage in design.usage:
-            is_known = np.isfinite(usage.lower) or np.isfinite(usage.upper)
-            if usage.kind == kind and usage.name in label_of and is_known:
-                bounds[quantity, label_of[usage.name]] = (usage.lower, usage.upper)
-    return bounds
+def _bounds_by_label(design: Design, group: _Signals) -> dict[str, tuple[float, float]]:
+    """Return the finite bounds of positions, velocities or controls, by label."""
+    ending = " velocity" if group.kind == "velocity" else ""
+    label_of = {split_unit(label)[0].removesuffix(ending): label for label in group.labels}
+    return {
+        label_of[usage.name]: (usage.lower, usage.upper)
+        for usage in design.usage
+        if usage.kind == group.kind
+        and usage.name in label_of
+        and (np.isfinite(usage.lower) or np.isfinite(usage.upper))
+    }
 
 
 def _signal_panel(
-    design: Design,
-    quantity: str,
-    column: int,
-    label: str,
-    bounds: tuple[float, float] | tuple[()],
+    design: Design, group: _Signals, column: int, bounds: tuple[float, float] | tuple[()]
 ) -> Panel:
     """Return the plot of one column of both trajectories, with its bounds."""
     traces, extremes = [], []
-    for evaluation, term in ((design.initial, INITIAL), (design.final, DESIGNED)):
-        t = evaluation.trajectory.t
-        values = getattr(evaluation.trajectory, quantity)[:, column]
-        held = quantity == "ctrl"
+    evaluations = (design.initial, design.final)
+    for evaluation, term, rows in zip(evaluations, (INITIAL, DESIGNED), group.values, strict=True):
+        values = rows[:, column]
+        held = group.kind == "control"
         if held:
             # The last control is held until the end.
             values = np.append(values, values[-1])
-        traces.append(curve(t, values, term.word, term.word, held=held))
+        traces.append(curve(evaluation.trajectory.t, values, term.word, term.word, held=held))
         extremes += [float(values.min()), float(values.max())]
 
     # A bound that the motion comes near is inside the plot; one far away would flatten the curves.
@@ -232,9 +260,11 @@ def _signal_panel(
         layout["yaxis"] = axis(range=[min(ends) - room, max(ends) + room])
     remark = ""
     if len(near) < len(lines):
-        values = " and ".join(f"{y:.4g}" for y in lines)
-        remark = f"limits {values}" if len(lines) > 1 else f"limit {values}"
-    return Panel(title=label, traces=traces, layout=layout, linked="time", remark=remark)
+        stated = " and ".join(f"{y:.4g}" for y in lines)
+        remark = f"limits {stated}" if len(lines) > 1 else f"limit {stated}"
+    return Panel(
+        title=group.labels[column], traces=traces, layout=layout, linked="time", remark=remark
+    )
 
 
 def _information_plot(design: Design) -> PlotGroup:
@@ -269,10 +299,11 @@ def _root_information(evaluation: Evaluation, name: str) -> Plotly:
 def _limit_plots(design: Design) -> PlotGroup:
     """Return a plot of the used share of each limit, one for each kind."""
     kinds = list(dict.fromkeys(usage.kind for usage in design.usage))
+    roles = dict(zip(closest_to_bounds(design.usage), LIMIT_ROLES, strict=False))
     panels = []
     for kind in kinds:
         usages = [usage for usage in design.usage if usage.kind == kind]
-        panels.append(_limit_panel(design, kind, usages))
+        panels.append(_limit_panel(design, kind, usages, roles))
     note = (
         "Every engine step of the designed motion on the stated model, in percent of the way from "
         "the middle of the range to its bound; the dashed lines are the bounds. Where a curve "
@@ -281,16 +312,24 @@ def _limit_plots(design: Design) -> PlotGroup:
     return PlotGroup(title="How much of each limit is used", panels=panels, note=note)
 
 
-def _limit_panel(design: Design, kind: str, usages: list[LimitUsage]) -> Panel:
-    """Return the plot of one kind of limit; the curves closest to a bound are drawn."""
+def _limit_panel(
+    design: Design, kind: str, usages: list[LimitUsage], roles: dict[str, str]
+) -> Panel:
+    """Return the plot of one kind of limit; the curves closest to a bound are drawn.
+
+    `roles` holds the role of the colour of a joint or actuator, by its name.
+    """
     closest_first = sorted(usages, key=lambda usage: -largest_share(usage))
     shown = closest_first[:MAX_LIMIT_CURVES]
     is_dense = any(would_be_solid(usage) for usage in shown)
     traces, keys = [], []
-    for usage, role in zip(shown, LIMIT_ROLES, strict=False):
-        percent = 100.0 * usage.share
-        name = f"{usage.name} {100.0 * largest_share(usage):.0f} %"
-        times, values = _envelope(usage.t, percent) if is_dense else (usage.t, percent)
+    for usage in shown:
+        role = roles.get(usage.name, OTHER_ROLE)
+        name = f"{usage.name} {whole_percent(largest_share(usage))}"
+        times, values = usage.t, 100.0 * usage.share
+        if is_dense:
+            times, low, high = envelope(usage)
+            values = np.maximum(np.abs(low), np.abs(high))
         traces.append(curve(times, values, name, role, width=1.3))
         keys.append(Key(name=name, role=role))
 
@@ -325,14 +364,6 @@ def _limit_title(kind: str, *, is_dense: bool) -> str:
     if kind == "clearance":
         return "required / actual distance [%]"
     return "largest use in short intervals [%]" if is_dense else "place in the range [%]"
-
-
-def _envelope(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return the largest size of a curve in short intervals, with their middle times."""
-    parts = np.array_split(np.abs(values), min(ENVELOPE_INTERVALS, len(values)))
-    times = np.array_split(t, len(parts))
-    middles = np.array([float(part.mean()) for part in times])
-    return middles, np.array([float(part.max()) for part in parts])
 
 
 # ---- optimisation

@@ -32,7 +32,7 @@ from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.summary_parts import Listing, Part, Quantity, Summary
 from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
 from mjfim.records.estimate import Estimate, Prediction
-from mjfim.records.labels import Labels
+from mjfim.records.labels import Labels, with_unit
 from mjfim.records.recording import Recording
 
 # Largest number of outputs that are drawn; of more, those whose residuals over sigma are largest.
@@ -46,6 +46,12 @@ MAX_PREDICTION_PLOTS = 3
 
 # Name of the identified parameters in the legend.
 WITH_INTERVAL = f"{IDENTIFIED.word}, 95 % interval"
+
+# Ratio of the largest to the smallest prediction error above which their axis is logarithmic.
+MOST_LINEAR = 20.0
+
+# Decades of a logarithmic axis of prediction errors before the smallest and behind the largest one.
+NOISE_ROOM = (0.5, 0.05)
 
 # Largest number of segments whose beginnings are drawn as lines.
 MAX_SEGMENTS = 20
@@ -225,20 +231,28 @@ def _noise_panel(
     outputs = prediction.identified.outputs
     sigma = np.array([estimate.sigma[outputs[j]] for j in columns])
     names, units = zip(*(split_unit(labels.output(outputs[j])) for j in columns), strict=True)
-    traces, largest = [], 1.0
+    traces, shares = [], np.ones(1)
     for term, errors in ((NOMINAL, prediction.nominal), (IDENTIFIED, prediction.identified)):
         rms = errors.rms[list(columns)]
         texts = [
             f"{Quantity(value=float(error))} {unit}".rstrip()
             for error, unit in zip(rms, units, strict=True)
         ]
-        traces.append(rows_of_bars(rms / sigma, term.word, term.word, texts=texts))
-        largest = float(np.nanmax(np.append(rms / sigma, largest)))
+        # The line of the noise would cross texts beside the bars; they are seen at the pointer.
+        bars = rows_of_bars(rms / sigma, term.word, term.word, texts=texts, outside=False)
+        traces.append(bars)
+        shares = np.append(shares, rms / sigma)
+
+    # A nominal model far away would hide the errors of the identified one on a linear axis.
+    title, known = "rms error / σ of the noise [–]", shares[np.isfinite(shares) & (shares > 0.0)]
+    horizontal = axis(title, range=[0.0, 1.05 * float(known.max())])
+    if known.max() > MOST_LINEAR * known.min():
+        horizontal = log_axis(title, known, room=NOISE_ROOM)
     return Panel(
         title=f"{_prediction_name(prediction)}: rms error of the prediction / σ of the noise [–]",
         traces=traces,
         layout={
-            "xaxis": axis("rms error / σ of the noise [–]", range=[0.0, 1.3 * largest]),
+            "xaxis": horizontal,
             "yaxis": row_axis(names),
             "shapes": [level(1.0, "text", across="y")],
             "bargap": 0.25,
@@ -547,11 +561,10 @@ def _trace_plots(estimate: Estimate) -> PlotGroup | None:
         line = curve(iterations, trace[:, j], IDENTIFIED.word, IDENTIFIED.word)
         line["mode"] = "lines+markers"
         line["marker"] = {"size": 4, "color": f"role:{IDENTIFIED.word}"}
-        unit = estimate.units[j] or "model unit"
         guess = float(estimate.initial_theta[j])
         panels.append(
             Panel(
-                title=f"{name} [{unit}]",
+                title=with_unit(name, estimate.units[j]),
                 traces=[line],
                 layout={
                     "xaxis": axis("iteration [–]"),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
+from mjfim.output.correlation_colours import colour_strength
 from mjfim.output.vocabulary import OTHER, TERMS
 
 # Colours of page and plots that belong to no term of the vocabulary, by their role.
@@ -58,18 +61,38 @@ SERIES_DARK = (
     "#a3abb3",
 )
 
-# Colours from -1 over 0 to 1.
-DIVERGING_LIGHT = ((0.0, "#2166ac"), (0.5, "#f7f7f7"), (1.0, "#b2182b"))
-DIVERGING_DARK = ((0.0, "#2a73b5"), (0.5, "#262b31"), (1.0, "#c2412f"))
+# Colours of the correlations -1, 0 and 1, and number of colours from one to the next.
+DIVERGING_LIGHT = ("#2166ac", "#f7f7f7", "#b2182b")
+DIVERGING_DARK = ("#2a73b5", "#262b31", "#c2412f")
+DIVERGING_STEPS = 12
 
 
 def palettes() -> dict[str, dict[str, Any]]:
     """Return the colours by theme, `light` and `dark`, and role."""
-    light: dict[str, Any] = {**LIGHT, "diverging": DIVERGING_LIGHT}
-    dark: dict[str, Any] = {**DARK, "diverging": DIVERGING_DARK}
+    light: dict[str, Any] = {**LIGHT, "diverging": _diverging(DIVERGING_LIGHT)}
+    dark: dict[str, Any] = {**DARK, "diverging": _diverging(DIVERGING_DARK)}
     for term in (*TERMS, OTHER):
         light[term.word] = term.colour
         dark[term.word] = term.colour_on_dark
     for i, (bright, pale) in enumerate(zip(SERIES_LIGHT, SERIES_DARK, strict=True)):
         light[f"series{i}"], dark[f"series{i}"] = bright, pale
     return {"light": light, "dark": dark}
+
+
+def _diverging(ends: tuple[str, str, str]) -> list[tuple[float, str]]:
+    """Return places from 0 to 1 on a scale of correlations, with their colours.
+
+    Args:
+        ends: Colours at -1, 0 and 1, `#rrggbb`.
+    """
+    # Colours change faster near 0, so the places there are closer.
+    even = np.linspace(-1.0, 1.0, 2 * DIVERGING_STEPS + 1)
+    correlations = np.sign(even) * even**2
+    known = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in ends])
+    strengths = colour_strength(correlations)
+    channels = [np.interp(strengths, (-1.0, 0.0, 1.0), known[:, i]) for i in range(3)]
+    colours = np.round(np.stack(channels, axis=1)).astype(int).tolist()
+    return [
+        (float(place), "#{:02x}{:02x}{:02x}".format(*colour))
+        for place, colour in zip((1.0 + correlations) / 2.0, colours, strict=True)
+    ]

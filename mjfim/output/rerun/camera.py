@@ -17,8 +17,8 @@ from mjfim.output.rerun.scene import BodyPoses, moving_geoms
 # leaves a margin.
 FIELD_OF_VIEW = np.radians(50.0)
 
-# Half of the height that is in view, as a multiple of the height of the scene, with a margin.
-HALF_FRAME = 0.56
+# Times that a camera is centred on the picture of the motion, which its distance changes.
+CENTRINGS = 4
 
 # Samples of a motion from which the camera is placed.
 CAMERA_SAMPLES = 200
@@ -98,20 +98,19 @@ def place_camera(
     if followed is not None:
         clouds = _around_begin(clouds, motions, followed)
 
-    low, high = _bounding_box(model, clouds, axes)
-    room = 1.0 if followed is None else FOLLOW_ROOM
-    width, height, depth = room * np.maximum(high - low, 1e-6)
+    points = seen_points(model, clouds) @ axes.T
+    if followed is not None:
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+        points = middle + FOLLOW_ROOM * (points - middle)
 
     # Views are stacked if this draws the scene larger.
-    stacked_scale = min(1.0 / (views * height), aspect / width)
-    beside_scale = min(1.0 / height, aspect / (views * width))
-    stacked = bool(stacked_scale > beside_scale)
-
-    view_aspect = aspect * views if stacked else aspect / views
-    frame_height = max(height, width / view_aspect)
-    distance = HALF_FRAME * frame_height / np.tan(FIELD_OF_VIEW / 2.0) + depth / 2.0
-    target = (low + high) / 2.0 @ axes
-    position = target + distance * towards_camera
+    slope = float(np.tan(FIELD_OF_VIEW / 2.0))
+    beside = fit_in_view(points, slope, aspect / views)
+    above = fit_in_view(points, slope, aspect * views)
+    stacked = views > 1 and above.distance * views < beside.distance
+    chosen = above if stacked else beside
+    target = chosen.target @ axes
+    position = target + chosen.distance * towards_camera
     return Camera(
         position=tuple(map(float, position)),
         target=tuple(map(float, target)),
@@ -231,19 +230,60 @@ def camera_axes(towards_camera: Array) -> Array:
     return np.stack([right, up, towards_camera])
 
 
-def _bounding_box(
-    model: mujoco.MjModel, clouds: Sequence[Array], axes: Array
-) -> tuple[Array, Array]:
-    """Return the (3,) lower and upper ends of all points along the camera's axes [m].
+def seen_points(model: mujoco.MjModel, clouds: Sequence[Array]) -> Array:
+    """Return the (n, 3) points that a camera has in view [m]: a cube around what does not move.
 
-    If nothing moves, they enclose the model.
+    Args:
+        model: The model.
+        clouds: (samples, n, 3) world paths of the corners of all moving geoms, by motion [m].
     """
-    seen = np.concatenate([(cloud @ axes.T).reshape(-1, 3) for cloud in clouds])
-    if len(seen):
-        low, high = seen.min(axis=0), seen.max(axis=0)
-        if np.any(high > low):
-            return low, high
+    points = np.concatenate([cloud.reshape(-1, 3) for cloud in clouds])
+    if len(points) and np.any(np.ptp(points, axis=0) > 0.0):
+        return points
 
-    middle = axes @ model.stat.center
-    reach = float(model.stat.extent)
-    return middle - reach, middle + reach
+    signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
+    return np.asarray(model.stat.center + 0.5 * float(model.stat.extent) * signs)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class View:
+    """Place from which a camera has points in view, as near as possible.
+
+    Attributes:
+        target: (3,) point at which it looks, along its axes [m].
+        distance: Distance of the camera from there [m].
+    """
+
+    target: Array
+    distance: float
+
+
+def fit_in_view(points: Array, slope: float, aspect: float) -> View:
+    """Return the nearest place from which a camera has all points in view.
+
+    Args:
+        points: (n, 3) points along the axes of the camera: right, up, and towards it [m].
+        slope: Half of the height of the picture at distance 1.
+        aspect: Width of the picture over its height.
+    """
+    slopes = np.array([aspect * slope, slope])
+    target = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    for _ in range(CENTRINGS):
+        near = points - target
+        distance = _distance(near, slopes)
+
+        # Centre the picture: what is nearer to the camera is larger.
+        seen = near[:, :2] / (distance - near[:, 2:])
+        target[:2] += distance * (seen.min(axis=0) + seen.max(axis=0)) / 2.0
+    return View(target=target, distance=_distance(points - target, slopes))
+
+
+def _distance(points: Array, slopes: Array) -> float:
+    """Smallest distance at which all points are in the picture [m].
+
+    Args:
+        points: (n, 3) points relative to the target, along the axes of the camera [m].
+        slopes: (2,) half of the width and of the height of the picture at distance 1.
+    """
+    needed = points[:, 2:] + np.abs(points[:, :2]) / slopes
+    return float(needed.max())

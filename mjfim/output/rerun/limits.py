@@ -19,7 +19,13 @@ from mjfim.output.limit_curves import (
     would_be_solid,
 )
 from mjfim.output.rerun.iterates import IterateCurves
-from mjfim.output.rerun.series import NO_LIMITS, Curve, Range, SeriesPlot
+from mjfim.output.rerun.series import (
+    NO_LIMITS,
+    Curve,
+    Range,
+    SeriesPlot,
+    with_room_for_legends,
+)
 from mjfim.records.design import Design, HistoryRow, LimitUsage
 
 # Limits by kind, such as "position", and name of the degree of freedom or the actuator.
@@ -133,7 +139,7 @@ def usage_plots(design: Design, iterates: IterateCurves | None) -> list[SeriesPl
             own_legend=True,
         )
         plots.append(plot)
-    return plots
+    return with_room_for_legends([plot for plot in plots if not plot.is_empty])
 
 
 def _curve_of_use(used: LimitUsage, colour: tuple[int, int, int], is_named: bool) -> Curve:

@@ -46,9 +46,12 @@ LARGEST_WIDENING = 1.4
 # Height of the numbers below a plot [points].
 NUMBERS_BELOW = 20.0
 
+# Width of the numbers beside a plot [points].
+NUMBERS_BESIDE = 40.0
+
 # Free space behind the last sample, as a share of the time, in which the last number of the axis
-# has room.
-TIME_ROOM = 0.05
+# has room, and largest free space for a legend: the motion rests while it is played.
+TIME_ROOM, MOST_ROOM = 0.05, 0.35
 
 # Width of a legend beside its names, of a character, and of its height per name and beside them
 # [points].
@@ -162,6 +165,7 @@ class SeriesPlot:
         largest_zoom: The plot reaches to the limits if its range is then at most this many times as
             large.
         own_legend: True for a plot whose names are not those of the plots beside it.
+        room: Free space behind the last sample, as a share of the time.
         height: Height of the plot without its title in a window of 1280 x 800 pixels [points].
     """
 
@@ -171,6 +175,7 @@ class SeriesPlot:
     limits: Range = NO_LIMITS
     largest_zoom: float = LARGEST_ZOOM
     own_legend: bool = False
+    room: float = TIME_ROOM
     height: float = LEAST_HEIGHT
 
     @property
@@ -238,11 +243,8 @@ class SeriesPlot:
     def emptiest_corner(self) -> rrb.Corner2D:
         """The corner in which a legend covers the fewest samples of the curves over time."""
         curves = [curve for curve in self.curves if curve.timeline == "sim_time"]
-        names = {name for curve in curves if curve.finite.any() for name in curve.names}
-        names |= {LIMIT_NAME for limit in self.limits if np.isfinite(limit)}
-        longest = max(map(len, names), default=0)
-        width = (LEGEND_ROOM + CHARACTER_WIDTH * longest) / LEAST_WIDTH
-        height = (LEGEND_EDGE + LEGEND_ROW * len(names)) / self.height
+        width = self.legend_width / LEAST_WIDTH
+        height = (LEGEND_EDGE + LEGEND_ROW * len(self._names)) / self.height
 
         # (n, 2) samples as shares of the width and the height of the plot.
         samples = np.concatenate([np.zeros((0, 2)), *map(self._as_shares, curves)])
@@ -252,6 +254,18 @@ class SeriesPlot:
             up = 1.0 - samples[:, 1] if is_top else samples[:, 1]
             covered[corner] = int(np.count_nonzero((across < width) & (up < height)))
         return min(covered, key=lambda corner: covered[corner])
+
+    @property
+    def legend_width(self) -> float:
+        """Width of the legend [points]."""
+        return LEGEND_ROOM + CHARACTER_WIDTH * max(map(len, self._names), default=0)
+
+    @property
+    def _names(self) -> set[str]:
+        """Names in the legend of the curves over time."""
+        curves = [curve for curve in self.curves if curve.timeline == "sim_time"]
+        names = {name for curve in curves if curve.finite.any() for name in curve.names}
+        return names | {LIMIT_NAME for limit in self.limits if np.isfinite(limit)}
 
     @property
     def _times(self) -> tuple[float, float]:
@@ -274,7 +288,7 @@ class SeriesPlot:
 
         low, high = self.range
         first, last = self._times
-        across = (t - first) / ((1.0 + TIME_ROOM) * (last - first) or 1.0)
+        across = (t - first) / ((1.0 + self.room) * (last - first) or 1.0)
         up = (values - low) / (high - low)
         return np.column_stack([np.repeat(across, up.shape[1]), up.ravel()])
 
@@ -295,7 +309,7 @@ class SeriesPlot:
         path = entity_path((*self.parts, ROOM))
         line = rr.SeriesLines(colors=[curves[0].colour], names=[curves[0].names[0]])
         rec.log(path, line, static=True, strict=True)
-        times = times_on("sim_time", np.array([last, last + TIME_ROOM * (last - first)]))
+        times = times_on("sim_time", np.array([last, last + self.room * (last - first)]))
         nothing = rr.Scalars.columns(scalars=[np.nan, np.nan])
         rec.send_columns(path, [times], nothing, strict=True)
 
@@ -391,6 +405,21 @@ def with_two_numbers(low: float, high: float, height: float) -> Range:
     else:
         wide = (float((first - 1.0) * step - edge), high)
     return wide if wide[1] - wide[0] <= LARGEST_WIDENING * (high - low) else (low, high)
+
+
+def with_room_for_legends(plots: Sequence[SeriesPlot]) -> list[SeriesPlot]:
+    """Return plots whose legends stand behind the last sample, all with the same axis of time.
+
+    Args:
+        plots: All plots of a tab, each with a legend of its own.
+    """
+    shares = [
+        plot.legend_width / (plot_size(len(plots), k)[0] - NUMBERS_BESIDE)
+        for k, plot in enumerate(plots)
+    ]
+    share = max(shares, default=0.0)
+    room = min(max(share / (1.0 - share) if share < 1.0 else MOST_ROOM, TIME_ROOM), MOST_ROOM)
+    return [replace(plot, room=room) for plot in plots]
 
 
 def views_of(plots: Sequence[SeriesPlot]) -> list[rrb.View]:

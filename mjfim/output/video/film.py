@@ -34,8 +34,9 @@ FASTEST = 2.0
 # Speeds below real time.
 SLOW_SPEEDS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 
-# Size of a view [pixels]; both are even, as the encoder of mp4 needs.
-VIEW_WIDTH, VIEW_HEIGHT = 640, 360
+# Sizes that a view may have [pixels], all about equally large: that one is taken in which the robot
+# is largest. They are even, as the encoder of mp4 needs.
+VIEW_SIZES = ((640, 360), (560, 420), (480, 480))
 
 # Distance that a free body travels, as a multiple of the size of the robot, above which the camera
 # follows it.
@@ -287,7 +288,8 @@ def _camera(
         for view, shift in zip(poses, shifts, strict=True)
         for each in view
     ]
-    camera = place_film_camera(model, seen, VIEW_WIDTH / VIEW_HEIGHT)
+    cameras = [place_film_camera(model, seen, size) for size in VIEW_SIZES]
+    camera = max(cameras, key=lambda each: each.scale)
     heights = np.concatenate([shift[:, 2] for shift in shifts])
     return lowered(camera, float(heights.min()), float(heights.max()))
 

@@ -21,7 +21,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.output.video.film import FRAME_RATE, VIEW_HEIGHT, VIEW_WIDTH, Film, speed_text
+from mjfim.output.video.film import FRAME_RATE, Film, speed_text
 from mjfim.output.video.record import MEDIA_TYPES, Format, NoVideoError, Video, require_encoder
 
 # Kinds of OpenGL contexts by system, in the order in which they are tried: without a display first.
@@ -127,8 +127,8 @@ def _write_job(folder: Path, film: Film, kind: Format, effort: Effort) -> None:
 
     job = {
         "views": views,
-        "width": VIEW_WIDTH,
-        "height": VIEW_HEIGHT,
+        "width": film.camera.size[0],
+        "height": film.camera.size[1],
         "field_of_view": film.camera.field_of_view,
         "floor": film.camera.floor,
         "spacing": film.camera.spacing,

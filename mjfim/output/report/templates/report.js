@@ -68,7 +68,7 @@
   function narrowed(trace) {
     if (!trace.texttemplate) return;
     trace.showscale = false;
-    trace.textfont = { size: 10 };
+    trace.textfont = { size: trace.z.length > 8 ? 8 : 10 };
     if (trace.meta === "correlation") {
       const short = (value) => value === null ? "" : value.toFixed(2).replace("0.", ".").replace("-", "−");
       trace.text = trace.z.map((row) => row.map(short));

@@ -1,4 +1,4 @@
-"""Positions as figures show them: rotations as rotation vectors instead of quaternions."""
+"""Positions as figures and reports show them: rotation vectors instead of quaternions."""
 
 from __future__ import annotations
 
