@@ -7,7 +7,7 @@ import numpy as np
 from mjfim.arrays import Array
 
 # What a picture says of it.
-SCALE_IN_WORDS = "strength: root of its size"
+SCALE_IN_WORDS = "strength of the colour: root of its size"
 
 
 def colour_strength(correlation: Array) -> Array:

@@ -261,7 +261,7 @@ def _draw_correlations(axes: Axes, check: Check) -> None:
     axes.grid(False)
 
     mark = "bold" if count <= MAX_WRITTEN_CELLS else "dot"
-    title = f"correlation (red: positive, blue: negative; {SCALE_IN_WORDS})\n"
+    title = f"correlation (red: positive, blue: negative)\n{SCALE_IN_WORDS}\n"
     title += f"{mark}: beyond ±{CONFOUNDED_CORRELATION:g}, hardly distinguishable"
     if unknown.any():
         title += "\ngrey: not identifiable alone"
