@@ -57,7 +57,6 @@ from mjfim.records.progress import stages_observed_by
 if TYPE_CHECKING:
     from mjfim.experiment.system import System
     from mjfim.output.video.results import Filmed
-    from mjfim.parallel import Pool
 
 app = typer.Typer(
     add_completion=False,
@@ -340,21 +339,6 @@ def keep_result(folder: Path | None = None) -> None:
     interruption = current_interruption()
     if interruption is not None:
         interruption.keep(folder)
-
-
-@contextmanager
-def worker_processes(count: int) -> Iterator[Pool]:
-    """Yield a pool of worker processes; say at the end if one of them was killed.
-
-    Args:
-        count: Largest number of processes.
-    """
-    from mjfim.parallel import LOST_SENTENCE, Pool
-
-    with Pool(count) as pool:
-        yield pool
-    if pool.has_lost_worker:
-        errors.print(f"mjfim: {LOST_SENTENCE}", markup=False)
 
 
 def replace_unencodable_characters() -> None:

@@ -32,10 +32,10 @@ from mjfim.cli.common import (
     say_written,
     verb,
     watched,
-    worker_processes,
     write_wanted_video,
     writing,
 )
+from mjfim.cli.executors import LOCAL, ExecutorPlace, started_executor, stated_executor
 from mjfim.errors import first_ones
 from mjfim.output.picture_format import PictureFormat
 
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from mjfim.excitation.shortest_horizon import ShortestExperiment
     from mjfim.excitation.task import DesignTask
     from mjfim.experiment.system import System
+    from mjfim.parallel import Workers
+    from mjfim.parallel.stated import StatedExecutor
     from mjfim.records.design import Design
     from mjfim.records.events import Callback
 
@@ -53,21 +55,22 @@ DEFAULT_SECONDS = 120.0
 
 
 @contextmanager
-def several(task: DesignTask) -> Iterator[Executor | None]:
-    """Yield processes for the initial controls of a design under hard limits.
+def several(task: DesignTask, stated: StatedExecutor) -> Iterator[Workers | None]:
+    """Start the workers for the initial controls of a design under hard limits.
+
+    Args:
+        task: The design.
+        stated: Where they are, as the user states it.
 
     Yields:
-        A pool; None without hard limits, and for a single initial control, which uses all threads.
+        The workers; None without hard limits, and for a single initial control on this computer,
+        which uses all threads.
     """
     from mjfim.cli.announcements import number_of_starts
 
-    count = number_of_starts(task.system)
-    if count == 1 or not task.is_limited:
-        yield None
-        return
-
-    with worker_processes(min(count, task.plant.simulator.threads)) as pool:
-        yield pool
+    count = number_of_starts(task.system) if task.is_limited else 1
+    with started_executor(stated, count, task.plant.simulator.threads) as workers:
+        yield workers
 
 
 @verb
@@ -93,6 +96,7 @@ def design(
     live: LiveView = None,
     force: Force = False,
     threads: Threads = None,
+    executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Design the excitation that gives the most information about the parameters."""
     from mjfim.excitation.design import design_budget, design_task
@@ -104,6 +108,7 @@ def design(
     from mjfim.output.folders import DESIGN_FILES, SHORTEST_FILES
     from mjfim.output.presentation import describe
 
+    place = stated_executor(executor)
     stated = mjfim.Experiment.from_file(experiment)
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
@@ -120,17 +125,17 @@ def design(
     claim_folder(output, pictures.files(names), input_files(stated), force=force)
 
     with (
-        several(task) as executor,
+        several(task, place) as workers,
         progress("designing", expected=expected) as display,
         watched(live, system, display) as show,
         stop_on_interrupt() as stop,
     ):
-        found = _shortest(task, show, executor, stop) if shortest else None
+        found = _shortest(task, show, workers, stop) if shortest else None
         if found is not None:
             result = found.design
         else:
             budget = design_budget(task, stop)
-            result = design_task(task, callback=show, executor=executor, budget=budget)
+            result = design_task(task, callback=show, executor=workers, budget=budget)
 
     # The files of the shortest experiment describe its horizon, not the stated one.
     if found is not None:

@@ -21,9 +21,9 @@ from mjfim.cli.common import (
     progress,
     say_written,
     verb,
-    worker_processes,
     writing,
 )
+from mjfim.cli.executors import worker_processes
 from mjfim.errors import ExperimentError
 from mjfim.output.picture_format import PictureFormat
 

@@ -300,3 +300,15 @@ def test_trials_that_diverge(
     assert any(diverged), "no trial diverged: this test has lost its object"
     assert capfd.readouterr() == ("", "")
     assert "MUJOCO_LOG.TXT" not in names(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [("cluster", "state local, local:N"), ("local:0", "not a number"), ("dask:no.json", "no file")],
+)
+def test_an_executor_that_cannot_be_had_is_misuse(
+    place: str, message: str, study: Path, tmp_path: Path
+) -> None:
+    result = run("design", study, "-o", tmp_path / "out", "--executor", place)
+    misused(result, message)
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,83 @@
+"""Executors that are stated in words: their forms, and what is said where one cannot be had."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from mjfim.errors import ExperimentError
+from mjfim.parallel import stated
+from mjfim.parallel.stated import StatedExecutor
+
+FACTORY = """
+from concurrent.futures import ThreadPoolExecutor
+
+
+def make():
+    return ThreadPoolExecutor(3)
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cluster", "has no known form; state local"),
+        ("dask", "states no scheduler"),
+        ("local:", "has no known form"),
+        ("local:0", "not a number of processes"),
+        ("local:many", "not a number of processes"),
+        ("python:cluster", "names no function"),
+        ("python:cluster.py:", "names no function"),
+    ],
+)
+def test_a_wrong_form_is_refused_with_the_right_ones(text: str, message: str) -> None:
+    with pytest.raises(ExperimentError, match=message):
+        StatedExecutor.parse(text)
+
+
+def test_local_processes_are_counted() -> None:
+    assert StatedExecutor.parse("local").processes is None
+    assert StatedExecutor.parse("local:3").processes == 3
+
+
+def test_an_executor_of_a_file_is_made_by_its_function(tmp_path: Path) -> None:
+    path = tmp_path / "cluster.py"
+    path.write_text(FACTORY, encoding="utf-8")
+    with StatedExecutor.parse(f"python:{path}:make").started() as workers:
+        assert workers.count == 3
+        assert workers.submit(len, "four").result() == 4
+
+    with pytest.raises(RuntimeError, match="shutdown"):
+        workers.submit(len, "ended")
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("python:not_there.py:make", "cannot be imported"),
+        ("python:no_such_module:make", "state the name of an installed module"),
+        ("python:json:make", "json has no function make"),
+        ("dask:not_there.json", "there is no file not_there.json; `dask scheduler"),
+    ],
+)
+def test_what_is_missing_is_named(place: str, message: str) -> None:
+    with pytest.raises(ExperimentError, match=message), StatedExecutor.parse(place).started():
+        pass
+
+
+def test_a_missing_dask_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    place = StatedExecutor.parse("dask://host:8786")
+    with pytest.raises(ExperimentError, match=r"pip install 'mjfim\[dask\]'"), place.started():
+        pass
+
+
+@pytest.mark.slow
+def test_an_address_at_which_nobody_answers_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(stated, "CONNECTION_SECONDS", 0.5)
+    place = StatedExecutor.parse("dask://127.0.0.1:9")
+    with pytest.raises(ExperimentError, match="no scheduler answers there"), place.started():
+        pass
