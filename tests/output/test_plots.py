@@ -263,7 +263,7 @@ def test_zero_parameter_has_no_relative_accuracy(tmp_path: Path) -> None:
     render(plots.std_bars(design, make_labels(2, 3)), tmp_path)
     estimate = dataclasses.replace(make_estimate(), initial_theta=np.array([0.0, 1.0, 2.0]))
     figure = plots.parameter_intervals(estimate, make_labels(2, 3))
-    assert "guess of 0" in all_text(figure)
+    assert "nominal value of 0" in all_text(figure)
     render(figure, tmp_path)
 
 

@@ -391,6 +391,14 @@ def test_fits_that_failed_or_scatter_too_much_put_a_study_in_doubt() -> None:
     failed = {**sets, "final": replace(sets["final"], failed=3)}
     assert "3 of 200 (designed)" in verdict_of(results.study(sets=failed)).text
 
+    # One interval of six may miss 1 by chance, and the verdict says so.
+    intervals = np.array([[1.01, 1.2], [0.9, 1.1], [0.9, 1.1]])
+    by_chance = replace(sets["final"], efficiency_interval=intervals)
+    inside = replace(sets["initial"], efficiency_interval=np.tile([0.9, 1.1], (3, 1)))
+    lucky = verdict_of(results.study(sets={"initial": inside, "final": by_chance}))
+    assert lucky.level is Level.GOOD
+    assert "1 of 6 intervals of 95 % misses it" in lucky.text
+
     wide = replace(sets["final"], efficiency_interval=np.tile([0.1, 0.2], (3, 1)))
     verdict = verdict_of(results.study(sets={**sets, "final": wide}))
     assert verdict.level is Level.DOUBTFUL

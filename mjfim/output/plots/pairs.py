@@ -27,6 +27,7 @@ from mjfim.output.plots.style import (
     shorten,
 )
 from mjfim.output.summaries.accuracy import BEST_CASE
+from mjfim.output.vocabulary import NOMINAL
 from mjfim.records.check import Check
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
@@ -168,7 +169,7 @@ def _draw(estimates: _Estimates, title: str, note: str) -> Figure:
     ]
     if shown.guess is not None and _guesses_in_range(shown):
         handles.append(
-            Line2D([], [], color=NOMINAL_COLOUR, marker="x", linestyle="", label="guess")
+            Line2D([], [], color=NOMINAL_COLOUR, marker="x", linestyle="", label=NOMINAL.word)
         )
     if count < len(estimates.names):
         note += (

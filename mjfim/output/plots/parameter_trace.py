@@ -21,6 +21,7 @@ from mjfim.output.plots.style import (
     own_style,
     panel_width,
 )
+from mjfim.output.vocabulary import NOMINAL
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
 
@@ -59,7 +60,7 @@ def parameter_trace(estimate: Estimate, labels: Labels) -> Figure:
         format_axes(axes, "iteration [–]" if k + columns >= len(shown) else "")
 
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=NOMINAL_COLOUR, label="guess"),
+        Line2D([], [], color=NOMINAL_COLOUR, label=NOMINAL.word),
         Line2D([], [], color=IDENTIFIED_COLOUR, marker="o", markersize=3, label="estimate so far"),
         Patch(color=IDENTIFIED_COLOUR, alpha=0.15, label="95 % interval of the result"),
     ]

@@ -426,5 +426,5 @@ def _interval_note(estimate: Estimate, *, guess_of_zero: bool) -> str:
     if not np.array_equal(np.abs(estimate.theta), estimate.sizes):
         note += " The difference of an entry of a vector or tensor is a share of the whole."
     if guess_of_zero:
-        note += " For a guess of 0 there is no relative difference: its row has numbers only."
+        note += " For a nominal value of 0 there is no relative difference, only numbers."
     return note

@@ -9,6 +9,7 @@ from matplotlib.lines import Line2D
 from scipy.stats import binom
 
 from mjfim.output.plots import style
+from mjfim.output.vocabulary import NOMINAL
 from mjfim.records.robustness import (
     CONFIDENCE,
     INTERVAL_HALF_WIDTH,
@@ -37,7 +38,7 @@ MAX_LEVEL_CHARACTERS = 48
 
 @style.own_style
 def robustness_figure(result: Robustness) -> Figure:
-    """Draw the margins of every limit, the errors, the coverage, and the errors of the guess.
+    """Draw the margins of every limit, the errors, the coverage, and the errors of the nominal values.
 
     Args:
         result: The study.
@@ -67,7 +68,7 @@ def robustness_figure(result: Robustness) -> Figure:
     note = (
         f"{place} errors over the formal σ (shaded: 95 % range; red: outside); robots whose 95 % "
         "interval holds the true value (dashed: required, shaded: expected); errors in percent of "
-        "the error of the guess."
+        "the error of the nominal value."
     )
     if not has_limits:
         note += " The experiment states no limits."
@@ -130,7 +131,7 @@ def _handles(*, has_limits: bool) -> list[Line2D]:
         label="robots, some exceed the limit",
     )
     planned = Line2D([], [], color=style.TEXT_COLOUR, linewidth=1.6, label="planned")
-    guess = Line2D([], [], color=style.NOMINAL_COLOUR, marker="o", linestyle="", label="guess")
+    guess = Line2D([], [], color=style.NOMINAL_COLOUR, marker="o", linestyle="", label=NOMINAL.word)
     estimates = Line2D(
         [], [], color=style.IDENTIFIED_COLOUR, marker="o", linestyle="", label="estimates"
     )
@@ -217,7 +218,7 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
 
 
 def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
-    """Draw the errors of the guess, the predicted and the observed errors of each unknown."""
+    """Draw the errors of the nominal values, the predicted and the observed errors of each unknown."""
     style.format_axes(axes, "", "error [%]")
     x = np.arange(len(result.names))
     guess = np.where(result.wrong > 0.0, result.wrong, np.nan)
@@ -260,5 +261,7 @@ def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
         many = len(names) > MAX_WRITTEN_NUMBERS
         axes.tick_params(axis="x", labelsize=MANY_NAMES_FONT if many else style.SMALL_FONT)
     axes.set_title(
-        "rms error and σ, over the error of the guess", fontsize=style.NORMAL_FONT, loc="left"
+        "rms error and σ, over the error of the nominal value",
+        fontsize=style.NORMAL_FONT,
+        loc="left",
     )

@@ -110,7 +110,7 @@ def _accuracy_plots(check: Check) -> Iterator[Part | PlotGroup]:
 
     keys = [
         Key(name=PREDICTED, role=INITIAL.word, shape="bar"),
-        Key(name=WANTED, role="text", shape="dot"),
+        Key(name=WANTED, role="text", shape="tick"),
     ]
     note = (
         "No bar: the parameter is not identifiable alone. Pairs with a correlation near ±1 are "

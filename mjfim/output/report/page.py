@@ -20,7 +20,7 @@ class Key:
     Attributes:
         name: Name of the curves, by which they are found.
         role: Role of their colour.
-        shape: "line", "dash", "dot", "bar" or "band".
+        shape: "line", "dash", "dot", "tick", "bar" or "band".
     """
 
     name: str

@@ -40,7 +40,7 @@ def describe_robustness(result: Robustness) -> Summary:
 
 
 def _unknown_table(result: Robustness) -> SummaryTable:
-    """Tabulate the errors of the guess, of the prediction and of the estimate by unknown."""
+    """Tabulate the errors of the nominal value, of the prediction and of the estimate by unknown."""
     rows = []
     for j, name in enumerate(result.names):
         errors = (result.wrong[j], result.predicted[j], result.formal[j], result.observed[j])
@@ -60,15 +60,15 @@ def _unknown_table(result: Robustness) -> SummaryTable:
 
     return SummaryTable(
         key="unknowns",
-        title=f"Accuracy of {result.runs} robots, each identified from the guess",
+        title=f"Accuracy of {result.runs} robots, each identified from the nominal values",
         columns=columns(
             "unknown",
-            "error of guess",
+            "error of nominal",
             "σ predicted",
             "σ formal",
             "rms error",
             f"in 95 % interval, of {result.runs}",
-            optional=["error of guess", "σ formal"],
+            optional=["error of nominal", "σ formal"],
         ),
         rows=tuple(rows),
     )

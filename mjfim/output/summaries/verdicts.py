@@ -349,19 +349,32 @@ def _(study: MonteCarloStudy) -> Verdict:
         )
         return Verdict(text=text, level=Level.DOUBTFUL)
 
+    agreement = "every efficiency agrees with 1"
+    missing = sum(_missing_one(trials) for trials in study.sets.values())
+    if missing:
+        count = sum(len(trials.efficiency_interval) for trials in study.sets.values())
+        agreement = (
+            f"the efficiencies agree with 1 ({missing} of {count} intervals of 95 % "
+            f"{'misses' if missing == 1 else 'miss'} it, as many as chance may cause)"
+        )
     return Verdict(
-        text="The estimates scatter as predicted: every efficiency agrees with 1, so the σ of the "
-        "design can be trusted if the model and the noise are right.",
+        text=f"The estimates scatter as predicted: {agreement}, so the σ of the design can be "
+        "trusted if the model and the noise are right.",
         level=Level.GOOD,
     )
 
 
+def _missing_one(trials: TrialStatistics) -> int:
+    """Count the 95 % intervals of efficiencies without 1."""
+    low, high = trials.efficiency_interval.T
+    return int(np.sum((low > 1.0) | (high < 1.0)))
+
+
 def _reaches_bound(trials: TrialStatistics) -> bool:
     """Whether the efficiencies agree with 1; a few of the 95 % intervals may miss it by chance."""
-    low, high = trials.efficiency_interval.T
-    misses = int(np.sum((low > 1.0) | (high < 1.0)))
-    allowed = int(np.ceil(0.05 * len(low))) if len(low) > 1 else 0
-    return misses <= allowed
+    count = len(trials.efficiency_interval)
+    allowed = int(np.ceil(0.05 * count)) if count > 1 else 0
+    return _missing_one(trials) <= allowed
 
 
 @next_steps.register
