@@ -38,7 +38,7 @@ MAX_LEVEL_CHARACTERS = 48
 
 @style.own_style
 def robustness_figure(result: Robustness) -> Figure:
-    """Draw the margins of every limit, the errors, the coverage, and the errors of the nominal values.
+    """Draw the margins of every limit, the errors, the coverage, and errors of the nominal values.
 
     Args:
         result: The study.
@@ -218,7 +218,7 @@ def _draw_coverage(axes: Axes, result: Robustness) -> None:
 
 
 def _draw_before_and_after(axes: Axes, result: Robustness) -> None:
-    """Draw the errors of the nominal values, the predicted and the observed errors of each unknown."""
+    """Draw nominal, predicted and observed errors of each unknown."""
     style.format_axes(axes, "", "error [%]")
     x = np.arange(len(result.names))
     guess = np.where(result.wrong > 0.0, result.wrong, np.nan)

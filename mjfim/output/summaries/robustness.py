@@ -40,7 +40,7 @@ def describe_robustness(result: Robustness) -> Summary:
 
 
 def _unknown_table(result: Robustness) -> SummaryTable:
-    """Tabulate the errors of the nominal value, of the prediction and of the estimate by unknown."""
+    """Tabulate nominal, predicted and observed errors by unknown."""
     rows = []
     for j, name in enumerate(result.names):
         errors = (result.wrong[j], result.predicted[j], result.formal[j], result.observed[j])
