@@ -19,6 +19,7 @@ BENCHMARKS = {
     "casadi_limits": "what do CasADi's solvers find under hard limits?",
     "arms": "which experiments do the robot arms get, and do their designs keep the limits?",
     "arms_table": "is the design of two arms better than Fourier series in equal time?",
+    "mjx_oracle": "do the derivatives agree with those of MJX by automatic differentiation?",
     "prove_identification": "do the 95 % intervals hold the true values?",
 }
 
