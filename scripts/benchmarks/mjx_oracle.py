@@ -282,7 +282,7 @@ def _directional(function: Any) -> Any:
     """Return the function of (N, n) points and two directions that gives f, Df[a] and D²f[a, b]."""
 
     def at(z: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
-        def along_a(z: Any) -> tuple[Any, Any]:
+        def along_a(z: Any) -> Any:
             return jax.jvp(function, (z,), (a,))
 
         (value, first), (_, second) = jax.jvp(along_a, (z,), (b,))
