@@ -36,9 +36,6 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 
-# Options of the compiler of JAX with which it takes half of the time.
-QUICKLY_COMPILED = {"xla_backend_optimization_level": 0}
-
 MODELS = Path(__file__).resolve().parents[2] / "models"
 
 
@@ -253,9 +250,7 @@ def oracle(case: Case, task: DesignTask, w: Array) -> Derivatives:
 
     with jax.enable_x64(True):
         # One compiled function for all derivatives: MJX takes long to compile, and no time to run.
-        directional = jax.jit(
-            _directional(_sample_map(case, task)), compiler_options=QUICKLY_COMPILED
-        )
+        directional = jax.jit(_directional(_sample_map(case, task)))
 
         # First derivatives, and from them psi by its recursion.
         no_direction = np.zeros_like(points)

@@ -1,0 +1,434 @@
+"""Scale-out: the verbs on a Dask cluster of this computer, and their scheduler on a simulated one.
+
+    python -m scripts.benchmarks scale                     # small work, some minutes
+    python -m scripts.benchmarks scale --full              # 64 starts, 1e5 trials, 500 recordings
+    python -m scripts.benchmarks scale --only kill --kills 10
+
+Needs the extra `dask`. The parts, each of which can be chosen by `--only`:
+
+    equal      J, theta and covariances on the cluster and in one process, to the last digit
+    cpu        CPU seconds of cluster and caller over those of the same work in one process, and the
+               largest memory of a worker
+    kill       SIGKILL of a worker at random moments: the same result
+    interrupt  SIGINT at random moments: seconds until there is a result
+    folder     workers in an empty folder, after the files of the experiment were deleted
+    scaling    seconds with one worker over seconds with two
+    simulate   efficiency of a design from many starts on 1 to 256 simulated workers
+
+In `cpu`, the work of one process is what the cluster does without any overhead: what is above 1 is
+the price of sending, waiting and resolving the experiment more than once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import logging
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+import mjfim
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
+from scripts.benchmarks.benchmark_hour import EXPERIMENT as TWO_JOINTS
+from scripts.benchmarks.benchmark_hour import played
+from scripts.benchmarks.simulated_design import efficiencies, save_curve
+
+MODELS = Path(__file__).resolve().parents[2] / "models"
+
+PARTS = ("equal", "cpu", "kill", "interrupt", "folder", "scaling", "simulate")
+
+# What is wanted: CPU seconds of the cluster over those of one process, memory of a worker [MiB],
+# seconds from SIGINT to a result, and speed of two workers over that of one.
+MOST_CPU, MOST_MEMORY, MOST_SECONDS, LEAST_SPEED = 1.15, 1024.0, 10.0, 1.85
+
+# Efficiency that is wanted at this number of simulated workers.
+LEAST_EFFICIENCY, MOST_WORKERS = 0.8, 256
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """How much work the verbs have.
+
+    Attributes:
+        starts: Initial controls of the design.
+        iterations: Largest number of its iterations.
+        trials: Trials of the Monte-Carlo study.
+        recordings: Recordings of the fit.
+        seconds: Duration of each of them [s].
+    """
+
+    starts: int
+    iterations: int
+    trials: int
+    recordings: int
+    seconds: float
+
+    @property
+    def gigabytes(self) -> float:
+        """Size of the recordings as CSV, at 1 kHz, 7 columns and 17 characters each [GB]."""
+        return self.recordings * self.seconds * 1000.0 * 7 * 17 * 1e-9
+
+
+QUICK = Sizes(starts=8, iterations=12, trials=2000, recordings=6, seconds=4.0)
+FULL = Sizes(starts=64, iterations=60, trials=100_000, recordings=500, seconds=8.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verb:
+    """A verb with its work.
+
+    Attributes:
+        name: Its name.
+        run: Does the work on an executor, or in this process for None.
+        fingerprint: Numbers of a result that have to be equal to the last digit.
+    """
+
+    name: str
+    run: Callable[[Any], Any]
+    fingerprint: Callable[[Any], bytes]
+
+
+def verbs(sizes: Sizes, folder: Path = MODELS) -> list[Verb]:
+    """List the verbs that take an executor.
+
+    Args:
+        sizes: How much work they have.
+        folder: Folder of the experiments.
+    """
+    limited = mjfim.Experiment.from_file(folder / "cart_pendulum_limits.toml")
+    descent = {"starts": sizes.starts, "max_iterations": sizes.iterations, "seconds": 36_000}
+    limited = limited.replace(descent=descent).packed()
+    cart = mjfim.Experiment.from_file(folder / "cart_pendulum.toml").packed()
+    trajectory = DesignTask.resolve(cart, threads=1).initial
+
+    arm = mjfim.Experiment.from_file(folder / TWO_JOINTS.name).packed()
+    system = System.resolve(arm, threads=1)
+    recordings = [
+        replace(played(system, sizes.seconds, seed), name=f"log {seed}")
+        for seed in range(sizes.recordings)
+    ]
+
+    def options(executor: Any) -> dict[str, Any]:
+        return {"executor": executor, "threads": 1, "progress": False}
+
+    def design(executor: Any) -> Any:
+        return mjfim.design(limited, **options(executor))
+
+    def montecarlo(executor: Any) -> Any:
+        return mjfim.monte_carlo(cart, trajectory, trials=sizes.trials, **options(executor))
+
+    def identify(executor: Any) -> Any:
+        return mjfim.identify(arm, recordings, **options(executor))
+
+    found = (
+        (mjfim.design, Verb(name="design", run=design, fingerprint=_of_design)),
+        (mjfim.monte_carlo, Verb(name="montecarlo", run=montecarlo, fingerprint=_of_study)),
+        (mjfim.identify, Verb(name="identify", run=identify, fingerprint=_of_estimate)),
+    )
+    for function, verb in found:
+        if "executor" not in inspect.signature(function).parameters:
+            print(f"{verb.name}: left out, it takes no executor")
+    return [verb for f, verb in found if "executor" in inspect.signature(f).parameters]
+
+
+def _of_design(design: Any) -> bytes:
+    """Return J and the control."""
+    return np.float64(design.final.cost).tobytes() + bytes(design.final.trajectory.ctrl.tobytes())
+
+
+def _of_study(study: Any) -> bytes:
+    """Return the covariances of all trajectories."""
+    return b"".join(found.covariance.tobytes() for found in study.sets.values())
+
+
+def _of_estimate(estimate: Any) -> bytes:
+    """Return theta and its covariance."""
+    return bytes(estimate.theta.tobytes() + estimate.covariance.tobytes())
+
+
+# ---- the cluster
+
+
+@contextmanager
+def cluster(workers: int) -> Iterator[Any]:
+    """Start a Dask cluster on this computer, with one process per worker.
+
+    Args:
+        workers: Number of workers, of one thread and 1 GiB each.
+
+    Yields:
+        A client of the cluster.
+    """
+    from distributed import Client, LocalCluster
+
+    # The workers import the benchmarks as this process does.
+    root = str(Path(__file__).resolve().parents[2])
+    os.environ["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit="1GiB",
+            dashboard_address=None,
+            local_directory=folder,
+            silence_logs=logging.CRITICAL,
+        ) as made,
+        Client(made, set_as_default=False) as client,
+    ):
+        client.wait_for_workers(workers)
+        client.run(_import)
+        yield client
+
+
+def _import() -> None:
+    """Import in a worker what the first task would import."""
+    import mjfim.cli.design
+    import mjfim.excitation.design  # noqa: F401
+
+
+def cpu_seconds() -> float:
+    """CPU time of this process and of all that it has started and that are alive [s]."""
+    own = psutil.Process()
+    total = 0.0
+    for process in [own, *own.children(recursive=True)]:
+        try:
+            times = process.cpu_times()
+        except psutil.NoSuchProcess:
+            continue
+        total += times.user + times.system
+    return total
+
+
+def peak_memory() -> float:
+    """Largest memory of this process so far [MiB]."""
+    import resource
+
+    kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return kilobytes / (1024.0**2 if sys.platform == "darwin" else 1024.0)
+
+
+# ---- the parts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """What a verb does in one process.
+
+    Attributes:
+        fingerprint: Numbers of its result.
+        cpu: CPU time [s].
+    """
+
+    fingerprint: bytes
+    cpu: float
+
+
+def serial(verb: Verb) -> Reference:
+    """Do the work of a verb in this process."""
+    begun = time.process_time()
+    result = verb.run(None)
+    return Reference(fingerprint=verb.fingerprint(result), cpu=time.process_time() - begun)
+
+
+def on_cluster(verb: Verb, reference: Reference, workers: int) -> bool:
+    """Compare a verb on the cluster with one process: numbers, CPU time and memory."""
+    with cluster(workers) as client:
+        begun, clock = cpu_seconds(), time.perf_counter()
+        result = verb.run(client)
+        used, seconds = cpu_seconds() - begun, time.perf_counter() - clock
+        memory = max(client.run(peak_memory).values())
+
+    is_equal = verb.fingerprint(result) == reference.fingerprint
+    ratio = used / reference.cpu
+    print(
+        f"{verb.name:11s} equal to the last digit: {'yes' if is_equal else 'NO':3s}  "
+        f"{used:8.1f} CPU s over {reference.cpu:8.1f} s = {ratio:.3f} (at most {MOST_CPU})  "
+        f"{memory:5.0f} MiB (at most {MOST_MEMORY:.0f})  {seconds:.1f} s on {workers} workers"
+    )
+    return is_equal and ratio <= MOST_CPU and memory <= MOST_MEMORY
+
+
+def killed(verb: Verb, reference: Reference, workers: int, kills: int, seed: int) -> bool:
+    """End a worker at random moments of a verb; the result has to be the same."""
+    rng = np.random.default_rng(seed)
+    duration = _duration(verb, workers)
+    same = 0
+    for _ in range(kills):
+        with cluster(workers) as client:
+            victims = sorted(client.run(os.getpid).values())
+            victim = int(rng.choice(victims))
+            timer = threading.Timer(rng.uniform(0.0, duration), _kill, [victim])
+            timer.daemon = True
+            timer.start()
+            same += verb.fingerprint(verb.run(client)) == reference.fingerprint
+            timer.cancel()
+
+    print(f"{verb.name:11s} the same result after SIGKILL of a worker: {same} of {kills}")
+    return same == kills
+
+
+def interrupted(verb: Verb, workers: int, times: int, seed: int) -> bool:
+    """Press Ctrl-C at random moments of a verb; there has to be a result within seconds."""
+    rng = np.random.default_rng(seed)
+    duration = _duration(verb, workers)
+    waits, without = [], 0
+    for _ in range(times):
+        with cluster(workers) as client:
+            pressed: list[float] = []
+
+            def press(pressed: list[float] = pressed) -> None:
+                pressed.append(time.perf_counter())
+                os.kill(os.getpid(), signal.SIGINT)
+
+            timer = threading.Timer(rng.uniform(0.1, 0.9) * duration, press)
+            timer.daemon = True
+            timer.start()
+            try:
+                without += verb.run(client) is None
+            except KeyboardInterrupt:
+                without += 1  # nothing was ready, or the verb had ended just before
+            waits += [time.perf_counter() - moment for moment in pressed]
+            timer.cancel()
+
+    longest = max(waits, default=0.0)
+    print(
+        f"{verb.name:11s} after Ctrl-C: {times - without} of {times} results, the last one after "
+        f"{longest:.1f} s (at most {MOST_SECONDS:.0f})"
+    )
+    return without == 0 and longest <= MOST_SECONDS
+
+
+def in_empty_folder(sizes: Sizes, references: dict[str, Reference], workers: int) -> bool:
+    """Do the work in workers without any file: the experiments are deleted meanwhile."""
+    with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as empty:
+        copies = Path(name) / "models"
+        shutil.copytree(MODELS, copies)
+        chosen = verbs(sizes, copies)
+        shutil.rmtree(copies)
+
+        good = True
+        with cluster(workers) as client:
+            client.run(os.chdir, empty)
+            for verb in chosen:
+                is_equal = verb.fingerprint(verb.run(client)) == references[verb.name].fingerprint
+                is_empty = not any(Path(empty).iterdir())
+                good &= is_equal and is_empty
+                print(
+                    f"{verb.name:11s} without files in the workers: "
+                    f"{'the same result' if is_equal else 'ANOTHER RESULT'}, "
+                    f"{'nothing' if is_empty else 'SOMETHING'} written"
+                )
+            client.run(os.chdir, name)
+    return good
+
+
+def scaling(verb: Verb) -> bool:
+    """Compare the time on one worker with that on two."""
+    seconds = {}
+    for workers in (1, 2):
+        with cluster(workers) as client:
+            clock = time.perf_counter()
+            verb.run(client)
+            seconds[workers] = time.perf_counter() - clock
+    speed = seconds[1] / seconds[2]
+    print(f"{verb.name:11s} {speed:.2f} times faster on two workers (at least {LEAST_SPEED})")
+    return speed >= LEAST_SPEED
+
+
+def simulation(sizes: Sizes, measured: int, starts: int, picture: Path) -> bool:
+    """Schedule a design from many starts on simulated workers, and draw the efficiency."""
+    descent = {"starts": measured, "max_iterations": sizes.iterations, "seconds": 36_000}
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum_limits.toml")
+    rows = efficiencies(experiment.replace(descent=descent), starts, MOST_WORKERS)
+
+    print(f"a design from {starts} starts, lengths of {measured} of them measured:")
+    print("workers  seconds  efficiency  of the searches alone")
+    for row in rows:
+        print(f"{row.workers:7d} {row.seconds:8.1f} {row.efficiency:11.3f} {row.of_searches:22.3f}")
+    save_curve(rows, LEAST_EFFICIENCY, picture)
+    print(f"the curve is in {picture}")
+    return rows[-1].efficiency >= LEAST_EFFICIENCY
+
+
+def _duration(verb: Verb, workers: int) -> float:
+    """Time that a verb takes on the cluster [s]."""
+    with cluster(workers) as client:
+        clock = time.perf_counter()
+        verb.run(client)
+        return time.perf_counter() - clock
+
+
+def _kill(pid: int) -> None:
+    """End a process at once; it may have ended already."""
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except ProcessLookupError:
+        return
+
+
+def run(options: argparse.Namespace) -> bool:
+    """Run the chosen parts; return whether all figures are as wanted."""
+    sizes = FULL if options.full else QUICK
+    given = {key: getattr(options, key) for key in vars(sizes) if getattr(options, key)}
+    sizes = replace(sizes, **given)
+    parts: Sequence[str] = options.only or PARTS
+
+    good = True
+    if set(parts) - {"simulate"}:
+        print(f"{sizes}: {sizes.gigabytes:.2f} GB of recordings")
+        chosen = [verb for verb in verbs(sizes) if verb.name in (options.verb or verb.name)]
+        references = {verb.name: serial(verb) for verb in chosen}
+        for verb in chosen:
+            reference = references[verb.name]
+            if {"equal", "cpu"} & set(parts):
+                good &= on_cluster(verb, reference, options.workers)
+            if "kill" in parts:
+                good &= killed(verb, reference, options.workers, options.kills, options.seed)
+            if "interrupt" in parts:
+                good &= interrupted(verb, options.workers, options.kills, options.seed)
+            if "scaling" in parts:
+                good &= scaling(verb)
+        if "folder" in parts:
+            good &= in_empty_folder(sizes, references, options.workers)
+
+    if "simulate" in parts:
+        measured = 64 if options.full else 4
+        good &= simulation(sizes, measured, options.simulated_starts, options.picture)
+    return good
+
+
+def main() -> int:
+    """Run the benchmark; return 1 where a figure is not as wanted."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--full", action="store_true", help="the work of a large study")
+    parser.add_argument("--only", nargs="+", choices=PARTS, help="parts; default: all")
+    parser.add_argument("--verb", nargs="+", help="verbs; default: all that take an executor")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--kills", type=int, default=2, help="random moments per verb")
+    parser.add_argument("--seed", type=int, default=0, help="of the random moments")
+    for name, value in vars(QUICK).items():
+        parser.add_argument(f"--{name}", type=type(value), help=f"default: {value}")
+    parser.add_argument("--simulated-starts", type=int, default=1024)
+    parser.add_argument("--picture", type=Path, default=Path("out/scale.png"))
+    return 0 if run(parser.parse_args()) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,157 @@
+"""Efficiency of a design from many starts on simulated clusters of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import mjfim
+from mjfim.excitation import design as design_module
+from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
+from mjfim.excitation.task import DesignTask
+from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
+
+# Time that a task needs to reach a worker of a cluster, and its result to return [s].
+LATENCY = 5e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Efficiency:
+    """A design on a simulated cluster.
+
+    Attributes:
+        workers: Number of workers.
+        seconds: Simulated time of the whole design [s].
+        efficiency: Seconds of the same design on one worker, over workers times `seconds`.
+        of_searches: The same from the first task to the last one, without what the caller does
+            before and after them.
+    """
+
+    workers: int
+    seconds: float
+    efficiency: float
+    of_searches: float
+
+
+def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> list[Efficiency]:
+    """Schedule a design from many starts on 1, 2, 4 and more workers.
+
+    The searches from the initial controls that the experiment states are carried out once. Every
+    further start takes as long as one of them, and finds the same.
+
+    Args:
+        experiment: Experiment under hard limits; its number of starts is that of the searches that
+            are carried out.
+        starts: Number of starts that are scheduled.
+        most: Largest number of workers.
+    """
+    task = DesignTask.resolve(experiment, threads=1)
+    tasks = _MeasuredSearches()
+
+    # All tasks are carried out in a run that does not count.
+    _simulated_seconds(task, tasks, starts, 1)
+
+    workers = [2**k for k in range(most.bit_length())]
+    rows: list[Efficiency] = []
+    alone = _simulated_seconds(task, tasks, starts, 1)
+    for number in workers:
+        found = alone if number == 1 else _simulated_seconds(task, tasks, starts, number)
+        rows.append(
+            Efficiency(
+                workers=number,
+                seconds=found.whole,
+                efficiency=alone.whole / (number * found.whole),
+                of_searches=found.busy / (number * found.searches),
+            )
+        )
+    return rows
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Times:
+    """Simulated times of a design [s]: whole, from the first to the last task, and of all tasks."""
+
+    whole: float
+    searches: float
+    busy: float
+
+
+def _simulated_seconds(task: DesignTask, tasks: MeasuredTasks, starts: int, workers: int) -> _Times:
+    """Design on a simulated cluster."""
+
+    def many(*args: Any, **kwargs: Any) -> list[InitialControl]:
+        """The stated initial controls again and again, under other names."""
+        found = list(initial_controls_of(*args, **kwargs))
+        return [replace(found[i % len(found)], name=_copy_name(found, i)) for i in range(starts)]
+
+    with (
+        patch.object(design_module, "initial_controls_of", many),
+        simulated(workers, tasks, LATENCY) as cluster,
+    ):
+        design_module.design_task(task, executor=cluster.workers)
+    return _Times(whole=cluster.now, searches=cluster.searching, busy=cluster.busy)
+
+
+def _copy_name(found: Sequence[InitialControl], i: int) -> str:
+    """Name of a copy of a start; the first ones keep theirs."""
+    name = str(found[i % len(found)].name)
+    return name if i < len(found) else f"{name}{COPY}{i // len(found)}"
+
+
+# What stands between the name of a start and the number of its copy.
+COPY = ", copy "
+
+
+class _MeasuredSearches(MeasuredTasks):
+    """Searches, or slices of searches, of which copies take as long and find the same."""
+
+    def __init__(self) -> None:
+        super().__init__(key_of=_key)
+
+    def done(self, fn: Any, args: tuple[Any, ...]) -> tuple[Any, float]:
+        """Result of a search under the name of its start, and its CPU time [s]."""
+        found, seconds = super().done(fn, args)
+        name = _search(args).start.name
+        if hasattr(found, "result"):  # of a slice
+            return replace(found, result=replace(found.result, name=name)), seconds
+        return replace(found, name=name), seconds
+
+
+def _search(args: tuple[Any, ...]) -> Any:
+    """Return the search of an order, which may be that of a slice."""
+    return getattr(args[0], "search", args[0])
+
+
+def _key(args: tuple[Any, ...]) -> Hashable:
+    """Return what tells a search or a slice from others, apart from copies of its start."""
+    search, before = _search(args), getattr(args[0], "before", None)
+    done = 0 if before is None else len(before.result.history)
+    schedule = search.schedule
+    name = search.start.name.partition(COPY)[0]
+    return name, schedule.first, schedule.last, tuple(search.tightening.items()), done
+
+
+def save_curve(rows: Sequence[Efficiency], wanted: float, path: Path) -> None:
+    """Draw the efficiency over the number of workers.
+
+    Args:
+        rows: The efficiencies.
+        wanted: Efficiency that is wanted.
+        path: PNG to write.
+    """
+    import matplotlib.pyplot as plt
+
+    workers = [row.workers for row in rows]
+    figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
+    axes.semilogx(workers, [row.efficiency for row in rows], "o-", base=2, label="whole design")
+    axes.semilogx(workers, [row.of_searches for row in rows], "s--", base=2, label="searches alone")
+    axes.axhline(wanted, color="0.5", lw=1.0, label=f"wanted: {wanted:g}")
+    axes.set(xlabel="simulated workers", ylabel="efficiency", ylim=(0.0, 1.05))
+    axes.set_xticks(workers, [str(number) for number in workers])
+    axes.legend()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
