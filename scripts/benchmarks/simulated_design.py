@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -82,10 +82,11 @@ class _Times:
 def _simulated_seconds(task: DesignTask, tasks: MeasuredTasks, starts: int, workers: int) -> _Times:
     """Design on a simulated cluster."""
 
-    def many(*args: Any, **kwargs: Any) -> list[InitialControl]:
+    def many(*args: Any, **kwargs: Any) -> Iterator[InitialControl]:
         """The stated initial controls again and again, under other names."""
         found = list(initial_controls_of(*args, **kwargs))
-        return [replace(found[i % len(found)], name=_copy_name(found, i)) for i in range(starts)]
+        names = (_copy_name(found, i) for i in range(starts))
+        return (replace(found[i % len(found)], name=name) for i, name in enumerate(names))
 
     with (
         patch.object(design_module, "initial_controls_of", many),
