@@ -26,6 +26,7 @@ from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.verification import verify
+from mjfim.experiment.packing import for_workers
 from mjfim.parallel import Workers, results_or_here
 from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
@@ -549,6 +550,9 @@ class Multistart:
     def _run_in_workers(self, searches: Sequence[ConstrainedSearch], executor: Executor) -> Runs:
         """Run searches side by side; the iterates of each are reported when it has ended."""
         results: list[RunResult] = []
+        system = self.fine.task.system
+        packed = for_workers(system.experiment, system.source)
+        searches = [replace(search, experiment=packed) for search in searches]
 
         def here(search: ConstrainedSearch) -> RunResult:
             """Run a search whose process was ended from outside."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,6 +30,32 @@ def packed(experiment: Experiment) -> Experiment:
             raise ModelError(f"{model}: no such model file")
         needed += files_of_model(model)
     return experiment.model_copy(update={"files": PackedFiles.read(needed, before)})
+
+
+def for_workers(
+    experiment: Experiment, source: ModelSource, further: Iterable[Path] = ()
+) -> Experiment:
+    """Make a packed copy for orders, of which each worker process receives the files once.
+
+    Args:
+        experiment: The experiment.
+        source: Its model, whose files are read once.
+        further: Further files that the orders need; `opened` gives them by their paths.
+
+    Returns:
+        The copy, which is pickled with the hash of its files. It is for `parallel.carry_out` only.
+
+    Raises:
+        ExperimentError: A file cannot be read.
+    """
+    before = experiment.files or PackedFiles.of({})
+    kept = {Path(name): content for name, content in before.contents.items()}
+    if before.content(source.path) is None:
+        kept.update(source.contents)
+
+    tables = [experiment.directory / name for name in tables_of(experiment)]
+    files = PackedFiles.read([*kept, *tables, *further], PackedFiles.of(kept))
+    return experiment.model_copy(update={"files": files.shared()})
 
 
 def tables_of(experiment: Experiment) -> tuple[str, ...]:
@@ -60,12 +86,12 @@ def model_of(experiment: Experiment) -> ModelSource:
 
 
 @contextmanager
-def opened(experiment: Experiment, name: str) -> Iterator[Path]:
-    """Give a file that an experiment states, other than its model.
+def opened(experiment: Experiment, name: str | Path) -> Iterator[Path]:
+    """Give a file of an experiment, other than its model.
 
     Args:
         experiment: The experiment.
-        name: Path as the experiment states it.
+        name: Path as the experiment states it, or an absolute path.
 
     Yields:
         The file on the disk. That of a packed experiment exists inside the block only.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field, SkipValidation, ValidationError
+from pydantic import Field, InstanceOf, ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
 from mjfim.arrays import Array
@@ -125,7 +125,7 @@ class Experiment(Section):
         exclude=True,
         description="Name of the experiment in messages, the path of its file.",
     )
-    files: SkipJsonSchema[SkipValidation[PackedFiles | None]] = Field(
+    files: SkipJsonSchema[InstanceOf[PackedFiles] | None] = Field(
         default=None,
         exclude=True,
         description="Files of a packed experiment, which are not read from the disk any more.",

@@ -15,6 +15,7 @@ from mjfim.errors import ModelError
 from mjfim.model.coordinates import ModelCoordinates
 from mjfim.model.expanded_size import check_expanded_size
 from mjfim.model.finite_numbers import check_compiled_numbers, check_file_numbers
+from mjfim.model.model_files import files_of_model
 from mjfim.model.mujoco_log import collected_warnings, tell_once
 
 
@@ -166,6 +167,11 @@ class ModelSource:
     def _loaded(path: Path, files: Any) -> Any:
         """The parsed model from the disk, or from a virtual file system."""
         return load_spec(path) if files is None else load_packed_spec(path, files)
+
+    @cached_property
+    def contents(self) -> dict[Path, bytes]:
+        """Bytes of the model's files by their paths, for processes that do not have them."""
+        return {file: file.read_bytes() for file in files_of_model(self.path)}
 
     @cached_property
     def coordinates(self) -> ModelCoordinates:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mjfim.errors import ExperimentError
+from mjfim.parallel.shared_value import SharedValue
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,11 +18,12 @@ class PackedFiles:
 
     Attributes:
         digest: Hash of all paths and contents; equal for equal files only.
-        contents: Bytes of each file by its path, with slashes.
+        held: Bytes of each file by its path, with slashes; or a reference to them, under which they
+            are pickled as their hash.
     """
 
     digest: str
-    contents: Mapping[str, bytes] = field(repr=False, compare=False)
+    held: Mapping[str, bytes] | SharedValue[Mapping[str, bytes]] = field(repr=False, compare=False)
 
     @classmethod
     def of(cls, contents: Mapping[Path, bytes]) -> PackedFiles:
@@ -39,7 +41,7 @@ class PackedFiles:
             for part in (name.encode(), content):
                 hashed.update(len(part).to_bytes(8, "big"))
                 hashed.update(part)
-        return cls(digest=hashed.hexdigest(), contents=ordered)
+        return cls(digest=hashed.hexdigest(), held=ordered)
 
     @classmethod
     def read(cls, paths: Iterable[Path], packed: PackedFiles) -> PackedFiles:
@@ -57,6 +59,21 @@ class PackedFiles:
             kept = packed.content(path)
             contents[path] = _read(path) if kept is None else kept
         return cls.of(contents)
+
+    @property
+    def contents(self) -> Mapping[str, bytes]:
+        """Bytes of each file by its path, with slashes.
+
+        Raises:
+            AbsentValueError: This process has received the hash only.
+        """
+        return self.held.value if isinstance(self.held, SharedValue) else self.held
+
+    def shared(self) -> PackedFiles:
+        """Return these files for tasks, each of which is sent with their hash alone."""
+        if isinstance(self.held, SharedValue):
+            return self
+        return PackedFiles(digest=self.digest, held=SharedValue(self.digest, self.held))
 
     def content(self, path: Path) -> bytes | None:
         """Return the bytes of a file; None if it is not among the packed files."""

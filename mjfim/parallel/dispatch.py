@@ -6,14 +6,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.interruption import hurried
 from mjfim.parallel.losses import is_loss, is_refused_by_pickle, is_shared_loss
+from mjfim.parallel.shared_value import AbsentValueError, owned_value, run_with_values
 from mjfim.parallel.workers import Workers
 
 T = TypeVar("T")
@@ -76,12 +77,14 @@ class _Work(Generic[Order]):
         losses: How often its worker was lost.
         needs_isolation: True where it may be the cause of the losses, and where others are lost
             together with it.
+        values: Shared values that a worker did not have, by their hash.
     """
 
     index: int
     order: Order
     losses: int = 0
     needs_isolation: bool = False
+    values: dict[str, Any] = field(default_factory=dict)
 
 
 class Dispatch(Generic[Order, T]):
@@ -170,13 +173,19 @@ class Dispatch(Generic[Order, T]):
     def _submit(self, work: _Work[Order]) -> None:
         """Submit an order; in an executor whose processes have ended, it is lost at once."""
         try:
-            future = self._workers.submit(self._function, work.order)
+            future = self._submitted(work)
         except BrokenExecutor as error:
             future = Future()
             future.set_exception(error)
 
         self._running[future] = work
         future.add_done_callback(self._ended.put)
+
+    def _submitted(self, work: _Work[Order]) -> Future[T]:
+        """Submit an order, together with the values that a worker did not have."""
+        if not work.values:
+            return self._workers.submit(self._function, work.order)
+        return self._workers.submit(run_with_values, work.values, self._function, work.order)
 
     def _next_outcome(self) -> Outcome[T] | None:
         """Wait for a task for a while; None where none has ended, or where it is done again."""
@@ -189,10 +198,15 @@ class Dispatch(Generic[Order, T]):
         work = self._running.pop(future, None)
         if work is None:
             return None
-        if not _is_lost(future):
-            return Outcome(index=work.index, found=(_result_of(future),))
+        if _is_lost(future):
+            return self._done_again(work, is_shared=_is_shared(future))
 
-        return self._done_again(work, is_shared=_is_shared(future))
+        error = future.exception()
+        if isinstance(error, AbsentValueError) and error.digest not in work.values:
+            work.values[error.digest] = owned_value(error.digest)
+            self._waiting.appendleft(work)
+            return None
+        return Outcome(index=work.index, found=(_result_of(future),))
 
     def _done_again(self, work: _Work[Order], *, is_shared: bool) -> Outcome[T] | None:
         """Put an order that was lost among the waiting ones, or report it after the last loss."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor
 from typing import Any
@@ -50,7 +49,7 @@ def is_refused_by_pickle(error: BaseException | None) -> bool:
     Args:
         error: Error of the task; None where it has none.
     """
-    if isinstance(error, pickle.PicklingError):
+    if type(error).__name__ == "PicklingError":
         return True
 
     is_candidate = isinstance(error, AttributeError | TypeError)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import shutil
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import mjfim
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
@@ -167,6 +169,26 @@ def test_the_packed_cart_pendulum_has_the_same_cost() -> None:
     experiment = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=1.0)
 
     assert cost_of(sent(experiment)) == cost_of(experiment)
+
+
+@pytest.mark.slow
+def test_a_design_runs_in_a_process_without_any_file_of_the_caller(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "caller").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "caller")
+
+    # The paths are relative, so that a process in another folder does not find the files.
+    tables = {"limits": {"position": {"turn": [-2.0, 2.0]}}, "descent": {"max_iterations": 3}}
+    experiment = stated(Path("study")).replace(**tables)
+    alone = mjfim.design(experiment, threads=1)
+    with mjfim.Pool(1) as pool:
+        pool.submit(os.chdir, tmp_path / "elsewhere").result()
+        elsewhere = mjfim.design(experiment, threads=1, executor=pool)
+
+    assert elsewhere.final.cost == alone.final.cost
+    assert np.array_equal(elsewhere.trajectory.ctrl, alone.trajectory.ctrl)
 
 
 @pytest.mark.slow
