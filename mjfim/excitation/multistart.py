@@ -550,8 +550,8 @@ class Multistart:
     def _run_in_workers(self, searches: Sequence[ConstrainedSearch], executor: Executor) -> Runs:
         """Run searches side by side; the iterates of each are reported when it has ended."""
         results: list[RunResult] = []
-        system = self.fine.task.system
-        packed = for_workers(system.experiment, system.source)
+        source = self.fine.task.system.source
+        packed = for_workers(searches[0].experiment, source)
         searches = [replace(search, experiment=packed) for search in searches]
 
         def here(search: ConstrainedSearch) -> RunResult:

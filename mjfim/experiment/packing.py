@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from mjfim.errors import ModelError
@@ -40,7 +40,7 @@ def for_workers(
     Args:
         experiment: The experiment.
         source: Its model, whose files are read once.
-        further: Further files that the orders need; `opened` gives them by their paths.
+        further: Further files that the orders need; `opened_file` gives them by their paths.
 
     Returns:
         The copy, which is pickled with the hash of its files. It is for `parallel.carry_out` only.
@@ -85,18 +85,30 @@ def model_of(experiment: Experiment) -> ModelSource:
     return packed_model(experiment.files, path)
 
 
-@contextmanager
-def opened(experiment: Experiment, name: str | Path) -> Iterator[Path]:
-    """Give a file of an experiment, other than its model.
+def opened(experiment: Experiment, name: str) -> AbstractContextManager[Path]:
+    """Give a file that an experiment states, other than its model.
 
     Args:
         experiment: The experiment.
-        name: Path as the experiment states it, or an absolute path.
+        name: Path as the experiment states it.
+
+    Returns:
+        See `opened_file`.
+    """
+    return opened_file(experiment, experiment.directory / name)
+
+
+@contextmanager
+def opened_file(experiment: Experiment, path: Path) -> Iterator[Path]:
+    """Give a file that may be packed in an experiment.
+
+    Args:
+        experiment: The experiment.
+        path: The file.
 
     Yields:
         The file on the disk. That of a packed experiment exists inside the block only.
     """
-    path = experiment.directory / name
     content = None if experiment.files is None else experiment.files.content(path)
     if content is None:
         yield path

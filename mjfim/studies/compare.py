@@ -26,7 +26,9 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
+from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
 from mjfim.parallel import Workers, results_or_here
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
@@ -269,7 +271,7 @@ class _MethodRun:
                 self.search, lambda used, best: self.report(used, best.cost), self.stop
             )
         else:
-            result = self.divided_baseline(self.executor)
+            result = self.divided_baseline(self.executor, evaluation.task.system)
 
         # An interrupted search is compared by its best control so far.
         interrupted = self.stop.requested
@@ -278,17 +280,24 @@ class _MethodRun:
         note = INTERRUPTED_NOTE if interrupted else ""
         return evaluation.result(self.search.method, self.title, result, note)
 
-    def divided_baseline(self, executor: Executor) -> SearchResult | None:
+    def divided_baseline(self, executor: Executor, system: System) -> SearchResult | None:
         """Run a part of a baseline in every worker, each with its share of the steps.
+
+        Args:
+            executor: The executor of the workers.
+            system: The system, whose files the workers receive.
 
         Returns:
             The best result; None where no part has a result.
         """
         count = Workers.of(executor).count
-        parts = [
-            replace(self.search, part=(i, count), steps=self.search.steps / count, threads=1)
-            for i in range(count)
-        ]
+        order = replace(
+            self.search,
+            experiment=for_workers(self.search.experiment, system.source),
+            steps=self.search.steps / count,
+            threads=1,
+        )
+        parts = [replace(order, part=(i, count)) for i in range(count)]
 
         def here(part: BaselineSearch) -> SearchResult:
             """Run a part whose process was ended from outside."""

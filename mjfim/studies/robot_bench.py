@@ -19,6 +19,7 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.constraints import SUBSTEP_KINDS, ConstraintSet, constraint_set_of
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.packing import opened_file
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
@@ -92,7 +93,8 @@ class RobotBench:
         conditions.check()
         self.conditions = conditions
         stated = DesignTask.resolve(experiment, threads=1)
-        self.plan = read_playback(table, stated.system.channels)
+        with opened_file(experiment, table) as file:
+            self.plan = read_playback(file, stated.system.channels)
         self.stated = stated.released_as(self.plan.state[0])
         self.timestep = float(self.stated.system.model.opt.timestep)
 

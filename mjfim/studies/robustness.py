@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import uuid
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
@@ -24,6 +24,7 @@ from mjfim.errors import (
     explain_renamed_arguments,
 )
 from mjfim.excitation.limits import Limit
+from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.parallel import pool_stop_token, results_or_here
@@ -90,9 +91,8 @@ def assess_robustness(
         stop_on_interrupt(stop) as token,
         shown_progress("playing the design", callback, progress) as show,
     ):
-        for run in _play_all(
-            bench, _RobotStudy.of(experiment, table, conditions), runs, executor, token
-        ):
+        study = partial(_RobotStudy.of, experiment, bench, table)
+        for run in _play_all(bench, study, runs, executor, token):
             found.append(run)
             if show is None:
                 continue
@@ -224,9 +224,14 @@ class _RobotStudy:
     conditions: RobotConditions
 
     @classmethod
-    def of(cls, experiment: Experiment, table: Path, conditions: RobotConditions) -> _RobotStudy:
-        """A new study of a design."""
-        return cls(key=uuid.uuid4().hex, experiment=experiment, table=table, conditions=conditions)
+    def of(cls, experiment: Experiment, bench: RobotBench, table: Path) -> _RobotStudy:
+        """The study of a bench, for processes that need no file of this one."""
+        return cls(
+            key=uuid.uuid4().hex,
+            experiment=for_workers(experiment, bench.stated.system.source, [table]),
+            table=table,
+            conditions=bench.conditions,
+        )
 
 
 # The bench of a worker process, by the key of its study. Only the latest bench is kept.
@@ -257,7 +262,7 @@ def _run_until_stopped(bench: RobotBench, number: int, stop: StopToken) -> Robot
 
 def _play_all(
     bench: RobotBench,
-    study: _RobotStudy,
+    study: Callable[[], _RobotStudy],
     count: int,
     executor: Executor | None,
     stop: StopToken,
@@ -267,7 +272,7 @@ def _play_all(
     Without an executor, one robot is played after another in this process.
     """
     if executor is not None:
-        play = partial(_run_in_worker, study)
+        play = partial(_run_in_worker, study())
         here = partial(_run_until_stopped, bench, stop=stop)
         for finished in results_or_here(executor, play, range(count), Budget(stop=stop), here):
             if finished is not None:
