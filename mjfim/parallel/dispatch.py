@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, wait
 from dataclasses import dataclass, field
+from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
@@ -14,7 +15,7 @@ from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.interruption import hurried
 from mjfim.parallel.losses import is_loss, is_refused_by_pickle, is_shared_loss
-from mjfim.parallel.shared_value import AbsentValueError, owned_value, run_with_values
+from mjfim.parallel.shared_value import AbsentValue, attempt, owned_value
 from mjfim.parallel.workers import Workers
 
 T = TypeVar("T")
@@ -106,8 +107,8 @@ class Dispatch(Generic[Order, T]):
         self._function = function
         self._stop = stop
         self._waiting: deque[_Work[Order]] = deque()
-        self._running: dict[Future[T], _Work[Order]] = {}
-        self._ended: SimpleQueue[Future[T]] = SimpleQueue()
+        self._running: dict[Future[T | AbsentValue], _Work[Order]] = {}
+        self._ended: SimpleQueue[Future[T | AbsentValue]] = SimpleQueue()
 
     def add(self, index: int, order: Order, *, next_one: bool = False) -> None:
         """Add an order.
@@ -181,11 +182,10 @@ class Dispatch(Generic[Order, T]):
         self._running[future] = work
         future.add_done_callback(self._ended.put)
 
-    def _submitted(self, work: _Work[Order]) -> Future[T]:
+    def _submitted(self, work: _Work[Order]) -> Future[T | AbsentValue]:
         """Submit an order, together with the values that a worker did not have."""
-        if not work.values:
-            return self._workers.submit(self._function, work.order)
-        return self._workers.submit(run_with_values, work.values, self._function, work.order)
+        carry_out = partial(attempt, self._function, work.values)
+        return self._workers.submit(carry_out, work.order)
 
     def _next_outcome(self) -> Outcome[T] | None:
         """Wait for a task for a while; None where none has ended, or where it is done again."""
@@ -201,12 +201,13 @@ class Dispatch(Generic[Order, T]):
         if _is_lost(future):
             return self._done_again(work, is_shared=_is_shared(future))
 
-        error = future.exception()
-        if isinstance(error, AbsentValueError) and error.digest not in work.values:
-            work.values[error.digest] = owned_value(error.digest)
+        # An order that needs a value is submitted again with it.
+        result = _result_of(future)
+        if isinstance(result, AbsentValue):
+            work.values[result.digest] = owned_value(result.digest)
             self._waiting.appendleft(work)
             return None
-        return Outcome(index=work.index, found=(_result_of(future),))
+        return Outcome(index=work.index, found=(result,))
 
     def _done_again(self, work: _Work[Order], *, is_shared: bool) -> Outcome[T] | None:
         """Put an order that was lost among the waiting ones, or report it after the last loss."""
@@ -236,9 +237,9 @@ class Dispatch(Generic[Order, T]):
         for future, work in self._running.items():
             if future in left:
                 offered = [] if pool is None else pool.offered(future)
-                found += [Outcome(index=work.index, found=(result,)) for result in offered]
+                found += _outcomes(work.index, offered)
             elif not future.cancelled() and future.exception() is None:
-                found.append(Outcome(index=work.index, found=(future.result(),)))
+                found += _outcomes(work.index, [future.result()])
 
         # Nobody waits any longer for a task that does not look at the request.
         for future in left:
@@ -251,7 +252,7 @@ class Dispatch(Generic[Order, T]):
         self._running.clear()
         return found
 
-    def _may_cancel(self, future: Future[T]) -> bool:
+    def _may_cancel(self, future: Future[T | AbsentValue]) -> bool:
         """Check whether a task can be cancelled without the loss of work that is done already.
 
         Dask does not say which tasks are running: they are those that were submitted first.
@@ -260,6 +261,15 @@ class Dispatch(Generic[Order, T]):
             return True
         first = list(self._running)[: self._workers.count]
         return future not in first
+
+
+def _outcomes(index: int, results: Sequence[T | AbsentValue]) -> list[Outcome[T]]:
+    """Outcome of an order; none where its worker did not have a value that it needs."""
+    return [
+        Outcome(index=index, found=(result,))
+        for result in results
+        if not isinstance(result, AbsentValue)
+    ]
 
 
 def _is_lost(future: Future[T]) -> bool:

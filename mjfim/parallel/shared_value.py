@@ -1,8 +1,8 @@
 """Large values that tasks hold by their hash, so that a worker process need not get them each time.
 
-A task is sent without the value. A process that does not have it yet says so by an
-`AbsentValueError`; the task is then sent again together with the value, which the process keeps.
-This needs nothing of an executor but `submit`.
+A task is sent without the value. A process that does not have it yet says so in place of a result;
+the task is then sent again together with the value, which the process keeps. This needs nothing of
+an executor but `submit`.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
 
@@ -104,7 +105,7 @@ def owned_value(digest: str) -> Any:
         digest: Its hash.
 
     Raises:
-        AbsentValueError: This process does not have it any more.
+        AbsentValueError: This process did not make it, or does not have it any more.
     """
     shared = _owned.get(digest)
     if shared is None:
@@ -112,20 +113,39 @@ def owned_value(digest: str) -> Any:
     return shared.value
 
 
-def run_with_values(values: Mapping[str, Any], function: Callable[[Order], T], order: Order) -> T:
-    """Keep values in this process, then carry out an order that needs them.
+@dataclass(frozen=True, kw_only=True)
+class AbsentValue:
+    """What a worker returns in place of a result where a value is absent.
+
+    Attributes:
+        digest: Hash of the value.
+    """
+
+    digest: str
+
+
+def attempt(
+    function: Callable[[Order], T], values: Mapping[str, Any], order: Order
+) -> T | AbsentValue:
+    """Carry out an order in a worker, if the values are there that it needs.
+
+    An error would be the other way to say that one is absent, but Dask prints the errors of tasks.
 
     Args:
-        values: Values by their hash.
         function: Carries out the order.
+        values: Values by their hash, which this process keeps from now on.
         order: The order.
 
     Returns:
-        The result of the order.
+        The result of the order, or which value it needs.
     """
     for digest, value in values.items():
         _received.put(digest, value)
-    return function(order)
+
+    try:
+        return function(order)
+    except AbsentValueError as error:
+        return AbsentValue(digest=error.digest)
 
 
 def _referenced(digest: str) -> SharedValue[Any]:

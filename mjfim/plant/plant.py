@@ -128,9 +128,19 @@ class Plant:
             or the plant itself if a perturbed rollout diverges.
         """
         factors = self.derivatives.calibrated_step_factors(theta, trajectory)
-        if factors is None:
-            return self
+        return self if factors is None else self.with_step_factors(factors)
 
+    @property
+    def step_factors(self) -> Array | None:
+        """(p,) factors of the parameters' difference steps; None before a calibration."""
+        return self._step_factors
+
+    def with_step_factors(self, factors: Array | None) -> Plant:
+        """A plant with the difference steps of a calibration; simulator and models are shared.
+
+        Args:
+            factors: (p,) factors of at least 1, or None for the steps without a calibration.
+        """
         other = copy.copy(self)
         other._step_factors = factors
         return other

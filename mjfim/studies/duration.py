@@ -14,7 +14,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.check import evaluate_and_test
-from mjfim.studies.monte_carlo import SHARED_STEPS
+from mjfim.studies.trials import SHARED_STEPS
 
 # Gauss-Newton steps with the Jacobian of each trial that most trials need.
 USUAL_STEPS = 3

@@ -28,6 +28,7 @@ from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.parallel import pool_stop_token, results_or_here
+from mjfim.parallel.kept import KeptPerThread
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.progress import shown_progress
 from mjfim.records.robustness import (
@@ -234,18 +235,16 @@ class _RobotStudy:
         )
 
 
-# The bench of a worker process, by the key of its study. Only the latest bench is kept.
-_worker_benches: dict[str, RobotBench] = {}
+# The latest bench of a worker, by the key of its study.
+_worker_benches: KeptPerThread[RobotBench] = KeptPerThread(1)
 
 
 def _run_in_worker(study: _RobotStudy, number: int) -> RobotRun | None:
     """Play one robot in a worker process."""
-    if study.key not in _worker_benches:
-        _worker_benches.clear()
-        bench = RobotBench(study.experiment, study.table, study.conditions)
-        _worker_benches[study.key] = bench
-
-    return _run_until_stopped(_worker_benches[study.key], number, pool_stop_token())
+    bench = _worker_benches.get(
+        study.key, lambda: RobotBench(study.experiment, study.table, study.conditions)
+    )
+    return _run_until_stopped(bench, number, pool_stop_token())
 
 
 def _run_until_stopped(bench: RobotBench, number: int, stop: StopToken) -> RobotRun | None:

@@ -1,0 +1,150 @@
+"""Trials on workers: their estimates are those of one process, to the last digit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.budget import StopToken
+from mjfim.excitation.task import DesignTask
+from mjfim.records.events import StudyEvent
+from mjfim.studies import monte_carlo as studies
+from tests.support.paths import MODELS
+
+# Trials of each trajectory, in two chunks.
+TRIALS = 6
+
+
+# A short experiment with little noise, so that all trials converge soon.
+SHORT: dict[str, Any] = {"horizon": 0.5, "noise": {"state": 0.002}}
+
+
+@pytest.fixture(scope="module")
+def experiment() -> mjfim.Experiment:
+    """The cart-pendulum for half a second."""
+    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**SHORT)
+
+
+@pytest.fixture(scope="module")
+def curves(experiment: mjfim.Experiment) -> dict[str, mjfim.Trajectory]:
+    """Two trajectories with different controls."""
+    task = DesignTask.resolve(experiment, threads=1)
+    weaker = task.plant.simulate(task.theta, 0.5 * task.control)
+    return {"initial": task.initial, "final": weaker}
+
+
+@pytest.fixture(autouse=True)
+def several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few trials in a chunk."""
+    monkeypatch.setattr(studies, "MIN_CHUNK", 4)
+
+
+class LosingThreads(ThreadPoolExecutor):
+    """Threads that lose every second task, as if a worker had been killed."""
+
+    def __init__(self) -> None:
+        super().__init__(2)
+        self.submitted = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.submitted += 1
+        if self.submitted % 2:
+            return super().submit(fn, *args, **kwargs)
+        lost: Future[Any] = Future()
+        lost.set_exception(BrokenExecutor("killed"))
+        return lost
+
+
+def estimates(
+    experiment: mjfim.Experiment, curves: dict[str, mjfim.Trajectory], **options: Any
+) -> list[np.ndarray]:
+    """Estimates and covariances of both trajectories."""
+    study = mjfim.monte_carlo(experiment, curves, trials=TRIALS, seed=3, threads=1, **options)
+    return [array for found in study.sets.values() for array in (found.estimates, found.covariance)]
+
+
+def same(first: list[np.ndarray], second: list[np.ndarray]) -> bool:
+    """Whether all numbers are the same to the last digit."""
+    return all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_the_estimates_do_not_depend_on_the_executor_nor_on_lost_tasks(
+    experiment: mjfim.Experiment, curves: dict[str, mjfim.Trajectory]
+) -> None:
+    final = {"final": curves["final"]}
+    alone = estimates(experiment, final)
+    with LosingThreads() as threads:
+        assert same(estimates(experiment, final, executor=threads), alone)
+
+    assert threads.submitted == 3
+
+
+def test_a_request_to_stop_keeps_the_trials_of_finished_workers(
+    experiment: mjfim.Experiment, curves: dict[str, mjfim.Trajectory]
+) -> None:
+    token = StopToken()
+
+    def stop_after_the_first_chunk(event: StudyEvent) -> None:
+        """Request a stop."""
+        token.request()
+
+    with ThreadPoolExecutor(1) as threads:
+        study = mjfim.monte_carlo(
+            experiment,
+            {"final": curves["final"]},
+            trials=TRIALS,
+            executor=threads,
+            callback=stop_after_the_first_chunk,
+            stop=token,
+        )
+
+    assert 4 <= study.sets["final"].trials <= TRIALS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pool", "loky", "dask"])
+def test_processes_in_another_folder_find_the_same_estimates(
+    kind: str, tmp_path: Path, curves: dict[str, mjfim.Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The path of the experiment is relative, so that processes elsewhere do not find its files.
+    monkeypatch.chdir(MODELS)
+    experiment = mjfim.Experiment.from_file("cart_pendulum.toml").replace(**SHORT)
+    alone = estimates(experiment, curves)
+
+    with started(kind) as executor:
+        move_to(executor, tmp_path)
+        assert same(estimates(experiment, curves, executor=executor), alone)
+
+
+def started(kind: str) -> AbstractContextManager[Any]:
+    """Two worker processes of a kind."""
+    if kind == "pool":
+        return mjfim.Pool(2)
+    if kind == "loky":
+        return pytest.importorskip("loky").ProcessPoolExecutor(2)
+    return _dask_client()
+
+
+def _dask_client() -> Any:
+    """A client of a cluster of two processes on this computer, which it ends when it is closed."""
+    distributed = pytest.importorskip("distributed")
+    return distributed.Client(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, set_as_default=False
+    )
+
+
+def move_to(executor: Any, folder: Path) -> None:
+    """Let all processes work in a folder."""
+    if hasattr(executor, "run"):
+        executor.run(os.chdir, str(folder))
+        return
+    for future in [executor.submit(os.chdir, folder) for _ in range(20)]:
+        future.result()
