@@ -24,12 +24,12 @@ TRIALS = 6
 
 
 # A short experiment with little noise, so that all trials converge soon.
-SHORT: dict[str, Any] = {"horizon": 0.5, "noise": {"state": 0.002}}
+SHORT: dict[str, Any] = {"horizon": 0.2, "noise": {"state": 0.0005}}
 
 
 @pytest.fixture(scope="module")
 def experiment() -> mjfim.Experiment:
-    """The cart-pendulum for half a second."""
+    """The cart-pendulum for a short time."""
     return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**SHORT)
 
 
