@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.continuation import continued_fit
 from mjfim.identification.extreme_values import describe_extreme_value
+from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.residuals import FitProblem
 from mjfim.identification.searches import NEWTON, FitSearch, of_subset, quick_subset
@@ -53,6 +55,7 @@ def identify(
     threads: int | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
+    executor: Any = None,
 ) -> Estimate:
     """Estimate parameters from recordings, with the settings of the table `[fit]`.
 
@@ -71,6 +74,8 @@ def identify(
         threads: Threads for the engine; default: one per core.
         stop: Token that ends the search with the best result so far.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
+        executor: Executor that simulates parts of much data and searches from several starts side
+            by side, such as `mjfim.Pool` or a Dask `Client`; the estimate does not depend on it.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -84,7 +89,7 @@ def identify(
         task = FitTask.resolve(
             experiment, recordings, method=method, start=start, held_out=held_out, threads=threads
         )
-        return identify_task(task, callback=show, stop=stop)
+        return identify_task(task, callback=show, stop=stop, executor=executor)
 
 
 def identify_system(
@@ -121,7 +126,11 @@ def identify_system(
 
 
 def identify_task(
-    task: FitTask, *, callback: Callback | None = None, stop: StopToken | None = None
+    task: FitTask,
+    *,
+    callback: Callback | None = None,
+    stop: StopToken | None = None,
+    executor: Any = None,
 ) -> Estimate:
     """Estimate the parameters of a task. See `identify`.
 
@@ -129,6 +138,7 @@ def identify_task(
         task: System, recordings and settings.
         callback: Called with every iterate.
         stop: Token that ends the search with the best result so far.
+        executor: Executor that simulates parts of much data side by side; None for this process.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -142,6 +152,8 @@ def identify_task(
 
     with one_blas_thread(), stop_on_interrupt(stop) as token:
         problem = task.problem()
+        if executor is not None:
+            problem = problem.on_workers(FitWorkers(executor))
         held_out = task.held_out_problem()
         search = FitSearch(task=task, budget=Budget(stop=token), callback=callback)
 

@@ -7,18 +7,24 @@ linearised rows are condensed block by block.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, zip_longest
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
-from mjfim.identification.segment_simulation import SegmentRows, SegmentSimulation
+from mjfim.identification.segment_simulation import (
+    SegmentBatch,
+    SegmentRows,
+    SegmentSimulation,
+)
 from mjfim.identification.segments import (
     Segment,
     cut_into_segments,
@@ -30,12 +36,17 @@ from mjfim.identification.unknowns import UnknownLayout
 from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
-from mjfim.optimize.levenberg_marquardt import UnknownValues
+from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution, UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.plant.noise import Noise
 from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
+
+T = TypeVar("T")
+
+# Work on one batch of a problem, at values of the unknowns.
+BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T | None]
 
 # Smallest number of rows of a block.
 MIN_BLOCK_ROWS = 8
@@ -99,6 +110,49 @@ class Pins:
         return np.asarray(self.rows @ (theta - self.theta))
 
 
+class BatchWorkers(Protocol):
+    """Does work on batches of segments in other processes."""
+
+    def of_batches(
+        self,
+        problem: FitProblem,
+        work: BatchWork[T],
+        batches: Sequence[SegmentBatch],
+        at: UnknownValues,
+    ) -> Sequence[T | None]:
+        """Do a work on all batches.
+
+        Args:
+            problem: The problem.
+            work: Method of the problem that does it for one batch.
+            batches: The batches.
+            at: The unknowns.
+
+        Returns:
+            What is found for every batch, in their order.
+        """
+
+    def solutions(
+        self,
+        problem: FitProblem,
+        begins: Sequence[UnknownValues],
+        settings: SearchSettings,
+        budget: Budget,
+    ) -> Iterator[Solution | None]:
+        """Search from several starts.
+
+        Args:
+            problem: The problem.
+            begins: Unknowns at which the searches begin.
+            settings: Tolerance and number of iterations.
+            budget: Ends the searches early.
+
+        Yields:
+            The solution of every search that was not stopped before its begin, in their order; None
+            where the simulation diverges at the begin.
+        """
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitProblem:
     """Residuals of recordings as functions of the unknowns; a `levenberg_marquardt.Problem`.
@@ -114,6 +168,7 @@ class FitProblem:
         pins: Combinations that no recording determines, and their values.
         with_priors: Whether priors of the parameters count.
         difference_step: Relative step of the two-sided differences of a linearisation.
+        workers: Does the work on batches of segments; None for this process.
     """
 
     simulation: SegmentSimulation
@@ -123,6 +178,7 @@ class FitProblem:
     pins: Pins
     with_priors: bool
     difference_step: float = SENSITIVITY_STEP
+    workers: BatchWorkers | None = None
 
     @classmethod
     def of(
@@ -186,6 +242,14 @@ class FitProblem:
         )
 
     # ---- variants
+
+    def on_workers(self, workers: BatchWorkers) -> FitProblem:
+        """This problem, the batches of which are simulated by workers.
+
+        Args:
+            workers: The workers.
+        """
+        return replace(self, workers=workers)
 
     def unbounded(self) -> FitProblem:
         """This problem without bounds."""
@@ -456,10 +520,12 @@ class FitProblem:
             The cost; infinite where a simulation diverges.
         """
         total = 0.0
-        for rows in self.simulation.rows(at, derivatives=False):
-            if rows is None:
+        batches = self.simulation.batches(derivatives=False)
+        for losses in self._of_batches(FitProblem.losses_of_batch, batches, at):
+            if losses is None:
                 return np.inf
-            total += self.loss.value(self._whitened_residual(rows))
+            for loss in losses:
+                total += loss
 
         common = self._common_rows(at)[:, -1]
         private = self._private_rows(at)[:, :, -1]
@@ -478,7 +544,51 @@ class FitProblem:
         blocks = np.zeros((int(self._block_offsets[-1]), m, m))
         segment_of_block = np.repeat(np.arange(len(self.segments)), np.diff(self._block_offsets))
 
-        for rows in self.simulation.rows(at, derivatives=True, step=self.difference_step):
+        batches = self.simulation.batches(derivatives=True, step=self.difference_step)
+        for found in self._of_batches(FitProblem.blocks_of_batch, batches, at):
+            if found is None:
+                return None
+            for index, block in found.items():
+                blocks[index] = block
+
+        return Condensed(
+            blocks=blocks,
+            segment_of_block=segment_of_block,
+            private_rows=self._private_rows(at),
+            common_rows=self._common_rows(at),
+        )
+
+    def losses_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[float] | None:
+        """Loss of the residuals of a batch, which the cost adds in this order.
+
+        Args:
+            at: The unknowns.
+            batch: The batch.
+
+        Returns:
+            The losses; None where a simulation diverges.
+        """
+        losses = []
+        for rows in self.simulation.rows_of_batch(at, batch):
+            if rows is None:
+                return None
+            losses.append(self.loss.value(self._whitened_residual(rows)))
+        return losses
+
+    def blocks_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> dict[int, Array] | None:
+        """Condensed blocks of a batch, all of whose rows are in it.
+
+        Args:
+            at: The unknowns.
+            batch: The batch, with derivatives.
+
+        Returns:
+            (m, m) triangle of each block by its index; None where a perturbed simulation diverges.
+        """
+        m = self.simulation.private_count + self.layout.column_count + 1
+        empty = np.zeros((m, m))
+        blocks: dict[int, Array] = {}
+        for rows in self.simulation.rows_of_batch(at, batch):
             if rows is None:
                 return None
 
@@ -489,16 +599,27 @@ class FitProblem:
             # Rows are added to the triangle of their block.
             edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
             for first, last in pairwise(edges):
-                index = block[first]
-                joined = np.concatenate([blocks[index], weighted[first:last]])
+                index = int(block[first])
+                joined = np.concatenate([blocks.get(index, empty), weighted[first:last]])
                 blocks[index] = triangle(joined)
+        return blocks
 
-        return Condensed(
-            blocks=blocks,
-            segment_of_block=segment_of_block,
-            private_rows=self._private_rows(at),
-            common_rows=self._common_rows(at),
-        )
+    def _of_batches(
+        self, work: BatchWork[T], batches: Iterable[SegmentBatch], at: UnknownValues
+    ) -> Iterator[T | None]:
+        """What a work on batches finds, in the order of the batches.
+
+        Args:
+            work: `losses_of_batch` or `blocks_of_batch`.
+            batches: The batches.
+            at: The unknowns.
+        """
+        if self.workers is not None:
+            yield from self.workers.of_batches(self, work, list(batches), at)
+            return
+
+        for batch in batches:
+            yield work(self, at, batch)
 
     def dense(self, at: UnknownValues) -> Residuals | None:
         """All rows without a loss: recordings first, then priors and pins.

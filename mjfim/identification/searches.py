@@ -306,6 +306,11 @@ class FitSearch:
         )
 
         # The first sample is the stated start, which was searched before.
+        if problem.workers is not None:
+            begins = [problem.begin(theta) for theta in samples[1:]]
+            searched = problem.workers.solutions(problem, begins, settings, self.budget)
+            return [solution for solution in searched if solution is not None]
+
         found = []
         for number, theta in enumerate(samples[1:], start=2):
             phase = f"start {number} of {starts}"

@@ -57,6 +57,27 @@ class SegmentRows:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class SegmentBatch:
+    """Segments that are simulated together, and how they are differentiated.
+
+    Attributes:
+        recording: Index of a recording whose parameters the segments have.
+        segments: Indices of the segments.
+        derivatives: Whether to compute derivatives.
+        central: True for two-sided differences.
+        step: Relative step of the differences.
+        wanted: (p,) True for the parameters by which to differentiate.
+    """
+
+    recording: int
+    segments: tuple[int, ...]
+    derivatives: bool
+    central: bool
+    step: float
+    wanted: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SegmentSimulation:
     """Predicted outputs of all segments as functions of the unknowns.
 
@@ -195,7 +216,37 @@ class SegmentSimulation:
             Predictions of some rows of one segment. Where a simulation diverges, None is the last
             item.
         """
-        plant = self.system.plant
+        batches = self.batches(
+            derivatives=derivatives,
+            central=central,
+            step=step,
+            by_all_parameters=by_all_parameters,
+        )
+        for batch in batches:
+            for found in self.rows_of_batch(at, batch):
+                yield found
+                if found is None:
+                    return
+
+    def batches(
+        self,
+        *,
+        derivatives: bool,
+        central: bool | None = None,
+        step: float = SENSITIVITY_STEP,
+        by_all_parameters: bool = False,
+    ) -> Iterator[SegmentBatch]:
+        """Divide all segments into batches that fit into memory; every segment is in one of them.
+
+        Args:
+            derivatives: Whether to compute derivatives.
+            central: True for two-sided differences; default: two-sided unless there is much data.
+            step: Relative step of two-sided differences.
+            by_all_parameters: Whether to differentiate also by parameters without common columns.
+
+        Yields:
+            The batches.
+        """
         wanted = self.layout.estimated
         if by_all_parameters:
             wanted = np.ones(len(self.system.parameters), dtype=bool)
@@ -211,26 +262,46 @@ class SegmentSimulation:
         if derivatives:
             simulations += directions * (2 if central else 1)
 
-        for recording, batch in self._batches(self._max_samples(simulations)):
-            theta = self.layout.theta_of_recording(at, recording)
-            longest = max(self.segments[i].samples for i in batch)
-            responses = plant.derivatives.responses(
-                theta,
-                np.stack([self._initial_state(at, i) for i in batch]),
-                np.stack([self._control(i, longest) for i in batch]),
-                start_directions=self.start_directions if derivatives else None,
+        for recording, segments in self._batches(self._max_samples(simulations)):
+            yield SegmentBatch(
+                recording=recording,
+                segments=tuple(segments),
+                derivatives=derivatives,
                 central=central,
                 step=step,
                 wanted=wanted,
             )
-            for response in responses:
-                if response is None:
-                    yield None
-                    return
-                for place, i in enumerate(batch):
-                    found = self._rows_of_segment(theta, i, place, response)
-                    if found is not None:
-                        yield found
+
+    def rows_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> Iterator[SegmentRows | None]:
+        """Simulate a batch over one interval of time after the other.
+
+        Args:
+            at: The unknowns.
+            batch: The batch.
+
+        Yields:
+            Predictions of some rows of one segment. Where a simulation diverges, None is the last
+            item.
+        """
+        theta = self.layout.theta_of_recording(at, batch.recording)
+        longest = max(self.segments[i].samples for i in batch.segments)
+        responses = self.system.plant.derivatives.responses(
+            theta,
+            np.stack([self._initial_state(at, i) for i in batch.segments]),
+            np.stack([self._control(i, longest) for i in batch.segments]),
+            start_directions=self.start_directions if batch.derivatives else None,
+            central=batch.central,
+            step=batch.step,
+            wanted=batch.wanted,
+        )
+        for response in responses:
+            if response is None:
+                yield None
+                return
+            for place, i in enumerate(batch.segments):
+                found = self._rows_of_segment(theta, i, place, response)
+                if found is not None:
+                    yield found
 
     def _max_samples(self, simulations: int) -> int:
         """Largest number of samples of a batch whose states fit into memory.

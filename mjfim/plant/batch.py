@@ -294,8 +294,16 @@ class BatchSimulator:
 
     @property
     def steps(self) -> int:
-        """`mj_step` calls so far, those of `with_substeps` included."""
+        """`mj_step` calls so far, those of `with_substeps` and of workers included."""
         return self._count.steps
+
+    def add_steps(self, steps: int) -> None:
+        """Count `mj_step` calls that a worker has made for this simulator.
+
+        Args:
+            steps: Their number.
+        """
+        self._count.steps += steps
 
     def with_substeps(self, substeps: int) -> BatchSimulator:
         """A simulator with samples of another length; memory and counted steps are shared.

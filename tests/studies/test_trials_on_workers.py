@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +14,7 @@ from mjfim.budget import StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.records.events import StudyEvent
 from mjfim.studies import monte_carlo as studies
+from tests.support.executors import KINDS, LosingThreads, move_to, processes
 from tests.support.paths import MODELS
 
 # Trials of each trajectory, in two chunks.
@@ -45,22 +43,6 @@ def curves(experiment: mjfim.Experiment) -> dict[str, mjfim.Trajectory]:
 def several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few trials in a chunk."""
     monkeypatch.setattr(studies, "MIN_CHUNK", 4)
-
-
-class LosingThreads(ThreadPoolExecutor):
-    """Threads that lose every second task, as if a worker had been killed."""
-
-    def __init__(self) -> None:
-        super().__init__(2)
-        self.submitted = 0
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        self.submitted += 1
-        if self.submitted % 2:
-            return super().submit(fn, *args, **kwargs)
-        lost: Future[Any] = Future()
-        lost.set_exception(BrokenExecutor("killed"))
-        return lost
 
 
 def estimates(
@@ -110,7 +92,7 @@ def test_a_request_to_stop_keeps_the_trials_of_finished_workers(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pool", "loky", "dask"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_processes_in_another_folder_find_the_same_estimates(
     kind: str, tmp_path: Path, curves: dict[str, mjfim.Trajectory], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,32 +101,6 @@ def test_processes_in_another_folder_find_the_same_estimates(
     experiment = mjfim.Experiment.from_file("cart_pendulum.toml").replace(**SHORT)
     alone = estimates(experiment, curves)
 
-    with started(kind) as executor:
+    with processes(kind) as executor:
         move_to(executor, tmp_path)
         assert same(estimates(experiment, curves, executor=executor), alone)
-
-
-def started(kind: str) -> AbstractContextManager[Any]:
-    """Two worker processes of a kind."""
-    if kind == "pool":
-        return mjfim.Pool(2)
-    if kind == "loky":
-        return pytest.importorskip("loky").ProcessPoolExecutor(2)
-    return _dask_client()
-
-
-def _dask_client() -> Any:
-    """A client of a cluster of two processes on this computer, which it ends when it is closed."""
-    distributed = pytest.importorskip("distributed")
-    return distributed.Client(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, set_as_default=False
-    )
-
-
-def move_to(executor: Any, folder: Path) -> None:
-    """Let all processes work in a folder."""
-    if hasattr(executor, "run"):
-        executor.run(os.chdir, str(folder))
-        return
-    for future in [executor.submit(os.chdir, folder) for _ in range(20)]:
-        future.result()

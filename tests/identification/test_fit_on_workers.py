@@ -1,0 +1,112 @@
+"""Fits on workers: costs, linearisations and estimates of one process, to the last digit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification import segment_simulation
+from mjfim.identification.fit_workers import FitWorkers
+from mjfim.identification.residuals import FitProblem
+from mjfim.identification.task import FitTask
+from tests.support.executors import LosingThreads, move_to, processes
+from tests.support.paths import MODELS
+
+# Settings of fits: whole recordings, and segments whose initial states are unknown.
+WHOLE: dict[str, Any] = {"starts": 2}
+SEGMENTS: dict[str, Any] = {"starts": 2, "segments": 0.25, "start": "measured"}
+
+
+@pytest.fixture(scope="module")
+def experiment() -> mjfim.Experiment:
+    """The cart-pendulum for a short time."""
+    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
+
+
+@pytest.fixture(scope="module")
+def recordings(experiment: mjfim.Experiment) -> list[mjfim.Recording]:
+    """Three recordings that differ by their noise."""
+    task = DesignTask.resolve(experiment, threads=1)
+    return [simulate_system(task.system, task.initial, seed) for seed in range(3)]
+
+
+@pytest.fixture(autouse=True)
+def several_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few segments in a batch, as with much data."""
+    monkeypatch.setattr(segment_simulation, "MAX_NUMBERS_AT_ONCE", 2000)
+
+
+def problem_of(
+    experiment: mjfim.Experiment, recordings: Sequence[mjfim.Recording], fit: dict[str, Any]
+) -> FitProblem:
+    """The problem of a fit."""
+    return FitTask.resolve(experiment.replace(fit=fit), recordings, threads=1).problem()
+
+
+@pytest.mark.parametrize("fit", [WHOLE, SEGMENTS], ids=["whole", "segments"])
+def test_cost_and_linearisation_are_the_same_although_tasks_are_lost(
+    experiment: mjfim.Experiment, recordings: list[mjfim.Recording], fit: dict[str, Any]
+) -> None:
+    problem = problem_of(experiment, recordings, fit)
+    plant = problem.system.plant
+    at = problem.begin(problem.system.parameters.guess)
+    begin = plant.engine_steps
+    cost, condensed = problem.cost(at), problem.condense(at)
+    alone = plant.engine_steps
+
+    with LosingThreads() as threads:
+        divided = problem.on_workers(FitWorkers(threads))
+        divided_cost, found = divided.cost(at), divided.condense(at)
+
+    assert threads.submitted > 4
+    assert divided_cost == cost
+    assert condensed is not None
+    assert found is not None
+    assert np.array_equal(found.blocks, condensed.blocks)
+
+    # The steps of workers count as those of this process.
+    assert plant.engine_steps - alone == alone - begin
+
+
+def test_a_fit_that_diverges_on_workers_has_no_cost(
+    experiment: mjfim.Experiment, recordings: list[mjfim.Recording]
+) -> None:
+    problem = problem_of(experiment, recordings, WHOLE)
+    at = problem.begin(np.array([1e-3, 1e-3, -1e6]))
+    assert problem.cost(at) == np.inf
+
+    with LosingThreads() as threads:
+        divided = problem.on_workers(FitWorkers(threads))
+
+        assert divided.cost(at) == np.inf
+        assert divided.condense(at) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pool", "dask"])
+def test_processes_in_another_folder_find_the_same_estimate(
+    kind: str,
+    tmp_path: Path,
+    recordings: list[mjfim.Recording],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The path of the experiment is relative, so that processes elsewhere do not find its files.
+    monkeypatch.chdir(MODELS)
+    experiment = mjfim.Experiment.from_file("cart_pendulum.toml").replace(fit=SEGMENTS)
+    alone = mjfim.identify(experiment, recordings, threads=1)
+
+    with processes(kind) as executor:
+        move_to(executor, tmp_path)
+        found = mjfim.identify(experiment, recordings, threads=1, executor=executor)
+
+    assert np.array_equal(found.theta, alone.theta)
+    assert np.array_equal(found.covariance, alone.covariance)
+    assert found.chi2 == alone.chi2
+    assert found.steps == alone.steps
