@@ -23,6 +23,13 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
+from mjfim.cli.executors import (
+    LOCAL,
+    MAX_PARTS,
+    ExecutorPlace,
+    started_if_stated,
+    stated_executor,
+)
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.text import render
 
@@ -61,6 +68,7 @@ def campaign(
     verbose: Verbose = False,
     force: Force = False,
     threads: Threads = None,
+    executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Repeat design, recording and estimate until every target accuracy is reached.
 
@@ -78,6 +86,7 @@ def campaign(
     from mjfim.output.summaries.campaign import describe_campaign
     from mjfim.records.campaign import CampaignStatus
 
+    place = stated_executor(executor)
     stated = with_target_accuracies(mjfim.Experiment.from_file(experiment), wanted)
     run = CampaignRun(output, DesignTask.resolve(stated, threads=threads), pictures)
 
@@ -91,9 +100,12 @@ def campaign(
     with progress("estimating how long it takes"):
         system = run.task.system
         expected = announce_design(system, is_default=False, work="the design of a round")
-    with progress("designing", expected=expected) as display:
+    with (
+        started_if_stated(place, MAX_PARTS) as workers,
+        progress("designing", expected=expected) as display,
+    ):
         display.count_rounds(rounds)
-        run.display = display
+        run.display, run.executor = display, workers
         found = run.simulated(rounds, seed) if simulated else run.real(rounds, recordings or [])
 
     parameters = CampaignParameters.stated(run.task.parameters, simulated=simulated)

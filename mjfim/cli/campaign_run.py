@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +38,7 @@ class CampaignRun:
         task: The task as stated.
         folder: The folder of the campaign.
         display: Shows the progress of designs and estimates, or None.
+        executor: Does the work of designs and estimates; None for this process.
     """
 
     def __init__(
@@ -56,6 +58,7 @@ class CampaignRun:
         self.folder = CampaignFolder(path, task.system, pictures)
         self._wanted = target_accuracies(task)
         self.display: Callback | None = None
+        self.executor: Executor | None = None
         self._estimate: Estimate | None = None
 
     def require_simulation(self, seed: int, *, resume: bool) -> None:
@@ -125,6 +128,7 @@ class CampaignRun:
             rounds=rounds,
             threads=self.task.system.threads,
             callback=self._finish_round,
+            executor=self.executor,
             done=list(self.folder.recorded_rounds()),
         )
 
@@ -163,6 +167,7 @@ class CampaignRun:
             rounds=limit,
             threads=self.task.system.threads,
             callback=self._finish_round,
+            executor=self.executor,
             done=done,
         )
         if is_waiting and found.status is CampaignStatus.EXHAUSTED and len(done) < rounds:

@@ -24,6 +24,13 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
+from mjfim.cli.executors import (
+    LOCAL,
+    MAX_PARTS,
+    ExecutorPlace,
+    started_if_stated,
+    stated_executor,
+)
 from mjfim.errors import NoResultError
 from mjfim.output.picture_format import PictureFormat
 from mjfim.studies.baselines.titles import TITLES
@@ -50,6 +57,7 @@ def compare(
     verbose: Verbose = False,
     force: Force = False,
     threads: Threads = None,
+    executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Compare the design with chirps, multisines, Fourier series and splines of equal budget.
 
@@ -63,6 +71,7 @@ def compare(
     from mjfim.output.presentation import describe
     from mjfim.studies.compare import chosen_methods, compare_task
 
+    place = stated_executor(executor)
     task = DesignTask.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     chosen = (
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
@@ -71,9 +80,15 @@ def compare(
     names = comparison_files(baselines)
     claim_folder(output, pictures.files(names), input_files(task.experiment), force=force)
     announce_comparison(len(baselines) + 1, seconds)
-    with progress("comparing") as show:
+    with started_if_stated(place, MAX_PARTS) as workers, progress("comparing") as show:
         result = compare_task(
-            task, seconds=seconds, steps=steps, seed=seed, methods=chosen, callback=show
+            task,
+            seconds=seconds,
+            steps=steps,
+            seed=seed,
+            methods=chosen,
+            callback=show,
+            executor=workers,
         )
 
     if not result.rows:

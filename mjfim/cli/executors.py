@@ -27,6 +27,9 @@ ExecutorPlace = Annotated[
 # Processes of this computer, one for each core.
 LOCAL = "local"
 
+# Number of tasks where it is not known before the work begins: as many processes as there may be.
+MAX_PARTS = 1_000_000
+
 
 def stated_executor(place: str) -> StatedExecutor:
     """Read the option, at the beginning of a verb.
@@ -74,6 +77,28 @@ def started_executor(
 
     with worker_processes(count) as pool:
         yield Workers(pool)
+
+
+@contextmanager
+def started_if_stated(stated: StatedExecutor, tasks: int) -> Iterator[Workers | None]:
+    """Start the executor of work that one process does on all cores where none is stated.
+
+    Args:
+        stated: The executor.
+        tasks: Number of tasks that can be done side by side.
+
+    Yields:
+        The workers; None for `local` without a number, and where there is one task.
+
+    Raises:
+        ExperimentError: As for `started_executor`.
+    """
+    if stated.text == LOCAL:
+        yield None
+        return
+
+    with started_executor(stated, tasks) as workers:
+        yield workers
 
 
 @contextmanager

@@ -30,6 +30,13 @@ from mjfim.cli.common import (
     write_wanted_video,
     writing,
 )
+from mjfim.cli.executors import (
+    LOCAL,
+    MAX_PARTS,
+    ExecutorPlace,
+    started_if_stated,
+    stated_executor,
+)
 from mjfim.errors import ExperimentError
 from mjfim.output.picture_format import PictureFormat
 
@@ -64,6 +71,7 @@ def identify(
     verbose: Verbose = False,
     force: Force = False,
     threads: Threads = None,
+    executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Estimate the parameters from recordings, with intervals, predictions and warnings."""
     from mjfim.cli.announcements import announce_fit
@@ -76,6 +84,7 @@ def identify(
     from mjfim.output.summaries.logs import describe_logs
     from mjfim.recordings.read import read_log, recording_paths
 
+    place = stated_executor(executor)
     if method not in ("least_squares", "newton"):
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
@@ -94,6 +103,7 @@ def identify(
         predicted = [read_log(path, system.channels) for path in held_out_logs]
         announce_fit(system, [log.recording for log in fitted])
     with (
+        started_if_stated(place, MAX_PARTS) as workers,
         progress("fitting") as display,
         watched(live, system, display) as show,
     ):
@@ -103,6 +113,7 @@ def identify(
             method="newton" if method == "newton" else "least_squares",
             held_out=[log.recording for log in predicted],
             callback=show,
+            executor=workers,
         )
 
     summary = describe(result)

@@ -23,7 +23,7 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
-from mjfim.cli.executors import worker_processes
+from mjfim.cli.executors import LOCAL, ExecutorPlace, started_executor, stated_executor
 from mjfim.errors import ExperimentError
 from mjfim.output.picture_format import PictureFormat
 
@@ -88,6 +88,7 @@ def robustness(
     pictures: Pictures = PictureFormat.PNG,
     verbose: Verbose = False,
     force: Force = False,
+    executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Play a design on simulated robots that differ from the model.
 
@@ -100,7 +101,6 @@ def robustness(
     from mjfim.output.folders import DESIGN_ARCHIVE, ROBUSTNESS_FILES
     from mjfim.output.presentation import describe
     from mjfim.output.text import render
-    from mjfim.parallel import cores
     from mjfim.records.robustness import RobotConditions
     from mjfim.studies.robustness import assess_robustness, default_latency
 
@@ -109,6 +109,13 @@ def robustness(
             "--reserve is for a new design; leave out DESIGN_FOLDER, or leave out --reserve"
         )
 
+    if jobs is not None and executor != LOCAL:
+        raise ExperimentError(
+            "--jobs states processes of this computer, and --executor another place; leave one of "
+            "them out"
+        )
+
+    place = stated_executor(executor)
     stated = mjfim.Experiment.from_file(experiment)
     conditions = RobotConditions(
         wrong=wrong,
@@ -129,14 +136,14 @@ def robustness(
         design_folder = design_with_reserve(stated, shares, output / "design")
 
     begun = time.perf_counter()
-    with worker_processes(min(jobs or cores(), runs)) as pool, progress("playing") as show:
+    with started_executor(place, runs, jobs) as workers, progress("playing") as show:
         result = assess_robustness(
             stated,
             design_folder,
             conditions=conditions,
             runs=runs,
             callback=show,
-            executor=pool,
+            executor=workers,
         )
     seconds = time.perf_counter() - begun
 

@@ -32,6 +32,13 @@ from mjfim.cli.common import (
     write_wanted_video,
     writing,
 )
+from mjfim.cli.executors import (
+    LOCAL,
+    ExecutorPlace,
+    started_executor,
+    started_if_stated,
+    stated_executor,
+)
 from mjfim.errors import NoResultError
 from mjfim.output.picture_format import PictureFormat
 
@@ -112,6 +119,7 @@ def montecarlo(
     pictures: Pictures = PictureFormat.PNG,
     verbose: Verbose = False,
     force: Force = False,
+    executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Compare estimates with the Cramér-Rao bound on the initial and on the designed trajectory."""
     from mjfim.cli.announcements import announce_trials
@@ -122,6 +130,7 @@ def montecarlo(
     from mjfim.output.presentation import describe
     from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
 
+    place = stated_executor(executor)
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(
         stated if measure_rate is None else stated.replace(measure_rate=measure_rate)
@@ -134,11 +143,17 @@ def montecarlo(
 
     require_memory_for_trials(system, named, trials)
     expected = announce_trials(system, named, trials)
+
+    # The start of processes takes longer than a short study.
+    start = started_if_stated if expected is None else started_executor
     with (
+        start(place, trials) as workers,
         progress(f"{trials} trials", expected=expected) as display,
         watched(live, system, display) as show,
     ):
-        study = monte_carlo_system(system, named, trials=trials, seed=seed, callback=show)
+        study = monte_carlo_system(
+            system, named, trials=trials, seed=seed, callback=show, executor=workers
+        )
 
     if not study.sets:
         raise NoResultError

@@ -101,6 +101,7 @@ def identify_system(
     held_out: Sequence[Recording] = (),
     callback: Callback | None = None,
     stop: StopToken | None = None,
+    executor: Any = None,
 ) -> Estimate:
     """Estimate the parameters of a resolved system.
 
@@ -112,6 +113,7 @@ def identify_system(
         held_out: Recordings that are predicted, not fitted.
         callback: Called with every iterate.
         stop: Token that ends the search with the best result so far.
+        executor: Executor that simulates parts of much data side by side; None for this process.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -122,7 +124,7 @@ def identify_system(
         SimulationDivergedError: The model diverges at the start.
     """
     task = FitTask.of(system, recordings, method=method, start=start, held_out=held_out)
-    return identify_task(task, callback=callback, stop=stop)
+    return identify_task(task, callback=callback, stop=stop, executor=executor)
 
 
 def identify_task(

@@ -260,6 +260,7 @@ class _CampaignRun:
             start,
             callback=self._callback,
             stop=self._stop,
+            executor=self._executor,
         )
         if estimate is None:
             return False
@@ -363,6 +364,7 @@ def identify_all(
     *,
     callback: Callback | None = None,
     stop: StopToken | None = None,
+    executor: Executor | None = None,
 ) -> Estimate | None:
     """Estimate the parameters from all recordings.
 
@@ -374,6 +376,7 @@ def identify_all(
         start: (p,) parameters at which the fit begins [theta-unit].
         callback: Called with a `FitEvent` for every iterate.
         stop: Ends the fit early.
+        executor: Simulates parts of much data side by side; None for this process.
 
     Returns:
         The better of the estimates; None where a fit was interrupted, because an incomplete round
@@ -391,7 +394,12 @@ def identify_all(
 
         try:
             estimate = identify_system(
-                base.system, recordings, start=begin, callback=callback, stop=stop
+                base.system,
+                recordings,
+                start=begin,
+                callback=callback,
+                stop=stop,
+                executor=executor,
             )
         except SimulationDivergedError as error:
             first_error = first_error or error

@@ -312,3 +312,29 @@ def test_an_executor_that_cannot_be_had_is_misuse(
     result = run("design", study, "-o", tmp_path / "out", "--executor", place)
     misused(result, message)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("verb", "files"),
+    [
+        ("montecarlo", ("design.npz",)),
+        ("identify", ("log.csv",)),
+        ("compare", ()),
+        ("campaign", ()),
+        ("robustness", ("design",)),
+    ],
+)
+def test_all_verbs_with_much_work_state_where_it_is_done(
+    verb: str, files: tuple[str, ...], study: Path, tmp_path: Path
+) -> None:
+    # Files whose existence is checked before the options.
+    for name in files:
+        (tmp_path / name).touch()
+
+    words = (verb, study, *(tmp_path / name for name in files), "-o", tmp_path / "out")
+    misused(run(*words, "--executor", "cluster"), "state local, local:N")
+
+
+def test_robustness_has_processes_in_one_place(study: Path, tmp_path: Path) -> None:
+    words = ("robustness", study, "-o", tmp_path / "out", "--jobs", 2, "--executor", "local:3")
+    misused(run(*words), "--jobs states processes of this computer")
