@@ -194,7 +194,7 @@ def own_versions() -> tuple[str, str]:
     """Return the versions on which results depend: of mjfim and of MuJoCo."""
     import mujoco
 
-    # The top of the package leads to all rooms, so that a lower one imports it by its name only.
+    # The top of the package imports every floor, so that a lower floor looks it up by its name.
     package = importlib.import_module("mjfim")
     return str(package.__version__), mujoco.__version__
 
