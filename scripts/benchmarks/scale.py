@@ -318,7 +318,7 @@ def in_empty_folder(sizes: Sizes, references: dict[str, Reference], workers: int
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as empty:
         copies = Path(name) / "models"
         shutil.copytree(MODELS, copies)
-        chosen = verbs(sizes, copies)
+        chosen = [verb for verb in verbs(sizes, copies) if verb.name in references]
         shutil.rmtree(copies)
 
         good = True
@@ -391,7 +391,9 @@ def run(options: argparse.Namespace) -> bool:
     good = True
     if set(parts) - {"simulate"}:
         print(f"{sizes}: {sizes.gigabytes:.2f} GB of recordings")
-        chosen = [verb for verb in verbs(sizes) if verb.name in (options.verb or verb.name)]
+        chosen = [
+            verb for verb in verbs(sizes) if options.verb is None or verb.name in options.verb
+        ]
         references = {verb.name: serial(verb) for verb in chosen}
         for verb in chosen:
             reference = references[verb.name]

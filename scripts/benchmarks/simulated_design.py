@@ -17,6 +17,9 @@ from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
 # Time that a task needs to reach a worker of a cluster, and its result to return [s].
 LATENCY = 5e-3
 
+# What stands between the name of a start and the number of its copy.
+COPY = ", copy "
+
 
 @dataclass(frozen=True, kw_only=True)
 class Efficiency:
@@ -100,10 +103,6 @@ def _copy_name(found: Sequence[InitialControl], i: int) -> str:
     """Name of a copy of a start; the first ones keep theirs."""
     name = str(found[i % len(found)].name)
     return name if i < len(found) else f"{name}{COPY}{i // len(found)}"
-
-
-# What stands between the name of a start and the number of its copy.
-COPY = ", copy "
 
 
 class _MeasuredSearches(MeasuredTasks):
