@@ -357,9 +357,12 @@ def simulation(sizes: Sizes, measured: int, starts: int, picture: Path) -> bool:
     rows = efficiencies(experiment.replace(descent=descent), starts, MOST_WORKERS)
 
     print(f"a design from {starts} starts, lengths of {measured} of them measured:")
-    print("workers  seconds  efficiency  of the searches alone")
+    print("workers  seconds  efficiency  of the searches alone  seconds of the caller")
     for row in rows:
-        print(f"{row.workers:7d} {row.seconds:8.1f} {row.efficiency:11.3f} {row.of_searches:22.3f}")
+        print(
+            f"{row.workers:7d} {row.seconds:8.1f} {row.efficiency:11.3f} {row.of_searches:22.3f} "
+            f"{row.caller:22.1f}"
+        )
     save_curve(rows, LEAST_EFFICIENCY, picture)
     print(f"the curve is in {picture}")
     return rows[-1].efficiency >= LEAST_EFFICIENCY

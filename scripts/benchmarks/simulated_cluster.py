@@ -63,6 +63,7 @@ class SimulatedCluster(Executor):
     Attributes:
         now: Simulated time [s].
         busy: Length of all tasks together [s].
+        caller: CPU time of the caller between the tasks, such as for choosing survivors [s].
         searching: Time from the submission of the first task to the arrival of the last one [s].
     """
 
@@ -70,6 +71,7 @@ class SimulatedCluster(Executor):
         self.max_workers = count
         self.now = 0.0
         self.busy = 0.0
+        self.caller = 0.0
         self.searching = 0.0
         self._first: float | None = None
         self._tasks = tasks
@@ -108,6 +110,7 @@ class SimulatedCluster(Executor):
         """Move the clock on by the CPU time that the caller has used."""
         mark = time.process_time()
         self.now += mark - self._mark
+        self.caller += mark - self._mark
         self._mark = mark
 
     def advance(self) -> None:

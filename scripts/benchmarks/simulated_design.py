@@ -31,12 +31,14 @@ class Efficiency:
         efficiency: Seconds of the same design on one worker, over workers times `seconds`.
         of_searches: The same from the first task to the last one, without what the caller does
             before and after them.
+        caller: CPU time of the caller, whom all workers wait for if it is busy [s].
     """
 
     workers: int
     seconds: float
     efficiency: float
     of_searches: float
+    caller: float
 
 
 def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> list[Efficiency]:
@@ -68,6 +70,7 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> list[E
                 seconds=found.whole,
                 efficiency=alone.whole / (number * found.whole),
                 of_searches=found.busy / (number * found.searches),
+                caller=found.caller,
             )
         )
     return rows
@@ -75,11 +78,19 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> list[E
 
 @dataclass(frozen=True, kw_only=True)
 class _Times:
-    """Simulated times of a design [s]: whole, from the first to the last task, and of all tasks."""
+    """Simulated times of a design [s].
+
+    Attributes:
+        whole: The whole design.
+        searches: From the first task to the last one.
+        busy: All tasks together.
+        caller: The caller's own work.
+    """
 
     whole: float
     searches: float
     busy: float
+    caller: float
 
 
 def _simulated_seconds(task: DesignTask, tasks: MeasuredTasks, starts: int, workers: int) -> _Times:
@@ -96,7 +107,9 @@ def _simulated_seconds(task: DesignTask, tasks: MeasuredTasks, starts: int, work
         simulated(workers, tasks, LATENCY) as cluster,
     ):
         design_module.design_task(task, executor=cluster.workers)
-    return _Times(whole=cluster.now, searches=cluster.searching, busy=cluster.busy)
+    return _Times(
+        whole=cluster.now, searches=cluster.searching, busy=cluster.busy, caller=cluster.caller
+    )
 
 
 def _copy_name(found: Sequence[InitialControl], i: int) -> str:
