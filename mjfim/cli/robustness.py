@@ -51,7 +51,7 @@ def robustness(
     wrong: Annotated[
         float,
         typer.Option(
-            help=f"Relative error of the guess of every parameter, from 0 to {MAX_WRONG:g}."
+            help=f"Relative error of the nominal value of every parameter, from 0 to {MAX_WRONG:g}."
         ),
     ] = 0.2,
     latency: Annotated[

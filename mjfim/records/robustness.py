@@ -33,7 +33,7 @@ class RobotConditions:
     """Differences between the simulated robots and the model.
 
     Attributes:
-        wrong: Relative error of the guess of every parameter; its sign is random.
+        wrong: Relative error of the nominal value of every parameter; its sign is random.
         latency: Delay of the control [s].
         feedback: True if the controller adds the gains times the measured deviation.
         loudness: Ratio of the robot's noise to the stated noise.

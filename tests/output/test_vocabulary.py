@@ -19,6 +19,7 @@ PAGE = ROOT / "docs" / "reference" / "words-and-colours.md"
 REPLACED = {
     r"optimi[sz]ed (trajectory|motion|control|design|experiment)": "designed",
     r"final (trajectory|motion|fit|design)\b": "designed, or last",
+    r"errors? of (the )?guess|identified from the guess": "nominal value",
     r"from one to the next": "lag-1 correlation",
     r"\b(the|predicted|wanted|stated|of) sigma\b": "σ",
 }

@@ -63,12 +63,12 @@ def _unknown_table(result: Robustness) -> SummaryTable:
         title=f"Accuracy of {result.runs} robots, each identified from the nominal values",
         columns=columns(
             "unknown",
-            "error of nominal",
+            "nominal error",
             "σ predicted",
             "σ formal",
             "rms error",
             f"in 95 % interval, of {result.runs}",
-            optional=["error of nominal", "σ formal"],
+            optional=["nominal error", "σ formal"],
         ),
         rows=tuple(rows),
     )
