@@ -18,7 +18,11 @@ from mjfim.information.fisher import FisherInformation
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     COARSER_STEP_FACTOR,
+    COLUMN_ERROR_FACTOR,
+    ERROR_FACTOR,
     LEAST_EFFECT,
+    LEAST_RELATIVE_EFFECT,
+    ZERO_SINGULAR_VALUES,
     NullSpace,
     find_null_space,
     parameter_groups,
@@ -47,6 +51,9 @@ FEW_SAMPLES = 60
 # Difference steps of the parameters for single engine steps, relative to the size of each
 # parameter.
 SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
+
+# Smallest divisor; it prevents a division by zero.
+TINY = 1e-300
 
 # An effect on a whole motion is certain if it exceeds this multiple of the derivatives' error.
 CLEAR_EFFECT = 1e3
@@ -237,7 +244,7 @@ def _identifiability(
         return _with_groups(test, along_trajectory, along_trajectory)
 
     tried = list(itertools.takewhile(lambda _: not stop(), test.probes(PROBES)))
-    known = _single_step_null_space(test, [trajectory, *tried])
+    known = _single_step_null_space(test, [trajectory, *tried], single_steps)
     known = _hidden_from_rows(test, known, J, error)
     stack, errors = [J], [error]
 
@@ -256,12 +263,18 @@ def _identifiability(
 
 
 def _single_step_null_space(
-    test: IdentifiabilityTest, trajectories: Sequence[Trajectory]
+    test: IdentifiabilityTest, trajectories: Sequence[Trajectory], known: Array | None = None
 ) -> Array | None:
     """Directions (t, k) without effect on single steps and their outputs.
 
     Such a direction changes no motion and no output. Single steps show this accurately, even if
     motions are chaotic.
+
+    Args:
+        test: The plant and its parameters.
+        trajectories: Trajectories whose samples are tested.
+        known: (t, k) directions without effect on single steps of the first trajectory, or None
+            where they are not known.
 
     Returns:
         The directions; None if no wanted parameter changes the model, or if all steps diverge.
@@ -271,54 +284,153 @@ def _single_step_null_space(
     if not len(inside):
         return None
 
-    no_prior = np.zeros_like(test.prior)
+    # A few samples are tested first. Another sample may show an effect of the directions that have
+    # none there, such as a contact that depends on them. One combination of them is tested at all
+    # samples, and every parameter only where that combination has an effect.
+    few = _step_effects(test, trajectories[:1], FEW_SAMPLES)
+    if few is not None:
+        directions = _without_effect(test, few, inside) if known is None else known
+        others = trajectories if known is None else trajectories[1:]
+        if not _has_effect(test, others, few, directions):
+            return _hidden_from_earlier(test, directions)
+
     longest = max(trajectory.samples for trajectory in trajectories)
+    found = _step_effects(test, trajectories, longest)
+    if found is None:
+        return None
+    return _hidden_from_earlier(test, _without_effect(test, found, inside))
 
-    # A few samples are tested first. If a direction has no effect on them, all samples are tested,
-    # because a contact between the few may depend on it.
-    for most in (FEW_SAMPLES, longest):
-        found = _step_effects(test, trajectories, most)
-        if found is None:
-            return None
-        J, error = found[0][:, inside], found[1][:, inside]
-        step, scale = parameters.magnitude[inside], parameters.scale[inside]
-        null = find_null_space(J, error, step, scale, np.arange(len(inside)), no_prior)
-        if not null.count:
-            break
 
-    directions = np.zeros((len(parameters.interest), null.count))
-    directions[np.searchsorted(parameters.interest, inside)] = null.directions
-    return _hidden_from_earlier(test, directions)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _StepEffects:
+    """Effects of directions of theta on single steps of trajectories.
+
+    Attributes:
+        J: (n, m) effects, see `mjfim.plant.step_derivatives.StepEffects`.
+        error: (n, m) their change with a longer difference step.
+        output_sizes: (ny,) sizes of the outputs, or None where there are no sensors.
+    """
+
+    J: Array
+    error: Array
+    output_sizes: Array | None
 
 
 def _step_effects(
-    test: IdentifiabilityTest, trajectories: Sequence[Trajectory], most: int
-) -> tuple[Array, Array] | None:
-    """Effects of the parameters on single steps, and their error; None if all trajectories diverge.
+    test: IdentifiabilityTest,
+    trajectories: Sequence[Trajectory],
+    most: int,
+    *,
+    directions: Array | None = None,
+    output_sizes: Array | None = None,
+) -> _StepEffects | None:
+    """Effects on single steps; None if all trajectories diverge.
 
     Args:
         test: The plant and its parameters.
         trajectories: Trajectories whose samples are tested.
         most: Largest number of samples of each trajectory.
-
-    Returns:
-        (n, p) effects and (n, p) their change with a longer difference step.
+        directions: (m, p) directions of theta; None for each parameter alone.
+        output_sizes: (ny,) sizes of the outputs; None for the largest effects of each trajectory.
     """
     stack, errors = [], []
+    sizes = output_sizes
     for trajectory in trajectories:
         count = min(most, trajectory.samples)
         picked = np.unique(np.linspace(0, trajectory.samples - 1, count).astype(int))
         try:
             first, second = (
-                test.plant.derivatives.one_step(test.theta, trajectory, picked, step)
+                test.plant.derivatives.one_step(
+                    test.theta,
+                    trajectory,
+                    picked,
+                    step,
+                    directions=directions,
+                    output_sizes=output_sizes,
+                )
                 for step in SINGLE_STEP_DIFFERENCES
             )
         except SimulationDivergedError:
             continue
-        stack.append(first)
-        errors.append(second - first)
+        stack.append(first.rows)
+        errors.append(second.rows - first.rows)
+        sizes = first.output_sizes
 
-    return (np.concatenate(stack), np.concatenate(errors)) if stack else None
+    if not stack:
+        return None
+    return _StepEffects(J=np.concatenate(stack), error=np.concatenate(errors), output_sizes=sizes)
+
+
+def _without_effect(test: IdentifiabilityTest, effects: _StepEffects, inside: np.ndarray) -> Array:
+    """(t, k) directions of the parameters inside the model without effect on single steps."""
+    parameters = test.parameters
+    null = find_null_space(
+        effects.J[:, inside],
+        effects.error[:, inside],
+        parameters.magnitude[inside],
+        parameters.scale[inside],
+        np.arange(len(inside)),
+        np.zeros_like(test.prior),
+    )
+    directions = np.zeros((len(parameters.interest), null.count))
+    directions[np.searchsorted(parameters.interest, inside)] = null.directions
+    return directions
+
+
+def _has_effect(
+    test: IdentifiabilityTest,
+    trajectories: Sequence[Trajectory],
+    few: _StepEffects,
+    directions: Array,
+) -> bool:
+    """Check whether directions have an effect on any single step.
+
+    A random combination of them has an effect, almost surely, where one of them has.
+
+    Args:
+        test: The plant and its parameters.
+        trajectories: Trajectories, all of whose samples are tested.
+        few: Effects of each parameter at a few samples, to which an effect is compared.
+        directions: (t, k) directions.
+
+    Returns:
+        True also where no step can be simulated.
+    """
+    k = directions.shape[1]
+    if not k or not trajectories:
+        return False
+
+    interest = test.parameters.interest
+    relative = directions / test.parameters.magnitude[interest][:, None]
+    share = np.random.default_rng(0).standard_normal(k) / np.linalg.norm(relative, axis=0)
+    combination = np.zeros((1, len(test.theta)))
+    combination[0, interest] = directions @ share
+
+    longest = max(trajectory.samples for trajectory in trajectories)
+    found = _step_effects(
+        test, trajectories, longest, directions=combination, output_sizes=few.output_sizes
+    )
+    if found is None:
+        return True
+
+    effect = float(_root_mean_square(found.J)[0])
+    error = float(_root_mean_square(found.error)[0])
+
+    # A weak effect that is no larger than its error is round-off.
+    sizes = test.parameters.magnitude
+    strongest = float((sizes * _root_mean_square(few.J)).max(initial=0.0))
+    weak = LEAST_RELATIVE_EFFECT * strongest * float(np.linalg.norm(combination[0] / sizes))
+    if effect <= min(weak, COLUMN_ERROR_FACTOR * error):
+        return False
+
+    # Other effects are compared with those of the parameters that cancel in the combination.
+    parts = max(float(np.linalg.norm(combination[0] * _root_mean_square(few.J))), TINY)
+    return effect / parts > float(np.clip(ERROR_FACTOR * error / parts, *ZERO_SINGULAR_VALUES))
+
+
+def _root_mean_square(rows: Array) -> Array:
+    """(m,) root mean square of each column of rows: (n, m)."""
+    return np.asarray(np.sqrt(np.mean(rows**2, axis=0)))
 
 
 def _with_groups(
