@@ -413,8 +413,10 @@ def _has_effect(
     if found is None:
         return True
 
+    # The directions are as inaccurate as the effects from which they follow.
     effect = float(_root_mean_square(found.J)[0])
     error = float(_root_mean_square(found.error)[0])
+    error += float(np.linalg.norm(combination[0] * _root_mean_square(few.error)))
 
     # A weak effect that is no larger than its error is round-off.
     sizes = test.parameters.magnitude

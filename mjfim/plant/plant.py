@@ -21,6 +21,7 @@ from mjfim.plant.derivatives import Derivatives
 from mjfim.plant.divergence import explain_divergence
 from mjfim.plant.outputs import Outputs
 from mjfim.plant.state_sizes import StateSizes
+from mjfim.plant.written_models import WrittenModels
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of compiled models at single parameter values that a plant keeps.
@@ -86,7 +87,7 @@ class Plant:
         self._step_factors: Array | None = None
         self._smooth = smooth
         self._cached_models: dict[bytes, Any] = {}
-        self._reusable_models: list[Any] = []
+        self._written_models = WrittenModels(source, parameters)
 
     @property
     def derivatives(self) -> Derivatives:
@@ -217,7 +218,7 @@ class Plant:
     def models(self, theta: Array) -> list[Any]:
         """Models at many parameter values.
 
-        The next call may overwrite the models.
+        A later call may overwrite the models.
 
         Args:
             theta: (m, p) parameters [theta-unit].
@@ -238,7 +239,7 @@ class Plant:
     def try_models(self, theta: Array) -> tuple[list[Any], np.ndarray]:
         """Models at many parameter values, of which some may be impossible to compile.
 
-        The next call may overwrite the models.
+        A later call may overwrite the models.
 
         Args:
             theta: (m, p) parameters [theta-unit].
@@ -250,15 +251,9 @@ class Plant:
         if self.parameters.needs_compile.any():
             return self._compile(theta)
 
-        # Parameters that need no compile are written into copies, which the next call uses again.
-        while len(self._reusable_models) < len(theta):
-            self._reusable_models.append(copy.copy(self.source.model))
-
-        models = self._reusable_models[: len(theta)]
-        for model, row in zip(models, theta, strict=True):
-            self.parameters.writer.write(model, row)
-            self.source.refresh(model)
-        return models, np.ones(len(theta), dtype=bool)
+        # Parameters that need no compile are written into copies, which are kept: a design asks for
+        # the same values at every iterate.
+        return self._written_models.at(theta), np.ones(len(theta), dtype=bool)
 
     def _compile(self, theta: Array) -> tuple[list[Any], np.ndarray]:
         """Compile one model for each row of theta: (m, p).

@@ -15,6 +15,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.designable import require_designable
 from mjfim.excitation.task import DesignTask
 from mjfim.information.identifiability import (
+    FEW_SAMPLES,
     PROBES,
     Identifiability,
     _single_step_null_space,
@@ -308,3 +309,30 @@ def test_a_design_is_refused_before_any_optimisation(tmp_path) -> None:
     start = np.stack([np.sin(5.0 * task.t), np.cos(4.0 * task.t)], axis=1)
     result = design_task(two_task(tmp_path, descent={"max_iterations": 1}), initial_control=start)
     assert np.isfinite(result.final.std).all()
+
+
+def test_directions_without_effect_at_a_few_samples_are_tested_at_all_of_them(
+    tmp_path, monkeypatch
+) -> None:
+    """Both sliders rest at the first sample, which alone is tested first, and are pushed later."""
+    monkeypatch.setattr("mjfim.information.identifiability.FEW_SAMPLES", 1)
+    task = two_task(tmp_path)
+    control = np.zeros_like(task.control)
+    control[task.samples // 2 :] = 0.5
+    pushed = task.plant.simulate(task.theta, control)
+
+    found = _single_step_null_space(task.identifiability_test, [pushed])
+    assert found is not None and not found.shape[1]
+
+
+def test_the_common_null_space_needs_few_single_steps(tmp_path) -> None:
+    task = cart_task(tmp_path, parameters=PRODUCT)
+    before = task.plant.engine_steps
+    found = _single_step_null_space(task.identifiability_test, [task.initial])
+    assert found is not None and found.shape[1] == 1
+
+    # Two differences of each of three parameters at 60 samples, and of one combination at all.
+    spent = task.plant.engine_steps - before
+    samples = task.samples * task.plant.simulator.substeps
+    few = FEW_SAMPLES * task.plant.simulator.substeps
+    assert spent <= 4 * (len(task.theta) * few + samples)

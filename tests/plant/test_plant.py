@@ -926,3 +926,29 @@ def test_quaternions_of_the_initial_state_are_normalised_or_refused(tmp_path) ->
         start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 0, 1e-9)
     with pytest.raises(ExperimentError, match=r"joint 'float' \(numbers 3 to 6\)"):
         start(*[0.0] * 11)
+
+
+def test_models_at_values_that_were_asked_for_before_are_not_written_again(
+    tmp_path, monkeypatch
+) -> None:
+    plant = cart_task(tmp_path).plant
+    theta = np.array([[1.9, 1.0, 1.0], [2.0, 1.1, 1.0]])
+    written = []
+    write = plant.parameters.writer.write
+    monkeypatch.setattr(
+        type(plant.parameters.writer),
+        "write",
+        lambda self, model, row: (written.append(row), write(model, row))[1],
+    )
+    first = plant.models(theta)
+    masses = [float(model.body_mass[-1]) for model in first]
+    assert plant.models(theta[::-1]) == first[::-1]
+    assert len(written) == 2
+
+    # Values that differ from call to call take spare copies, and leave those of a large call.
+    for k in range(40):
+        (moved,) = plant.models(np.array([[3.0 + k, 1.0, 1.0]]))
+        assert moved.body_mass[-1] == 3.0 + k
+        assert plant.models(theta) == first
+    assert [float(model.body_mass[-1]) for model in first] == masses
+    assert len(written) == 42
