@@ -17,6 +17,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken
+from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.residuals import BatchWork, FitProblem, Pins
@@ -32,13 +33,13 @@ from mjfim.optimize.levenberg_marquardt import (
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.parallel import Workers, one_blas_thread, pool_stop_token, results_or_here
 from mjfim.parallel.kept import KeptPerThread
-from mjfim.parallel.shared_value import SharedValue
+from mjfim.parallel.shared_value import SharedValue, require_values
 from mjfim.plant.noise import Noise
 
 T = TypeVar("T")
 
 # Number of problems that a worker keeps: a fit has variants with other noise or other segments.
-KEPT_PROBLEMS = 4
+KEPT_PROBLEMS = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,7 +48,7 @@ class _ProblemOrder:
 
     Attributes:
         system: The system.
-        recordings: The recordings that are needed, by their index.
+        recordings: Each of the recordings that are needed, by its index.
         masks: (M, ny) measured values of these recordings that count.
         row_counts: Number of rows M of every recording.
         segments: All segments of the problem.
@@ -60,8 +61,8 @@ class _ProblemOrder:
         difference_step: Relative step of the differences.
     """
 
-    system: SystemOrder
-    recordings: SharedValue[dict[int, AlignedRecording]]
+    system: SharedValue[SystemOrder]
+    recordings: dict[int, SharedValue[AlignedRecording]]
     masks: dict[int, np.ndarray]
     row_counts: tuple[int, ...]
     segments: tuple[Segment, ...]
@@ -75,11 +76,13 @@ class _ProblemOrder:
 
     def problem(self) -> FitProblem:
         """Make the problem; recordings that are not needed are empty."""
-        system = self.system.system()
+        require_values([self.system, *self.recordings.values()])
+        system = _worker_systems.get(self.system.digest, lambda: self.system.value.system())
+
         ny = len(system.outputs)
-        known = self.recordings.value
+        known = self.recordings
         recordings = [
-            known[i] if i in known else _without_values(count, ny)
+            known[i].value if i in known else _without_values(count, ny)
             for i, count in enumerate(self.row_counts)
         ]
         masks = [
@@ -131,6 +134,9 @@ class _Found(Generic[T]):
 
 # ---- in a worker
 
+
+# The latest systems of a worker, by the hash of their order.
+_worker_systems: KeptPerThread[System] = KeptPerThread(KEPT_PROBLEMS)
 
 # The latest problems of a worker, by the hash of their order.
 _worker_problems: KeptPerThread[FitProblem] = KeptPerThread(KEPT_PROBLEMS)
@@ -213,8 +219,10 @@ class FitWorkers:
         self._executor = Workers.of(executor)
         self._orders: _Orders = WeakKeyDictionary()
 
-        # Recordings by their identities, which are those of the objects as long as these are here.
-        self._recordings: dict[tuple[int, ...], SharedValue[dict[int, AlignedRecording]]] = {}
+        # Variants of a problem have the same systems and recordings.
+        self._systems: dict[tuple[int, int], tuple[System, SharedValue[SystemOrder]]] = {}
+        self._recordings: WeakKeyDictionary[AlignedRecording, SharedValue[AlignedRecording]]
+        self._recordings = WeakKeyDictionary()
 
     def of_batches(
         self,
@@ -279,8 +287,8 @@ class FitWorkers:
     def _made(self, problem: FitProblem, needed: Sequence[int], threads: int) -> _ProblemOrder:
         """The order for a problem with some of its recordings."""
         return _ProblemOrder(
-            system=SystemOrder.of(problem.system, threads),
-            recordings=self._shared_recordings(problem, needed),
+            system=self._shared_system(problem.system, threads),
+            recordings={i: self._shared_recording(problem.recordings[i]) for i in needed},
             masks={i: problem.masks[i] for i in needed},
             row_counts=tuple(len(recording.t) for recording in problem.recordings),
             segments=problem.segments,
@@ -293,15 +301,22 @@ class FitWorkers:
             difference_step=problem.difference_step,
         )
 
-    def _shared_recordings(
-        self, problem: FitProblem, needed: Sequence[int]
-    ) -> SharedValue[dict[int, AlignedRecording]]:
-        """Some recordings; variants of a problem share them."""
-        chosen = {i: problem.recordings[i] for i in needed}
-        key = tuple(number for i in needed for number in (i, id(chosen[i])))
-        if key not in self._recordings:
-            self._recordings[key] = SharedValue(uuid.uuid4().hex, chosen)
-        return self._recordings[key]
+    def _shared_system(self, system: System, threads: int) -> SharedValue[SystemOrder]:
+        """The order for a system, made once."""
+        key = (id(system), threads)
+        if key not in self._systems:
+            order = SharedValue(uuid.uuid4().hex, SystemOrder.of(system, threads))
+
+            # The system is kept as well, so that no other one has its identity.
+            self._systems[key] = (system, order)
+        return self._systems[key][1]
+
+    def _shared_recording(self, recording: AlignedRecording) -> SharedValue[AlignedRecording]:
+        """A recording, sent once."""
+        if recording not in self._recordings:
+            size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
+            self._recordings[recording] = SharedValue(uuid.uuid4().hex, recording, size)
+        return self._recordings[recording]
 
 
 # Orders of each problem, by the threads of a worker and the recordings that are needed.

@@ -73,7 +73,8 @@ class PackedFiles:
         """Return these files for tasks, each of which is sent with their hash alone."""
         if isinstance(self.held, SharedValue):
             return self
-        return PackedFiles(digest=self.digest, held=SharedValue(self.digest, self.held))
+        size = sum(map(len, self.held.values()))
+        return PackedFiles(digest=self.digest, held=SharedValue(self.digest, self.held, size))
 
     def content(self, path: Path) -> bytes | None:
         """Return the bytes of a file; None if it is not among the packed files."""

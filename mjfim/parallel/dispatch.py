@@ -9,13 +9,13 @@ from concurrent.futures import BrokenExecutor, Future, wait
 from dataclasses import dataclass, field
 from functools import partial
 from queue import Empty, SimpleQueue
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.interruption import hurried
 from mjfim.parallel.losses import is_loss, is_refused_by_pickle, is_shared_loss
-from mjfim.parallel.shared_value import AbsentValue, attempt, owned_value
+from mjfim.parallel.shared_value import AbsentValue, SentValue, attempt, owned_value
 from mjfim.parallel.workers import Workers
 
 T = TypeVar("T")
@@ -85,7 +85,7 @@ class _Work(Generic[Order]):
     order: Order
     losses: int = 0
     needs_isolation: bool = False
-    values: dict[str, Any] = field(default_factory=dict)
+    values: dict[str, SentValue] = field(default_factory=dict)
 
 
 class Dispatch(Generic[Order, T]):
@@ -201,10 +201,10 @@ class Dispatch(Generic[Order, T]):
         if _is_lost(future):
             return self._done_again(work, is_shared=_is_shared(future))
 
-        # An order that needs a value is submitted again with it.
+        # An order that needs values is submitted again with them.
         result = _result_of(future)
         if isinstance(result, AbsentValue):
-            work.values[result.digest] = owned_value(result.digest)
+            work.values.update({digest: owned_value(digest) for digest in result.digests})
             self._waiting.appendleft(work)
             return None
         return Outcome(index=work.index, found=(result,))

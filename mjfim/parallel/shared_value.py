@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
@@ -17,21 +17,21 @@ from weakref import WeakValueDictionary
 T = TypeVar("T")
 Order = TypeVar("Order")
 
-# Number of values that a process keeps. Those that were not used for the longest time are sent
-# again when a task needs them.
-KEPT_VALUES = 16
+# Size of the values that a process keeps [bytes]. Those that were not used for the longest time are
+# sent again when a task needs them.
+KEPT_BYTES = 256 * 2**20
 
 
 class AbsentValueError(Exception):
-    """A task needs a shared value that its process has not received.
+    """A task needs shared values that its process has not received.
 
     Attributes:
-        digest: Hash of the value.
+        digests: Hashes of the values.
     """
 
-    def __init__(self, digest: str) -> None:
-        super().__init__(digest)
-        self.digest = digest
+    def __init__(self, *digests: str) -> None:
+        super().__init__(*digests)
+        self.digests = digests
 
 
 class SharedValue(Generic[T]):
@@ -40,13 +40,16 @@ class SharedValue(Generic[T]):
     Args:
         digest: Hash of the value; equal for equal values only.
         value: The value, which can be pickled and is never changed.
+        size: About the memory that the value takes [bytes].
 
     Attributes:
         digest: The hash.
+        size: About the memory that the value takes [bytes].
     """
 
-    def __init__(self, digest: str, value: T) -> None:
+    def __init__(self, digest: str, value: T, size: int = 0) -> None:
         self.digest = digest
+        self.size = size
         self._value: tuple[T, ...] = (value,)
         _owned[digest] = self
 
@@ -63,9 +66,27 @@ class SharedValue(Generic[T]):
         found: T = _received.get(self.digest)
         return found
 
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
-        """Pickle the hash alone."""
-        return _referenced, (self.digest,)
+    @property
+    def is_here(self) -> bool:
+        """True where this process has the value."""
+        return bool(self._value) or _received.has(self.digest)
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str, int]]:
+        """Pickle the hash alone, with the size."""
+        return _referenced, (self.digest, self.size)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SentValue:
+    """A value on its way to a worker, and in its memory.
+
+    Attributes:
+        value: The value.
+        size: About the memory that it takes [bytes].
+    """
+
+    value: Any
+    size: int
 
 
 class _ReceivedValues:
@@ -74,15 +95,25 @@ class _ReceivedValues:
     def __init__(self) -> None:
         """Start without any value."""
         self._lock = threading.Lock()
-        self._values: OrderedDict[str, Any] = OrderedDict()
+        self._values: OrderedDict[str, SentValue] = OrderedDict()
 
-    def put(self, digest: str, value: object) -> None:
-        """Keep a value, and forget the one that was not used for the longest time."""
+    def put(self, values: Mapping[str, SentValue]) -> None:
+        """Keep values, and forget others that were not used for the longest time."""
         with self._lock:
-            self._values[digest] = value
-            self._values.move_to_end(digest)
-            while len(self._values) > KEPT_VALUES:
+            for digest, value in values.items():
+                self._values[digest] = value
+                self._values.move_to_end(digest)
+
+            # The values of one task are kept together, however large they are.
+            while len(self._values) > len(values) and self._size > KEPT_BYTES:
                 self._values.popitem(last=False)
+
+    def has(self, digest: str) -> bool:
+        """Check whether a value is here, and count that as a use of it."""
+        with self._lock:
+            if digest in self._values:
+                self._values.move_to_end(digest)
+            return digest in self._values
 
     def get(self, digest: str) -> Any:
         """Return a value; AbsentValueError where it was not received, or forgotten since."""
@@ -90,7 +121,12 @@ class _ReceivedValues:
             if digest not in self._values:
                 raise AbsentValueError(digest)
             self._values.move_to_end(digest)
-            return self._values[digest]
+            return self._values[digest].value
+
+    @property
+    def _size(self) -> int:
+        """Size of all values [bytes]."""
+        return sum(sent.size for sent in self._values.values())
 
 
 # Values that this process has made and still uses, and values that it has received.
@@ -98,7 +134,21 @@ _owned: WeakValueDictionary[str, SharedValue[Any]] = WeakValueDictionary()
 _received = _ReceivedValues()
 
 
-def owned_value(digest: str) -> Any:
+def require_values(values: Iterable[SharedValue[Any]]) -> None:
+    """Check that values are here, so that all absent ones are sent together.
+
+    Args:
+        values: The values.
+
+    Raises:
+        AbsentValueError: This process has not received all of them.
+    """
+    absent = [shared.digest for shared in values if not shared.is_here]
+    if absent:
+        raise AbsentValueError(*absent)
+
+
+def owned_value(digest: str) -> SentValue:
     """Return a value that this process has made, to send it to a worker.
 
     Args:
@@ -110,22 +160,22 @@ def owned_value(digest: str) -> Any:
     shared = _owned.get(digest)
     if shared is None:
         raise AbsentValueError(digest)
-    return shared.value
+    return SentValue(value=shared.value, size=shared.size)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AbsentValue:
-    """What a worker returns in place of a result where a value is absent.
+    """What a worker returns in place of a result where values are absent.
 
     Attributes:
-        digest: Hash of the value.
+        digests: Hashes of the values.
     """
 
-    digest: str
+    digests: tuple[str, ...]
 
 
 def attempt(
-    function: Callable[[Order], T], values: Mapping[str, Any], order: Order
+    function: Callable[[Order], T], values: Mapping[str, SentValue], order: Order
 ) -> T | AbsentValue:
     """Carry out an order in a worker, if the values are there that it needs.
 
@@ -137,18 +187,16 @@ def attempt(
         order: The order.
 
     Returns:
-        The result of the order, or which value it needs.
+        The result of the order, or which values it needs.
     """
-    for digest, value in values.items():
-        _received.put(digest, value)
-
+    _received.put(values)
     try:
         return function(order)
     except AbsentValueError as error:
-        return AbsentValue(digest=error.digest)
+        return AbsentValue(digests=error.digests)
 
 
-def _referenced(digest: str) -> SharedValue[Any]:
+def _referenced(digest: str, size: int) -> SharedValue[Any]:
     """Make the reference to a value: the value itself in the process that made it."""
     own = _owned.get(digest)
     if own is not None:
@@ -156,5 +204,6 @@ def _referenced(digest: str) -> SharedValue[Any]:
 
     reference: SharedValue[Any] = SharedValue.__new__(SharedValue)
     reference.digest = digest
+    reference.size = size
     reference._value = ()
     return reference

@@ -75,9 +75,9 @@ def test_a_value_is_sent_with_the_first_tasks_alone() -> None:
 
 
 def test_a_forgotten_value_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_value, "KEPT_VALUES", 1)
+    monkeypatch.setattr(shared_value, "KEPT_BYTES", len(LARGE))
     processes = FakeProcesses(1)
-    first, second = SharedValue("first", LARGE), SharedValue("second", LARGE)
+    first, second = (SharedValue(name, LARGE, len(LARGE)) for name in ("first", "second"))
 
     for value in (first, second, first):
         processes.sizes.clear()
