@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,12 +18,19 @@ from mjfim.excitation.interior_problem import values_of
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.search_slices import (
+    SLICE_SECONDS,
+    SearchSlice,
+    SearchState,
+    SliceLength,
+)
 from mjfim.excitation.short_steps import ShortSteps
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import RELAXED, ModelVariant
 from mjfim.parallel import offer_result, one_blas_thread, pool_stop_token
+from mjfim.parallel.kept import KeptPerThread
 from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
 from mjfim.records.iterates import IterateMotion
@@ -98,13 +105,35 @@ class ConstrainedSearch:
         Returns:
             The best feasible control, or the last one where none is feasible.
         """
-        task = self._task() if task is None else task
+        whole = yield from self.run_slice(task, SliceLength())
+        return whole.result
+
+    def run_slice(
+        self,
+        task: DesignTask | None,
+        length: SliceLength,
+        before: SearchSlice | None = None,
+    ) -> Generator[DesignEvent, None, SearchSlice]:
+        """Run a part of the search, with the same result to the last digit as the whole of it.
+
+        Args:
+            task: The task on the plant of the search; default: resolved from the experiment.
+            length: When the part ends.
+            before: The part before, which has not ended the search; None for the first one.
+
+        Yields:
+            Every iterate of the part.
+
+        Returns:
+            The result so far, and the state from which the next part goes on.
+        """
+        task = self.resolved() if task is None else task
         if self.start.repeats > 1:
             task = task.with_horizon(task.horizon / self.start.repeats)
 
-        return (yield from _Search.begin(self, task).run())
+        return (yield from _Search.begin(self, task, length, before).run(before))
 
-    def _task(self) -> DesignTask:
+    def resolved(self) -> DesignTask:
         """The task on the plant of the search."""
         return DesignTask.resolve(
             self.experiment,
@@ -114,21 +143,48 @@ class ConstrainedSearch:
         )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SliceOrder:
+    """Order for a part of a search, for a worker.
+
+    Attributes:
+        search: The search.
+        task_key: Text that is equal for searches on the same task, which a worker resolves once.
+        seconds: Time of the part [s].
+        iterations: Largest number of its iterates.
+        before: The part before; None for the first part.
+    """
+
+    search: ConstrainedSearch
+    task_key: str
+    seconds: float = SLICE_SECONDS
+    iterations: float = np.inf
+    before: SearchSlice | None = None
+
+
+# Tasks that a worker keeps for later slices: those of the two rounds of a design.
+_tasks = KeptPerThread[DesignTask](2)
+
+
 @one_blas_thread()
-def run_in_worker(search: ConstrainedSearch) -> RunResult:
-    """Run a search to its end, for an executor.
+def run_in_worker(order: SliceOrder) -> SearchSlice:
+    """Run a part of a search, for an executor.
 
     Args:
-        search: The order. A request to stop by its token or by that of the worker's pool ends it.
+        order: The order. A request to stop by the token of its search or by that of the worker's
+            pool ends it.
 
     Returns:
-        The best feasible control, or the last one where none is feasible.
+        The result so far, and the state.
     """
+    search = order.search
     search_stop, pool_stop = search.budget.stop, pool_stop_token()
     stop = StopToken(also=lambda: search_stop.requested or pool_stop.requested)
     search = replace(search, budget=search.budget.with_stop(stop))
 
-    return consume(search.run(), None)
+    task = _tasks.get(order.task_key, search.resolved)
+    length = SliceLength(seconds=order.seconds, iterations=order.iterations)
+    return consume(search.run_slice(task, length, order.before), None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,6 +200,7 @@ class _Search:
         constraints: The tightened limits.
         method: Minimises the smooth cost within the tightened limits.
         budget: Time and iterations of the search.
+        length: When this part of the search ends.
         steps_before: Engine steps of the plant when the search began.
     """
 
@@ -154,21 +211,32 @@ class _Search:
     constraints: ConstraintSet
     method: InteriorPointMethod
     budget: Budget
+    length: SliceLength
     steps_before: int
 
     @classmethod
-    def begin(cls, order: ConstrainedSearch, task: DesignTask) -> _Search:
+    def begin(
+        cls,
+        order: ConstrainedSearch,
+        task: DesignTask,
+        length: SliceLength,
+        before: SearchSlice | None,
+    ) -> _Search:
         """Set up the interior-point method; the time of the search counts from here."""
         budget = Budget(
             seconds=order.seconds,
             iterations=order.max_iterations,
             stop=order.budget.stop,
         )
+        steps_done = 0
+        if before is not None and before.state is not None:
+            budget = before.state.barrier.budget.resumed(order.budget.stop)
+            steps_done = before.result.steps
 
         # The controls that hold the start are found once for all searches of a process, so their
         # few steps do not count.
         centre, *other_centres = task.centre, *task.centres[1:]
-        steps_before = task.plant.engine_steps
+        steps_before = task.plant.engine_steps - steps_done
 
         # An initial control may bring its curves, such as a Fourier series; else a limited
         # bandwidth requires splines.
@@ -198,26 +266,35 @@ class _Search:
             constraints=constraints,
             method=method,
             budget=budget,
+            length=length,
             steps_before=steps_before,
         )
 
-    def run(self) -> Generator[DesignEvent, None, RunResult]:
-        """Yield every iterate and return the best result."""
+    def run(self, before: SearchSlice | None) -> Generator[DesignEvent, None, SearchSlice]:
+        """Yield every iterate of this part, and return the best result so far.
+
+        Args:
+            before: The part before; None for the first one.
+        """
         result = RunResult(name=self.order.start.name)
         status: Status | None = None
         best_of_stages: dict[float, Array] = {}
         steps = ShortSteps()
-        control = self.task.averaged(self.order.start.control)
+        if before is not None and before.state is not None:
+            result = before.result
+            best_of_stages = before.state.best_of_stages
+            steps = before.state.short_steps
 
         # A simulation that diverges ends this search, not those of other initial controls.
+        rows_before = len(result.history)
         try:
-            for iterate in self.method.run(control, self.budget):
+            for iterate in self._iterates(before):
                 status = iterate.status
                 point = self._exact_point(iterate)
                 result = self._updated(result, iterate, point)
 
                 # The next iterate may take longer than anybody waits for after Ctrl-C.
-                offer_result(replace(result, status=Status.INTERRUPTED))
+                offer_result(SearchSlice(result=replace(result, status=Status.INTERRUPTED)))
                 if np.isfinite(result.cost) and result.control is not None:
                     best_of_stages[iterate.mu] = result.control
                 if iterate.repaired:
@@ -235,11 +312,28 @@ class _Search:
                 result = replace(result, is_held_up=is_held_up)
                 if is_held_up or self.budget.stop.requested:
                     break
+
+                # The next part goes on from here.
+                is_over = self.length.is_over(len(result.history) - rows_before)
+                if is_over and iterate.state is not None and status is None:
+                    state = SearchState(
+                        barrier=iterate.state, best_of_stages=best_of_stages, short_steps=steps
+                    )
+                    return SearchSlice.unfinished(result, state)
         except (SimulationDivergedError, np.linalg.LinAlgError):
             status = Status.STALLED
 
         earlier = tuple(best_of_stages.values())[:-1]
-        return replace(result, status=self._final_status(result, status), earlier=earlier)
+        ended = replace(result, status=self._final_status(result, status), earlier=earlier)
+        return SearchSlice(result=ended)
+
+    def _iterates(self, before: SearchSlice | None) -> Iterator[BarrierIterate]:
+        """Iterates of the interior-point method, from the beginning or after those of a part."""
+        if before is not None and before.state is not None:
+            return self.method.resume(before.state.barrier, self.budget)
+
+        control = self.task.averaged(self.order.start.control)
+        return self.method.run(control, self.budget)
 
     def _is_too_slow(self, cost: float) -> bool:
         """Check whether a search has not reached a cost that it should have reached by now.

@@ -7,7 +7,6 @@ tightens the limits of the next stage.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopReason
+from mjfim.excitation.barrier_state import BarrierState, BetweenStages, WithinStage
 from mjfim.excitation.constraints import ConstraintSet
 from mjfim.excitation.feasibility import shrink_about_each
 from mjfim.excitation.interior_problem import InteriorPoint, InteriorProblem, values_of
@@ -109,6 +109,7 @@ class BarrierIterate:
             violated.
         status: How the run ended; None except in the last iterate.
         repaired: True where this is the iterate before, shrunk until all limits hold.
+        state: State from which the run can go on; None where it cannot be interrupted.
     """
 
     iterate: Iterate[InteriorPoint]
@@ -116,6 +117,7 @@ class BarrierIterate:
     margins: dict[str, float]
     status: Status | None = None
     repaired: bool = False
+    state: BarrierState | None = None
 
     @property
     def feasible(self) -> bool:
@@ -141,18 +143,20 @@ class _Stage:
     """Settings of one barrier stage.
 
     Attributes:
+        begun: State of the run at its beginning.
         problem: The problem to minimise, with the tightened limits of this stage.
         budget: Time of the stage.
+        total: Time and iterations of the whole run.
         max_iterations: Largest number of iterations of the stage.
         is_last: True for the stage with the smallest mu and its repetitions.
-        first_index: Number of its first iterate.
     """
 
+    begun: BetweenStages
     problem: InteriorProblem
     budget: Budget
+    total: Budget
     max_iterations: int
     is_last: bool
-    first_index: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -221,6 +225,18 @@ class InteriorPointMethod:
 
         if first.control is not None and not budget.stop.requested:
             yield from self._minimize(first.control, budget, first.iterations)
+
+    def resume(self, state: BarrierState, budget: Budget) -> Iterator[BarrierIterate]:
+        """Go on from an iterate, to the last digit as if the run had not been interrupted.
+
+        Args:
+            state: State of the iterate.
+            budget: Time and iterations of the run, of which a part is used.
+
+        Yields:
+            Every later iterate.
+        """
+        return self._run_stages(state.begun, budget, state.within)
 
     def shrink_inside(self, control: Array) -> Array | None:
         """Shrink a control about one of the centres until all limits hold strictly.
@@ -344,35 +360,37 @@ class InteriorPointMethod:
     def _minimize(
         self, control: Array, budget: Budget, first_index: int
     ) -> Iterator[BarrierIterate]:
-        """Run the stages with falling mu.
-
-        The last one is repeated until it has converged or the budget is used up, but only a few
-        times while its result is infeasible.
-        """
-        weights = self.schedule.barrier_weights()
-        infeasible_repeats = 0
-
-        # All stages share one direction, because its curvature pairs do not depend on mu.
-        direction = self._direction()
-        tightening = dict[str, float]()
-        was_feasible = False
-
-        point = self._problem(weights[0], self.constraints).point(control)
+        """Run all stages from a control."""
+        point = self._problem(self.schedule.barrier_weights()[0], self.constraints).point(control)
         if point.values is None:
             # The simulation diverges when the parameters change slightly.
             return
 
-        for number in itertools.count():
-            mu = weights[min(number, len(weights) - 1)]
-            problem = self._problem(mu, self.constraints.tightened(tightening))
-            stage = self._stage(problem, len(weights) - number, budget, first_index)
-            ended = yield from self._run_stage(stage, problem.reevaluate(point), direction)
+        # All stages share one direction, because its curvature pairs do not depend on mu.
+        begun = BetweenStages(point=point, direction=self._direction(), first_index=first_index)
+        yield from self._run_stages(begun, budget)
+
+    def _run_stages(
+        self, begun: BetweenStages, budget: Budget, within: WithinStage | None = None
+    ) -> Iterator[BarrierIterate]:
+        """Run the stages with falling mu.
+
+        The last one is repeated until it has converged or the budget is used up, but only a few
+        times while its result is infeasible.
+
+        Args:
+            begun: State at the beginning of the first stage.
+            budget: Time and iterations of all stages.
+            within: State within the first stage; None to begin it.
+        """
+        while True:
+            stage = self._stage(begun, budget, within)
+            ended = yield from self._run_stage(stage, within)
+            within = None
             if ended.converged:
                 return
 
-            point = ended.iterate.point
-            was_feasible = was_feasible or ended.was_feasible
-            first_index += ended.iterate.index
+            first_index = begun.first_index + ended.iterate.index
             budget.spend(iterations=ended.iterate.index)
             reason = budget.exhausted
 
@@ -380,77 +398,86 @@ class InteriorPointMethod:
             # take too long.
             repaired = None
             if not ended.is_feasible and reason is not StopReason.REQUESTED:
-                repaired = yield from self._repair(problem, ended.iterate, first_index)
+                repaired = yield from self._repair(stage.problem, ended.iterate, first_index)
 
-            infeasible_repeats += stage.is_last and not ended.is_feasible
-            if reason is not None or ended.stalled or infeasible_repeats > MAX_REPEATED_STAGES:
+            repeats = begun.infeasible_repeats + (stage.is_last and not ended.is_feasible)
+            if reason is not None or ended.stalled or repeats > MAX_REPEATED_STAGES:
                 return
+
+            begun = replace(
+                begun,
+                point=ended.iterate.point,
+                number=begun.number + 1,
+                first_index=first_index,
+                was_feasible=begun.was_feasible or ended.was_feasible,
+                infeasible_repeats=repeats,
+            )
 
             # Use the rest of the budget inside the limits where no iterate has been there.
             is_late = budget.used >= PATIENCE_OUTSIDE
-            if repaired is not None and is_late and not was_feasible:
-                point = repaired
-                direction = self._direction()
+            if repaired is not None and is_late and not begun.was_feasible:
+                begun = replace(begun, point=repaired, direction=self._direction())
 
             # Tighten violated limits, so that the result of the next stage keeps them.
-            if mu <= TIGHTENING_MU:
-                margins = self.constraints.relative_margins(values_of(point))
-                tightening = updated_tightening(tightening, margins)
+            if stage.problem.mu <= TIGHTENING_MU:
+                margins = self.constraints.relative_margins(values_of(begun.point))
+                begun = replace(begun, tightening=updated_tightening(begun.tightening, margins))
 
-    def _stage(
-        self, problem: InteriorProblem, stages_left: int, budget: Budget, first_index: int
-    ) -> _Stage:
-        """Settings of the next stage: its share of the time and of the iterations that are left."""
-        stages_left = max(stages_left, 1)
+    def _stage(self, begun: BetweenStages, budget: Budget, within: WithinStage | None) -> _Stage:
+        """Settings of a stage: its share of the time and of the iterations that are left."""
+        weights = self.schedule.barrier_weights()
+        mu = weights[min(begun.number, len(weights) - 1)]
+        stages_left = max(len(weights) - begun.number, 1)
         is_last = stages_left == 1
 
         # A stage may take somewhat more than an equal share of the time, the last one all of it.
         share = 1.0 if is_last else min(TIME_SHARE_FACTOR / stages_left, 1.0)
 
         patience = self.schedule.patience * (2 if is_last else 1)
-        max_iterations = min(patience, np.ceil(budget.iterations_left / stages_left))
+        max_iterations = int(min(patience, np.ceil(budget.iterations_left / stages_left)))
 
         return _Stage(
-            problem=problem,
-            budget=budget.share(share),
-            max_iterations=int(max_iterations),
+            begun=begun,
+            problem=self._problem(mu, self.constraints.tightened(begun.tightening)),
+            budget=budget.share(share) if within is None else within.budget.resumed(budget.stop),
+            total=budget,
+            max_iterations=max_iterations if within is None else within.max_iterations,
             is_last=is_last,
-            first_index=first_index,
         )
 
     def _run_stage(
-        self, stage: _Stage, start: InteriorPoint, direction: StructuredBFGS
+        self, stage: _Stage, within: WithinStage | None
     ) -> Generator[BarrierIterate, None, _StageResult]:
-        """Minimise with one mu until convergence, stagnation, or the end of the stage's budget."""
+        """Minimise with one mu until convergence, stagnation, or the end of the stage's budget.
+
+        Args:
+            stage: The stage.
+            within: State from which it goes on, whose iterate is not yielded again; None to begin.
+        """
         schedule = self.schedule
         problem = stage.problem
-        values: list[float] = []
-        was_feasible = False
+        values = [] if within is None else list(within.values)
+        was_feasible = within is not None and within.was_feasible
 
-        # Continue below a coarser stated tolerance: a smaller slope also means a smaller violation.
-        tolerance = min(schedule.tolerance, BarrierSchedule.tolerance)
-
-        iterates = optimize(
-            problem,
-            start,
-            direction,
-            self.regulator,
-            Armijo(),
-            tolerance=tolerance,
-            max_iterations=stage.max_iterations,
-        )
-        for iterate in iterates:
+        for iterate in self._iterates(stage, within):
             margins = self.constraints.margins(values_of(iterate.point))
             is_feasible = self.constraints.is_feasible(values_of(iterate.point))
-            was_feasible = was_feasible or is_feasible
 
             # A status ends the run only in the last stage, and only where the stated limits hold.
             status = Status.CONVERGED if iterate.slope <= schedule.tolerance else iterate.status
             if not (stage.is_last and is_feasible):
                 status = None
 
-            numbered = replace(iterate, index=stage.first_index + iterate.index)
-            yield BarrierIterate(iterate=numbered, mu=problem.mu, margins=margins, status=status)
+            if within is None:
+                yield BarrierIterate(
+                    iterate=replace(iterate, index=stage.begun.first_index + iterate.index),
+                    mu=problem.mu,
+                    margins=margins,
+                    status=status,
+                    state=_state_at(stage, iterate, values, was_feasible),
+                )
+            within = None
+            was_feasible = was_feasible or is_feasible
 
             if status is Status.CONVERGED:
                 break
@@ -470,6 +497,26 @@ class InteriorPointMethod:
             was_feasible=was_feasible,
             converged=status is Status.CONVERGED,
             stalled=status is Status.STALLED,
+        )
+
+    def _iterates(
+        self, stage: _Stage, within: WithinStage | None
+    ) -> Iterator[Iterate[InteriorPoint]]:
+        """Iterates of a stage; the first one is that of the state from which it goes on."""
+        begun = stage.begun
+        start = stage.problem.reevaluate(begun.point) if within is None else begun.point
+
+        # Continue below a coarser stated tolerance: a smaller slope also means a smaller violation.
+        tolerance = min(self.schedule.tolerance, BarrierSchedule.tolerance)
+        return optimize(
+            stage.problem,
+            start,
+            begun.direction,
+            self.regulator,
+            Armijo(),
+            tolerance=tolerance,
+            max_iterations=stage.max_iterations,
+            resumed=None if within is None else within.descent,
         )
 
     def _repair(
@@ -515,6 +562,23 @@ class InteriorPointMethod:
         N = len(self.base.running.desired_state) - 1
         ridge = RIDGE / N / self.constraints.control.bounds.scale**2
         return StructuredBFGS(ridge, self.basis)
+
+
+def _state_at(
+    stage: _Stage, iterate: Iterate[InteriorPoint], values: list[float], was_feasible: bool
+) -> BarrierState | None:
+    """State at an iterate of a stage, after the merits of its iterates before; None without one."""
+    if iterate.state is None:
+        return None
+
+    within = WithinStage(
+        descent=iterate.state,
+        budget=stage.budget.paused(),
+        max_iterations=stage.max_iterations,
+        values=tuple(values),
+        was_feasible=was_feasible,
+    )
+    return BarrierState(begun=stage.begun, within=within, budget=stage.total.paused())
 
 
 def nearly_inside(relative_margins: Mapping[str, float], violation: float) -> bool:

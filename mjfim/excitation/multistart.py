@@ -18,16 +18,17 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget
-from mjfim.excitation.constrained import ConstrainedSearch, run_in_worker
+from mjfim.excitation.constrained import ConstrainedSearch
 from mjfim.excitation.controls_within_limits import LimitedCost
 from mjfim.excitation.feasibility import reduced_actuators, shrink_about_each
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.run_result import RunResult, Runs, consume
+from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.excitation.verification import verify
 from mjfim.experiment.packing import for_workers
-from mjfim.parallel import Workers, results_or_here
+from mjfim.parallel import Workers
 from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
 
@@ -533,7 +534,11 @@ class Multistart:
         ]
         if self.executor is None:
             return (yield from self._run_here(searches, stage))
-        return (yield from self._run_in_workers(searches, self.executor))
+
+        # A worker needs no file of the caller.
+        packed = for_workers(task.experiment, task.system.source)
+        searches = [replace(search, experiment=packed) for search in searches]
+        return (yield from run_in_slices(self.executor, searches, self.budget))
 
     def _run_here(self, searches: Sequence[ConstrainedSearch], stage: DescentLevel) -> Runs:
         """Run searches one after the other while the budget lasts; the first one always begins."""
@@ -544,27 +549,6 @@ class Multistart:
 
             result = yield from search.run(stage.task)
             results.append(result)
-
-        return results
-
-    def _run_in_workers(self, searches: Sequence[ConstrainedSearch], executor: Executor) -> Runs:
-        """Run searches side by side; the iterates of each are reported when it has ended."""
-        results: list[RunResult] = []
-        source = self.fine.task.system.source
-        packed = for_workers(searches[0].experiment, source)
-        searches = [replace(search, experiment=packed) for search in searches]
-
-        def here(search: ConstrainedSearch) -> RunResult:
-            """Run a search whose process was ended from outside."""
-            return consume(search.run(), None)
-
-        for result in results_or_here(executor, run_in_worker, searches, self.budget, here):
-            results.append(result)
-
-            for row in result.history:
-                if self.budget.stop.requested:
-                    break
-                yield DesignEvent(start=result.name, row=row)
 
         return results
 

@@ -1,0 +1,195 @@
+"""Searches in slices: the results of the whole search, whatever becomes of the workers."""
+
+from __future__ import annotations
+
+import pickle
+import threading
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.budget import Budget, StopToken
+from mjfim.excitation import sliced_searches
+from mjfim.excitation.constrained import ConstrainedSearch, SliceOrder, run_in_worker
+from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.interior_point import BarrierSchedule
+from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.search_slices import SearchSlice
+from mjfim.excitation.sliced_searches import run_in_slices
+from mjfim.excitation.task import DesignTask
+from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
+from tests.support.limits import cart_inside
+
+# Iterations of a search, which pass through several stages of the barrier.
+ITERATIONS = 14
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
+    """A short experiment of the cart-pendulum within limits."""
+    return cart_inside(tmp_path_factory.mktemp("slices"), horizon=0.3)
+
+
+def search_of(task: DesignTask, factor: float = 1.0) -> ConstrainedSearch:
+    """A search from the initial control times a factor."""
+    return ConstrainedSearch(
+        experiment=task.experiment,
+        start=InitialControl(name=f"{factor:g} times", control=factor * task.control),
+        schedule=BarrierSchedule(patience=5),
+        max_iterations=ITERATIONS,
+        threads=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def searches(task: DesignTask) -> list[ConstrainedSearch]:
+    return [search_of(task, factor) for factor in (1.0, 0.8, 0.6)]
+
+
+@pytest.fixture(scope="module")
+def wholes(searches: list[ConstrainedSearch], whole: RunResult) -> list[RunResult]:
+    """Results of the searches as a whole."""
+    return [whole, *(consume(search.run(), None) for search in searches[1:])]
+
+
+@pytest.fixture(scope="module")
+def whole(searches: list[ConstrainedSearch]) -> RunResult:
+    """Result of the first search as a whole."""
+    return consume(searches[0].run(), None)
+
+
+def assert_same(found: RunResult, whole: RunResult) -> None:
+    """Assert that two results are equal to the last digit, apart from the time."""
+    assert (found.cost, found.status, found.slope) == (whole.cost, whole.status, whole.slope)
+    assert np.array_equal(np.asarray(found.control), np.asarray(whole.control))
+    assert found.steps == whole.steps
+    pairs = zip(found.earlier, whole.earlier, strict=True)
+    assert all(np.array_equal(one, other) for one, other in pairs)
+
+    rows = [
+        [replace(row, seconds=0.0, motion=None) for row in result.history]
+        for result in (found, whole)
+    ]
+    assert rows[0] == rows[1]
+
+
+@pytest.mark.parametrize("iterations", [4, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_search_in_slices_equals_the_whole_one_to_the_last_digit(
+    iterations: int, searches: list[ConstrainedSearch], whole: RunResult
+) -> None:
+    """Each slice is pickled, as on its way to another process."""
+    order = SliceOrder(search=searches[0], task_key="slices", iterations=iterations)
+    slices = [run_in_worker(pickle.loads(pickle.dumps(order)))]
+    while slices[-1].state is not None:
+        following = replace(order, before=slices[-1])
+        slices.append(run_in_worker(pickle.loads(pickle.dumps(following))))
+
+    assert len(slices) >= ITERATIONS // iterations
+    assert_same(slices[-1].result, whole)
+
+
+def run_sliced(
+    searches: list[ConstrainedSearch],
+    executor: Executor,
+    stop: StopToken | None = None,
+    callback: Callable[[DesignEvent], None] | None = None,
+) -> list[RunResult]:
+    """Run searches in slices, each of which ends after every second iterate."""
+    return consume(run_in_slices(executor, searches, Budget(stop=stop)), callback)
+
+
+@pytest.fixture(autouse=True)
+def short_slices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the slices of all tests end after two iterates."""
+
+    def order(**values: Any) -> SliceOrder:
+        return SliceOrder(**{"iterations": 2, **values})
+
+    monkeypatch.setattr(sliced_searches, "SliceOrder", order)
+
+
+class LosingExecutor(Executor):
+    """Does each task at once, and loses some of them.
+
+    Args:
+        is_lost: Given the order and the number of tasks so far, whether it is lost.
+    """
+
+    _max_workers = 2
+
+    def __init__(self, is_lost: Callable[[SliceOrder, int], bool]) -> None:
+        self.is_lost = is_lost
+        self.count = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.count += 1
+        order = next(each for each in args if isinstance(each, SliceOrder))
+        if self.is_lost(order, self.count):
+            future.set_exception(BrokenExecutor())
+        else:
+            future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
+        return future
+
+
+@pytest.mark.slow
+def test_slices_that_are_lost_are_done_again(
+    searches: list[ConstrainedSearch], wholes: list[RunResult]
+) -> None:
+    rows: list[DesignEvent] = []
+    executor = LosingExecutor(lambda order, count: count in (2, 3, 6, 10, 11, 17))
+    found = run_sliced(searches, executor, callback=rows.append)
+    for each, whole in zip(found, wholes, strict=True):
+        assert_same(each, whole)
+
+    # Each iterate is shown once, in the order of its search.
+    for whole in wholes:
+        shown = [event.row.iteration for event in rows if event.start == whole.name]
+        assert shown == [row.iteration for row in whole.history]
+
+
+@pytest.mark.slow
+def test_a_start_that_is_lost_each_time_is_reported_with_its_result_so_far(
+    searches: list[ConstrainedSearch], wholes: list[RunResult]
+) -> None:
+    executor = LosingExecutor(
+        lambda order, count: order.search is searches[1] and order.before is not None
+    )
+    found = run_sliced(searches, executor)
+    assert_same(found[0], wholes[0])
+    assert_same(found[2], wholes[2])
+    assert found[1].status is Status.LOST
+    assert len(found[1].history) == 2
+    assert found[1].control is not None
+
+
+def test_a_request_to_stop_loses_at_most_one_slice_on_threads(
+    searches: list[ConstrainedSearch],
+) -> None:
+    stop = StopToken()
+    rows: list[DesignEvent] = []
+
+    def stop_after_some(event: DesignEvent) -> None:
+        rows.append(event)
+        if len(rows) == 6:
+            stop.request()
+
+    with ThreadPoolExecutor(2) as executor:
+        found = run_sliced(searches, executor, stop, stop_after_some)
+    assert all(result.status is Status.INTERRUPTED for result in found)
+    assert sum(len(result.history) for result in found) >= 6
+    assert min(result.cost for result in found) < np.inf
+    assert threading.active_count() < 20
+
+
+@pytest.mark.slow
+def test_a_slice_says_when_its_search_has_ended(searches: list[ConstrainedSearch]) -> None:
+    ended = run_in_worker(SliceOrder(search=searches[0], task_key="ended", seconds=np.inf))
+    assert isinstance(ended, SearchSlice)
+    assert ended.state is None
+    assert ended.result.status is not Status.INTERRUPTED
