@@ -268,29 +268,35 @@ def on_cluster(verb: Verb, reference: Reference, workers: int) -> bool:
 def killed(verb: Verb, reference: Reference, workers: int, kills: int, seed: int) -> bool:
     """End a worker at random moments of a verb; the result has to be the same."""
     rng = np.random.default_rng(seed)
-    duration = _duration(verb, workers)
     same = 0
-    for _ in range(kills):
-        with cluster(workers) as client:
-            victims = sorted(client.run(os.getpid).values())
-            victim = int(rng.choice(victims))
+    with cluster(workers) as client:
+        duration = _duration(verb, client)
+        for _ in range(kills):
+            # A nanny has started another worker in place of the one before.
+            client.wait_for_workers(workers)
+            victim = int(rng.choice(sorted(client.run(os.getpid).values())))
             timer = threading.Timer(rng.uniform(0.0, duration), _kill, [victim])
             timer.daemon = True
             timer.start()
             same += verb.fingerprint(verb.run(client)) == reference.fingerprint
             timer.cancel()
 
-    print(f"{verb.name:11s} the same result after SIGKILL of a worker: {same} of {kills}")
+    print(
+        f"{verb.name:11s} the same result after SIGKILL of a worker: {same} of {kills}, within the "
+        f"{duration:.1f} s that it takes",
+        flush=True,
+    )
     return same == kills
 
 
 def interrupted(verb: Verb, workers: int, times: int, seed: int) -> bool:
     """Press Ctrl-C at random moments of a verb; there has to be a result within seconds."""
     rng = np.random.default_rng(seed)
-    duration = _duration(verb, workers)
-    waits, without = [], 0
-    for _ in range(times):
-        with cluster(workers) as client:
+    waits: list[float] = []
+    results = 0
+    with cluster(workers) as client:
+        duration = _duration(verb, client)
+        for _ in range(times):
             pressed: list[float] = []
 
             def press(pressed: list[float] = pressed) -> None:
@@ -301,18 +307,19 @@ def interrupted(verb: Verb, workers: int, times: int, seed: int) -> bool:
             timer.daemon = True
             timer.start()
             try:
-                without += verb.run(client) is None
-            except KeyboardInterrupt:
-                without += 1  # nothing was ready, or the verb had ended just before
+                results += verb.run(client) is not None
+            except (KeyboardInterrupt, mjfim.MjfimError) as error:
+                print(f"{verb.name:11s} no result: {error!r}")
             waits += [time.perf_counter() - moment for moment in pressed]
             timer.cancel()
 
     longest = max(waits, default=0.0)
     print(
-        f"{verb.name:11s} after Ctrl-C: {times - without} of {times} results, the last one after "
-        f"{longest:.1f} s (at most {MOST_SECONDS:.0f})"
+        f"{verb.name:11s} after Ctrl-C: {results} of {times} results, the last one after "
+        f"{longest:.1f} s (at most {MOST_SECONDS:.0f})",
+        flush=True,
     )
-    return without == 0 and longest <= MOST_SECONDS
+    return results == times and longest <= MOST_SECONDS
 
 
 def in_empty_folder(sizes: Sizes, references: dict[str, Reference], workers: int) -> bool:
@@ -370,12 +377,11 @@ def simulation(sizes: Sizes, measured: int, starts: int, picture: Path) -> bool:
     return rows[-1].efficiency >= LEAST_EFFICIENCY
 
 
-def _duration(verb: Verb, workers: int) -> float:
+def _duration(verb: Verb, client: Any) -> float:
     """Time that a verb takes on the cluster [s]."""
-    with cluster(workers) as client:
-        clock = time.perf_counter()
-        verb.run(client)
-        return time.perf_counter() - clock
+    clock = time.perf_counter()
+    verb.run(client)
+    return time.perf_counter() - clock
 
 
 def _kill(pid: int) -> None:
