@@ -23,7 +23,7 @@ from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start
 from mjfim.experiment.schema import Experiment
-from mjfim.parallel import one_blas_thread
+from mjfim.parallel import Workers, one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.events import DesignCallback
@@ -115,6 +115,9 @@ def design_task(
         The design.
     """
     budget = design_budget(task) if budget is None else budget
+
+    # All parts of the design use the same processes, also those that replace killed ones.
+    executor = None if executor is None else Workers.of(executor)
     if task.release is not None:
         return _design_release(task, task.release, budget, callback)
 

@@ -60,7 +60,7 @@ def renewed(executor: Any) -> Executor | None:
     """Make an executor in place of one whose processes have ended.
 
     Args:
-        executor: The broken executor: a `ProcessPoolExecutor`, or the reusable one of loky.
+        executor: The broken executor: a `ProcessPoolExecutor`, or one of loky.
 
     Returns:
         A new executor with the same settings; None for other kinds, which only their owner can
@@ -76,17 +76,22 @@ def renewed(executor: Any) -> Executor | None:
         )
 
     # joblib has a copy of loky, with the same names.
-    module = kind.__module__
-    if not module.endswith("loky.reusable_executor"):
+    *_, package, module = ["", *kind.__module__.split(".")]
+    if package != "loky":
         return None
 
-    made: Executor = sys.modules[module].get_reusable_executor(
-        max_workers=executor._max_workers,
-        context=executor._context,
-        timeout=executor._timeout,
-        initializer=executor._initializer,
-        initargs=executor._initargs,
-        env=executor._env,
-        kill_workers=True,
-    )
+    settings = {
+        "max_workers": executor._max_workers,
+        "context": executor._context,
+        "timeout": executor._timeout,
+        "initializer": executor._initializer,
+        "initargs": executor._initargs,
+        "env": executor._env,
+    }
+    made: Executor
+    if module == "reusable_executor":
+        reusable = sys.modules[kind.__module__].get_reusable_executor
+        made = reusable(**settings, kill_workers=True)
+    else:
+        made = kind(**settings)
     return made
