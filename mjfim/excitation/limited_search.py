@@ -10,6 +10,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget
+from mjfim.excitation.coarse_to_fine import CoarseToFine
+from mjfim.excitation.coarser_levels import coarser_levels
 from mjfim.excitation.controls_within_limits import (
     ControlsWithinLimits,
     InsideControl,
@@ -17,7 +19,7 @@ from mjfim.excitation.controls_within_limits import (
 )
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import easier_level
-from mjfim.excitation.multistart import Multistart, append_run
+from mjfim.excitation.multistart import append_run
 from mjfim.excitation.random_search import LEAST_PROGRESS, PATIENCE, RandomSearch
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.task import DesignTask
@@ -94,17 +96,20 @@ class LimitedSearch:
     ) -> Runs:
         """Descend within limits from several starts, after `done` iterations."""
         free = self.limited.level
-        multistart = Multistart(
+        has_parts = any(start.repeats > 1 for start in starts)
+        levels = () if done or has_parts else coarser_levels(free)
+        search = CoarseToFine(
             fine=free,
-            coarse=easier_level(free) if done == 0 else None,
+            coarse=easier_level(free) if done == 0 and not levels else None,
+            levels=levels,
             executor=self.executor,
             budget=self.budget,
             until_held_up=True,
             cost_to_beat=cost_to_beat,
             iterations_done=done,
         )
-        constrained = yield from multistart.run(starts)
-        return (yield from multistart.tighten_winner(constrained))
+        constrained = yield from search.run(starts)
+        return (yield from search.tighten_winner(constrained))
 
     def _helped_by_chance(
         self,

@@ -491,7 +491,7 @@ class Multistart:
             self._max_iterations - done,
             seconds / self._turns(len(starts)),
         )
-        return (yield from _renumber(events, done + 1))
+        return (yield from renumber(events, done + 1))
 
     def _round(
         self,
@@ -558,7 +558,7 @@ def _continued(result: RunResult) -> InitialControl:
     return InitialControl(name=result.name, control=np.asarray(result.control))
 
 
-def _renumber(events: Runs, offset: int) -> Runs:
+def renumber(events: Runs, offset: int) -> Runs:
     """Add an offset to the numbers of the iterates."""
     while True:
         try:

@@ -1,7 +1,7 @@
 """J against seconds: the design beside its baselines at every budget, as a table and a picture.
 
-    python -m scripts.benchmarks anytime FOLDER [--seconds 2 3 5 10 20] [--examples cart_pendulum_limits]
-    [--methods fourier5 fourier15] [--arms panda so_arm100]
+    python -m scripts.benchmarks anytime FOLDER [--seconds 2 3 5 10 20]
+    [--examples cart_pendulum_limits] [--methods fourier5 fourier15] [--arms panda so_arm100]
     python -m scripts.benchmarks anytime FOLDER --show        # the results in FOLDER
 
 Each method runs anew for each budget, in one thread, because a search plans with its budget. The
