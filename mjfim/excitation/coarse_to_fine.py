@@ -25,7 +25,6 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.multistart import HALVING_RATE, Multistart, append_run, renumber
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.run_result import RunResult, Runs
-from mjfim.parallel import workers_of
 from mjfim.records.design import Status
 
 # Share of the time that is left, and of the iterations, for a round that is not the last one.
@@ -39,10 +38,7 @@ LARGEST_ERROR = 1.0 / 3.0
 FEWEST_ITERATIONS = 2.0
 
 # Number of iterations for which each start of the first round should have time.
-ITERATIONS_OF_A_START = 25
-
-# Time that a clock can tell from zero [s].
-SHORTEST = 1e-6
+ITERATIONS_OF_A_START = 50
 
 
 @dataclass(eq=False, kw_only=True)
@@ -80,11 +76,9 @@ class CoarseToFine(Multistart):
 
     Attributes:
         levels: The coarser levels, the coarsest first; none for the rounds of `Multistart`.
-        ends_coarse: Leave out the stated level.
     """
 
     levels: tuple[DescentLevel, ...]
-    ends_coarse: bool = False
 
     def run(self, starts: Sequence[InitialControl]) -> Runs:
         """Optimise from all starts on the coarsest level, then the best of them on finer ones.
@@ -109,8 +103,7 @@ class CoarseToFine(Multistart):
         weights = np.geomspace(schedule.first, schedule.last, len(levels) + 1)[1:]
 
         for level, last_mu in zip(levels, weights.tolist(), strict=True):
-            is_left_out = self.ends_coarse and level is self.fine
-            if is_left_out or (state.results and self._is_over(level, state)):
+            if state.results and self._is_over(level, state):
                 break
 
             found = yield from self._run_level(level, state, last_mu)
@@ -131,8 +124,9 @@ class CoarseToFine(Multistart):
         begun = self.budget.seconds_used
         problem.expand(problem.point(self.levels[0].task.initial))
         each = ITERATIONS_OF_A_START * (self.budget.seconds_used - begun)
-        count = int(seconds * workers_of(self.executor) / max(each, SHORTEST))
-        return list(starts[: max(count, 1)])
+        counts = range(1, len(starts) + 1)
+        affordable = [count for count in counts if self._turns(count) * each <= seconds]
+        return list(starts[: max(affordable, default=1)])
 
     def _is_over(self, level: DescentLevel, state: _State) -> bool:
         """Check whether there is no time for a useful round on a level."""
@@ -151,8 +145,7 @@ class CoarseToFine(Multistart):
 
     def _run_level(self, level: DescentLevel, state: _State, last_mu: float) -> Runs:
         """Run one round on a level down to a barrier weight."""
-        last = self.levels[-1] if self.ends_coarse else self.fine
-        share = 1.0 if level is last else ROUND_SHARE
+        share = 1.0 if level is self.fine else ROUND_SHARE
         iterations_left = self._max_iterations - state.iterations
         turns = self._turns(len(state.starts))
         begun = self.budget.seconds_used

@@ -1,4 +1,4 @@
-"""Coarse levels of a descent under hard limits, with longer timesteps and longer samples."""
+"""Several coarse levels of a descent under hard limits, with longer and longer samples."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.levels import (
     MAX_CONSTRAINED_COARSE_CHANGE,
     MIN_COARSE_SAMPLES,
-    TIMESTEP_FACTORS,
     DescentLevel,
     has_similar_cost,
 )
@@ -34,55 +33,25 @@ def coarser_levels(fine: DescentLevel) -> tuple[DescentLevel, ...]:
         a stated `descent.coarse`.
     """
     task = fine.task
-    has_one_step = _longest_timestep(task) == 1
-    first = _first_point(fine)
-    if task.experiment.descent.coarse != "auto" or not has_one_step or first is None:
+    if task.experiment.descent.coarse != "auto" or task.system.grid.substeps > 1:
         return ()
 
-    variants = [replace(_smooth(task), sample_factor=factor) for factor in _factors(task)]
+    first = _first_point(fine)
+    if first is None:
+        return ()
+
+    # Dry friction is smooth in the motion as well.
+    stated = task.system.variant
+    smooth = replace(stated, smoothed=bool(stated.smoothing_speeds))
+    variants = [replace(smooth, sample_factor=factor) for factor in _factors(task)]
     levels = [_similar_level(fine, first, variant) for variant in variants]
     return tuple(level for level in levels if level is not None)
-
-
-def quickest_level(fine: DescentLevel) -> DescentLevel | None:
-    """Make the coarsest level, for a first look at other optima.
-
-    Args:
-        fine: The stated level, on the plant without clamps.
-
-    Returns:
-        The level with the longest timestep and the longest samples with which the initial control
-        costs nearly as much; None without one, or with a stated `descent.coarse`.
-    """
-    task = fine.task
-    first = _first_point(fine)
-    if task.experiment.descent.coarse != "auto" or first is None:
-        return None
-
-    longest = replace(_smooth(task), timestep_factor=_longest_timestep(task))
-    for factor in _factors(task):
-        level = _similar_level(fine, first, replace(longest, sample_factor=factor))
-        if level is not None:
-            return level
-    return None
-
-
-def _longest_timestep(task: DesignTask) -> int:
-    """Largest factor of the timestep that divides the engine steps of a sample; 1 without one."""
-    substeps = task.system.grid.substeps
-    return next((factor for factor in TIMESTEP_FACTORS if substeps % factor == 0), 1)
 
 
 def _factors(task: DesignTask) -> list[int]:
     """Factors of the samples that divide the horizon and leave enough samples."""
     N = task.samples
     return [k for k in SAMPLE_FACTORS if N % k == 0 and MIN_COARSE_SAMPLES * k <= N]
-
-
-def _smooth(task: DesignTask) -> ModelVariant:
-    """The variant of a task, with dry friction that is smooth in the motion as well."""
-    stated = task.system.variant
-    return replace(stated, smoothed=bool(stated.smoothing_speeds))
 
 
 def _first_point(fine: DescentLevel) -> DesignPoint | None:

@@ -17,6 +17,7 @@ BENCHMARKS = {
     "benchmark_limits": "is the design under hard limits better than CasADi + IPOPT in equal time?",
     "casadi_peer": "what do CasADi's solvers find on the hand-derived cart-pendulum?",
     "casadi_limits": "what do CasADi's solvers find under hard limits?",
+    "anytime": "is the design better than its baselines at every budget?",
     "arms": "which experiments do the robot arms get, and do their designs keep the limits?",
     "arms_table": "is the design of two arms better than Fourier series in equal time?",
     "mjx_oracle": "do the derivatives agree with those of MJX by automatic differentiation?",

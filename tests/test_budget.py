@@ -1,0 +1,25 @@
+"""Budgets: the clock by which they measure time."""
+
+from __future__ import annotations
+
+import pickle
+
+from mjfim.budget import Budget, StopReason, measured_by
+
+
+def test_a_budget_keeps_the_clock_with_which_it_was_made() -> None:
+    moment = [5.0]
+    with measured_by(lambda: moment[0]):
+        budget = Budget(seconds=10.0)
+        part = budget.share(0.5)
+    moment[0] = 11.0
+    assert (budget.seconds_used, budget.seconds_left, part.exhausted) == (
+        6.0,
+        4.0,
+        StopReason.SECONDS,
+    )
+    assert budget.exhausted is None and budget.share(0.5).exhausted is None
+
+    # The process of a worker has its own clock.
+    restored = pickle.loads(pickle.dumps(Budget(seconds=1e6)))
+    assert restored.exhausted is None and 0.0 <= restored.seconds_used < 1e3
