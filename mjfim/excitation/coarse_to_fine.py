@@ -30,6 +30,14 @@ from mjfim.records.design import Status
 # Share of the time that is left, and of the iterations, for a round that is not the last one.
 ROUND_SHARE = 0.4
 
+# Barrier weights with which the coarse levels end, by their number. An iteration on the stated level
+# is so expensive that the levels before have to come near the optimum.
+LAST_WEIGHTS: dict[int, tuple[float, ...]] = {
+    1: (1e-3,),
+    2: (0.03, 3e-4),
+    3: (0.03, 3e-4, 1e-4),
+}
+
 # Largest part of J on the stated plant that a coarse level may miss. Beyond that it misleads, and
 # the next level begins where this one began, if that is better.
 LARGEST_ERROR = 1.0 / 3.0
@@ -98,11 +106,8 @@ class CoarseToFine(Multistart):
         state = _State(starts=self._affordable(starts))
         levels = (*self.levels, self.fine)
 
-        # The weight of the barrier falls by the same factor on every level.
-        schedule = BarrierSchedule()
-        weights = np.geomspace(schedule.first, schedule.last, len(levels) + 1)[1:]
-
-        for level, last_mu in zip(levels, weights.tolist(), strict=True):
+        weights = (*LAST_WEIGHTS[len(self.levels)], BarrierSchedule().last)
+        for level, last_mu in zip(levels, weights, strict=True):
             if state.results and self._is_over(level, state):
                 break
 
@@ -119,10 +124,12 @@ class CoarseToFine(Multistart):
         if len(starts) == 1 or np.isinf(seconds):
             return list(starts)
 
-        # Measure an iteration at the initial control, without its line search.
-        problem = self.levels[0].problem
+        # Measure an iteration at the initial control, without its line search. The first simulation
+        # of a level takes longer, because it builds models.
+        problem, initial = self.levels[0].problem, self.levels[0].task.initial
+        problem.expand(problem.point(initial))
         begun = self.budget.seconds_used
-        problem.expand(problem.point(self.levels[0].task.initial))
+        problem.expand(problem.point(initial))
         each = ITERATIONS_OF_A_START * (self.budget.seconds_used - begun)
         counts = range(1, len(starts) + 1)
         affordable = [count for count in counts if self._turns(count) * each <= seconds]

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import StrMethodFormatter
 from rich.console import Console
 from rich.table import Table
 
@@ -192,7 +193,7 @@ def picture(results: list[Results], path: Path) -> None:
         _draw(each, axis)
     for axis in axes[:, 0]:
         axis.set_ylabel("J over the lowest J")
-    for axis in axes[-1]:
+    for axis in axes.flat[: len(results)]:
         axis.set_xlabel("budget [s of the processor]")
 
     handles, labels = axes.flat[0].get_legend_handles_labels()
@@ -221,6 +222,8 @@ def _draw(results: Results, axis: Any) -> None:
     axis.minorticks_off()
     if lowest > 0.0:
         axis.set_yscale("log")
+        for formatter in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+            formatter(StrMethodFormatter("{x:g}"))
     axis.grid(alpha=0.3)
 
 
