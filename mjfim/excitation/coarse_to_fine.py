@@ -30,8 +30,8 @@ from mjfim.records.design import Status
 # Share of the time that is left, and of the iterations, for a round that is not the last one.
 ROUND_SHARE = 0.4
 
-# Barrier weights with which the coarse levels end, by their number. An iteration on the stated level
-# is so expensive that the levels before have to come near the optimum.
+# Barrier weights with which the coarse levels end, by their number. Iterations on the stated level
+# are so expensive that the levels before have to come near the optimum.
 LAST_WEIGHTS: dict[int, tuple[float, ...]] = {
     1: (1e-3,),
     2: (0.03, 3e-4),
