@@ -251,7 +251,9 @@ class CoarseToFine(Multistart):
             return None
         centre = self.fine.task.centre
         control = self._at_stated_rate(result.control, level)
-        trials = ControlsWithinLimits(cost=self._limited_cost, budget=Budget(stop=self.budget.stop))
+
+        # This takes a few simulations, also after a request to stop, so that nothing is lost.
+        trials = ControlsWithinLimits(cost=self._limited_cost, budget=Budget())
         return trials.largest(centre, control - centre)
 
     def _at_stated_rate(self, control: Array, level: DescentLevel) -> Array:
