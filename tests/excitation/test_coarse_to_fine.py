@@ -82,6 +82,7 @@ def test_every_round_leaves_controls_that_keep_all_limits(fine: DescentLevel) ->
     assert refined.cost == min(result.cost for result in results)
 
 
+@pytest.mark.slow
 def test_a_short_time_is_for_few_starts_and_for_coarse_levels(fine: DescentLevel) -> None:
     starts = list(initial_controls_of(fine.task, None))
     assert len(search_of(fine, Budget())._affordable(starts)) == 5
