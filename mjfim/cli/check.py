@@ -24,6 +24,13 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
+from mjfim.cli.executors import (
+    LOCAL,
+    MAX_PARTS,
+    ExecutorPlace,
+    started_if_stated,
+    stated_executor,
+)
 from mjfim.errors import ExperimentError
 from mjfim.output.picture_format import PictureFormat
 
@@ -53,6 +60,7 @@ def check(
     verbose: Verbose = False,
     force: Force = False,
     threads: Threads = None,
+    executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Say which parameters can be identified, how accurately, and which only in combination."""
     from mjfim.cli.announcements import (
@@ -68,6 +76,7 @@ def check(
     from mjfim.output.presentation import describe
     from mjfim.recordings.read import read_recording, recording_paths
 
+    place = stated_executor(executor)
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(stated, threads=threads)
     with progress("reading"):
@@ -94,8 +103,8 @@ def check(
         refused = None
         if not loaded and trajectory is None and system.controls:
             refused = refusal_of_design(system)
-    with progress("checking", expected=expected):
-        result = mjfim.check(stated, loaded, trajectory, threads=threads)
+    with started_if_stated(place, MAX_PARTS) as workers, progress("checking", expected=expected):
+        result = mjfim.check(stated, loaded, trajectory, threads=threads, executor=workers)
 
     values = archive.summary_with_origin(result, system, output)
     print_result(as_json, values, describe(result), verbose=verbose)

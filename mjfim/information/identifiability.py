@@ -6,7 +6,7 @@ Random trajectories show whether another control would help.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,6 +114,10 @@ class Identifiability:
         )
 
 
+# Rows of G along a motion, and their change with a longer difference step.
+RowsAndError = tuple[Array, Array]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class IdentifiabilityTest:
     """Test for combinations of parameters that the outputs of a plant do not depend on.
@@ -126,6 +130,8 @@ class IdentifiabilityTest:
         earlier: (p, p) information of earlier experiments, without the priors of the parameters.
         probes: Function that simulates a number of random controls; it leaves out trajectories that
             diverge.
+        differentiated: Function that does `rows_along` for several trajectories, on workers for
+            example; None for one after the other.
     """
 
     plant: Plant
@@ -134,6 +140,7 @@ class IdentifiabilityTest:
     theta: Array
     earlier: Array
     probes: Callable[[int], Iterator[Trajectory]]
+    differentiated: Callable[[Iterable[Trajectory]], Iterable[RowsAndError | None]] | None = None
 
     @property
     def prior(self) -> Array:
@@ -143,6 +150,19 @@ class IdentifiabilityTest:
     def rows(self, sensitivity: Sensitivity) -> Array:
         """(n, p) whitened rows of G at the measured samples."""
         return self.noise.whitened_rows(sensitivity.G)
+
+    def rows_along(self, trajectory: Trajectory) -> RowsAndError | None:
+        """Differentiate a whole motion by the parameters.
+
+        Args:
+            trajectory: The motion.
+
+        Returns:
+            (n, p) whitened rows of G, and (n, p) their change with a longer difference step; None
+            where a perturbed simulation diverges.
+        """
+        fine = self.plant.derivatives.sensitivity(self.theta, trajectory)
+        return None if fine is None else _rows_and_error(self, trajectory, fine)
 
     def along(
         self,
@@ -250,13 +270,11 @@ def _identifiability(
 
     # Whole motions are differentiated only if single steps do not explain the null space.
     if known is None or along_trajectory.count > known.shape[1]:
-        for probe in itertools.takewhile(lambda _: not stop(), tried):
-            fine = test.plant.derivatives.sensitivity(test.theta, probe)
-            if fine is None:
-                continue
-            rows, change = _rows_and_error(test, probe, fine)
-            stack.append(rows)
-            errors.append(change)
+        differentiated = test.differentiated or (lambda probes: map(test.rows_along, probes))
+        for found in differentiated(itertools.takewhile(lambda _: not stop(), tried)):
+            if found is not None:
+                stack.append(found[0])
+                errors.append(found[1])
 
     along_all = _null_space(test, stack, errors, known)
     return _with_groups(test, along_trajectory, along_all)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from mjfim.identification.residuals import FitProblem
 from mjfim.identification.same_data import refuse_same_data
 from mjfim.identification.segments import recorded_release
 from mjfim.information.fisher import FisherInformation
-from mjfim.information.identifiability import Identifiability
+from mjfim.information.identifiability import Identifiability, IdentifiabilityTest
 from mjfim.information.marginal import shared
 from mjfim.parallel import one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
@@ -44,6 +45,7 @@ from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.derivative_test import self_test
 from mjfim.studies.design_outlook import DesignOutlook
+from mjfim.studies.probe_workers import ProbeWorkers
 
 # Target standard deviation where none is stated, relative to the size of the parameter.
 DEFAULT_RELATIVE_STD = 0.05
@@ -63,6 +65,7 @@ def check(
     threads: int | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
+    executor: Any = None,
 ) -> Check:
     """Check which parameters can be identified, at the parameter values that a design uses.
 
@@ -75,6 +78,8 @@ def check(
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the check early, as Ctrl-C does; the record then says what is missing.
         progress: False for no sign of progress in a notebook.
+        executor: Executor that differentiates random motions side by side, where these are needed,
+            such as `mjfim.Pool` or a Dask `Client`; the result does not depend on it.
 
     Raises:
         RecordingError: Recordings are unusable, or given together with a trajectory.
@@ -86,15 +91,18 @@ def check(
     with shown_progress("checking", None, progress):
         system = System.resolve(experiment, threads=threads)
         if recordings:
-            return check_recordings(system, recordings, stop)
+            return check_recordings(system, recordings, stop, executor)
 
         require_design_keys(system, "check without recordings")
-        return check_task(DesignTask.of(system), trajectory, stop)
+        return check_task(DesignTask.of(system), trajectory, stop, executor)
 
 
 @one_blas_thread()
 def check_task(
-    task: DesignTask, trajectory: Trajectory | None = None, stop: StopToken | None = None
+    task: DesignTask,
+    trajectory: Trajectory | None = None,
+    stop: StopToken | None = None,
+    executor: Any = None,
 ) -> Check:
     """Check the initial control of a task, or the control of a trajectory.
 
@@ -118,7 +126,7 @@ def check_task(
     # From here on, there is something to report when the check is stopped.
     with stop_on_interrupt(stop) as token:
         stage = _Stages(token)
-        test = task.identifiability_test
+        test = _identifiability_test(task, executor, token)
         identifiability = stage.identifiability(test.along, curve, point.sensitivity)
         tested = stage.test_derivatives(task, problem, point, identifiability)
         outlook = DesignOutlook()
@@ -138,7 +146,10 @@ def check_task(
 
 @one_blas_thread()
 def check_recordings(
-    system: System, recordings: Sequence[Recording], stop: StopToken | None = None
+    system: System,
+    recordings: Sequence[Recording],
+    stop: StopToken | None = None,
+    executor: Any = None,
 ) -> Check:
     """Check which parameters recordings identify; derivatives are tested along the longest one.
 
@@ -163,7 +174,7 @@ def check_recordings(
     # From here on, there is something to report when the check is stopped.
     with stop_on_interrupt(stop) as token:
         stage = _Stages(token)
-        test = task.identifiability_test
+        test = _identifiability_test(task, executor, token)
         identifiability = stage.identifiability(test.of_rows, task.initial, J, error)
         return _Assessment(
             task=task,
@@ -174,6 +185,15 @@ def check_recordings(
             tested=stage.test_derivatives(task, problem, point, identifiability),
             missing=tuple(stage.missing),
         ).check()
+
+
+def _identifiability_test(task: DesignTask, executor: Any, stop: StopToken) -> IdentifiabilityTest:
+    """The test of a task; an executor differentiates its random motions."""
+    test = task.identifiability_test
+    if executor is None:
+        return test
+    workers = ProbeWorkers(executor=executor, task=task, stop=stop)
+    return replace(test, differentiated=workers.differentiated)
 
 
 def _task_along(start: Array, system: System, control: Array) -> DesignTask:

@@ -319,6 +319,7 @@ def test_an_executor_that_cannot_be_had_is_misuse(
     [
         ("montecarlo", ("design.npz",)),
         ("identify", ("log.csv",)),
+        ("check", ()),
         ("compare", ()),
         ("campaign", ()),
         ("robustness", ("design",)),
