@@ -113,6 +113,15 @@ class SimulatedCluster(Executor):
         self.caller += mark - self._mark
         self._mark = mark
 
+    def charge(self, seconds: float) -> None:
+        """Move the clock on by work of the caller that is not done again.
+
+        Args:
+            seconds: CPU time that it took before [s].
+        """
+        self.now += seconds
+        self.caller += seconds
+
     def advance(self) -> None:
         """Move the clock on to the end of the next task, which then has its result."""
         self.account()

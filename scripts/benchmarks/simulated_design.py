@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +12,10 @@ from unittest.mock import patch
 import mjfim
 from mjfim.excitation import design as design_module
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
+from mjfim.excitation.multistart import Multistart
+from mjfim.excitation.run_result import RunResult
 from mjfim.excitation.task import DesignTask
-from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
+from scripts.benchmarks.simulated_cluster import MeasuredTasks, SimulatedCluster, simulated
 
 # Time that a task needs to reach a worker of a cluster, and its result to return [s].
 LATENCY = 5e-3
@@ -56,13 +59,10 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> list[E
     task = DesignTask.resolve(experiment, threads=1)
     tasks = _MeasuredSearches()
 
-    # All tasks are carried out in a run that does not count.
-    _simulated_seconds(task, tasks, starts, 1)
-
-    workers = [2**k for k in range(most.bit_length())]
+    # One worker carries out all tasks, the others schedule them again.
     rows: list[Efficiency] = []
     alone = _simulated_seconds(task, tasks, starts, 1)
-    for number in workers:
+    for number in (2**k for k in range(most.bit_length())):
         found = alone if number == 1 else _simulated_seconds(task, tasks, starts, number)
         rows.append(
             Efficiency(
@@ -93,7 +93,9 @@ class _Times:
     caller: float
 
 
-def _simulated_seconds(task: DesignTask, tasks: MeasuredTasks, starts: int, workers: int) -> _Times:
+def _simulated_seconds(
+    task: DesignTask, tasks: _MeasuredSearches, starts: int, workers: int
+) -> _Times:
     """Design on a simulated cluster."""
 
     def many(*args: Any, **kwargs: Any) -> Iterator[InitialControl]:
@@ -105,6 +107,7 @@ def _simulated_seconds(task: DesignTask, tasks: MeasuredTasks, starts: int, work
     with (
         patch.object(design_module, "initial_controls_of", many),
         simulated(workers, tasks, LATENCY) as cluster,
+        patch.object(Multistart, "reevaluate", tasks.reevaluation(cluster)),
     ):
         design_module.design_task(task, executor=cluster.workers)
     return _Times(
@@ -123,6 +126,29 @@ class _MeasuredSearches(MeasuredTasks):
 
     def __init__(self) -> None:
         super().__init__(key_of=_key)
+        self._reevaluated: dict[Hashable, tuple[Any, float]] = {}
+
+    def reevaluation(self, cluster: SimulatedCluster) -> Any:
+        """Return a method in place of `Multistart.reevaluate` that does copies only once.
+
+        Args:
+            cluster: Where the CPU time of the caller counts each time.
+        """
+        original = Multistart.reevaluate
+
+        def reevaluate(self_: Multistart, result: RunResult, start: InitialControl) -> Any:
+            control = b"" if result.control is None else result.control.tobytes()
+            key = start.name.partition(COPY)[0], control
+            if key in self._reevaluated:
+                found, seconds = self._reevaluated[key]
+                cluster.charge(seconds)
+            else:
+                begun = time.process_time()
+                found = original(self_, result, start)
+                self._reevaluated[key] = found, time.process_time() - begun
+            return tuple(replace(each, name=start.name) for each in found)
+
+        return reevaluate
 
     def done(self, fn: Any, args: tuple[Any, ...]) -> tuple[Any, float]:
         """Result of a search under the name of its start, and its CPU time [s]."""
