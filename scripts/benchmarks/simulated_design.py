@@ -44,8 +44,8 @@ class Efficiency:
     caller: float
 
 
-def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> list[Efficiency]:
-    """Schedule a design from many starts on 1, 2, 4 and more workers.
+def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterator[Efficiency]:
+    """Schedule a design from many starts on 1, 4, 16 and more workers.
 
     The searches from the initial controls that the experiment states are carried out once. Every
     further start takes as long as one of them, and finds the same.
@@ -54,26 +54,25 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> list[E
         experiment: Experiment under hard limits; its number of starts is that of the searches that
             are carried out.
         starts: Number of starts that are scheduled.
-        most: Largest number of workers.
+        most: Largest number of workers, a power of 4.
+
+    Yields:
+        The efficiency on each number of workers.
     """
     task = DesignTask.resolve(experiment, threads=1)
     tasks = _MeasuredSearches()
 
     # One worker carries out all tasks, the others schedule them again.
-    rows: list[Efficiency] = []
     alone = _simulated_seconds(task, tasks, starts, 1)
-    for number in (2**k for k in range(most.bit_length())):
+    for number in (2**k for k in range(0, most.bit_length(), 2)):
         found = alone if number == 1 else _simulated_seconds(task, tasks, starts, number)
-        rows.append(
-            Efficiency(
-                workers=number,
-                seconds=found.whole,
-                efficiency=alone.whole / (number * found.whole),
-                of_searches=found.busy / (number * found.searches),
-                caller=found.caller,
-            )
+        yield Efficiency(
+            workers=number,
+            seconds=found.whole,
+            efficiency=alone.whole / (number * found.whole),
+            of_searches=found.busy / (number * found.searches),
+            caller=found.caller,
         )
-    return rows
 
 
 @dataclass(frozen=True, kw_only=True)
