@@ -11,6 +11,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
+from mjfim.plant.lumped_parameters import LumpedParameters
 
 # Default factor by which the samples of a coarse level are longer.
 AUTO_COARSE_FACTOR = 4
@@ -54,7 +55,25 @@ class DescentLevel:
         problem = self.task.problem
         information = replace(problem.information, basis=self.basis, power=self.power)
         is_coarse = self.task.system.variant.sample_factor > 1
-        return replace(problem, information=information, forward_differences_only=is_coarse)
+        return replace(
+            problem,
+            information=information,
+            forward_differences_only=is_coarse,
+            lumped=self._lumped,
+        )
+
+    @property
+    def _lumped(self) -> LumpedParameters | None:
+        """Parameters whose effect follows from that of others; None where all are identifiable."""
+        if self.basis is None:
+            return None
+
+        parameters = self.task.parameters
+        wanted = parameters.interest
+        without_effect = np.linalg.qr(self.basis, mode="complete")[0][:, self.basis.shape[1] :]
+        directions = np.zeros((len(parameters), without_effect.shape[1]))
+        directions[wanted] = without_effect * parameters.scale[wanted][:, None]
+        return LumpedParameters.of(directions, parameters.magnitude)
 
 
 def require_coarse_factor(task: DesignTask) -> None:

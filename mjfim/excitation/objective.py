@@ -14,6 +14,7 @@ from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.lumped_parameters import LumpedParameters
 from mjfim.plant.mixed_derivatives import (
     CENTRAL_DIFFERENCES,
     FORWARD_DIFFERENCES,
@@ -130,6 +131,7 @@ class DesignProblem:
         forward_differences_only: Never refine the differences; meant for coarse levels.
         parameter_samples: Samples over which a robust design pools the criterion, theta first, or
             None. One control drives all samples, without feedback.
+        lumped: Parameters whose sensitivities follow from those of the others, or None.
     """
 
     plant: Plant
@@ -138,6 +140,7 @@ class DesignProblem:
     running: RunningCost
     forward_differences_only: bool = False
     parameter_samples: ParameterSamples | None = None
+    lumped: LumpedParameters | None = None
 
     def point(
         self, trajectory: Trajectory, accuracy: DifferenceAccuracy = FORWARD_DIFFERENCES
@@ -204,7 +207,12 @@ class DesignProblem:
     ) -> DesignPoint:
         """Point of a trajectory of the plant at theta: (p,), without its cost."""
         central = not accuracy.shared_origin
-        sensitivity = self.plant.derivatives.sensitivity(theta, trajectory, central=central)
+
+        # At other values, other combinations may be without effect.
+        lumped = self.lumped if theta is self.theta else None
+        sensitivity = self.plant.derivatives.sensitivity(
+            theta, trajectory, central=central, lumped=lumped
+        )
         if sensitivity is None:
             return DIVERGED
 

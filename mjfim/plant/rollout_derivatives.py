@@ -10,6 +10,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.plant.batch import Rollouts
 from mjfim.plant.difference_steps import DifferenceSteps
+from mjfim.plant.lumped_parameters import LumpedParameters
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 # Relative step of the differences between whole rollouts.
@@ -94,6 +95,7 @@ class RolloutDerivatives(DifferenceSteps):
         trajectory: Trajectory,
         step: float | Array = SENSITIVITY_STEP,
         central: bool = True,
+        lumped: LumpedParameters | None = None,
     ) -> Sensitivity | None:
         """Sensitivities psi and G of a trajectory at fixed control, by differences of rollouts.
 
@@ -103,6 +105,9 @@ class RolloutDerivatives(DifferenceSteps):
             step: Difference step relative to `parameter_scale`, one number or (p,).
             central: True for two-sided differences. False is honoured only if no sensor is an
                 output.
+            lumped: Parameters whose columns follow from those of the others, without rollouts of
+                their own; None for none. Where this motion shows that they do not follow, all
+                parameters are moved, from now on.
 
         Returns:
             The sensitivities, or None if a perturbed rollout diverges.
@@ -114,8 +119,17 @@ class RolloutDerivatives(DifferenceSteps):
             step,
             states=trajectory.state,
             central=central or self.plant.outputs.needs_sensors,
+            lumped=lumped if self._can_lump(lumped) else None,
         )
         return None if found is None else found[1]
+
+    def _can_lump(self, lumped: LumpedParameters | None) -> bool:
+        """True where lumped parameters act on the motion alone, and no motion has refuted them."""
+        if lumped is None or lumped.refuted:
+            return False
+
+        at_rest = ~self.plant.parameters.changes_motion
+        return not (at_rest[lumped.lumped].any() or lumped.probe[at_rest].any())
 
     def calibrated_step_factors(self, theta: Array, trajectory: Trajectory) -> Array | None:
         """Factors of the parameters' difference steps with which their effect exceeds round-off.
@@ -156,6 +170,7 @@ class RolloutDerivatives(DifferenceSteps):
         *,
         states: Array | None = None,
         central: bool = True,
+        lumped: LumpedParameters | None = None,
     ) -> tuple[Array, Sensitivity] | None:
         """Outputs and sensitivities from rollouts at theta +- h.
 
@@ -169,6 +184,7 @@ class RolloutDerivatives(DifferenceSteps):
             step: Difference step relative to `parameter_scale`, one number or (p,).
             states: (N+1, ns) states at theta, or None where they are not known.
             central: True for two-sided differences.
+            lumped: Parameters whose columns follow from those of the others, or None.
 
         Returns:
             y: (N+1, ny) outputs [y-unit] and the sensitivities, or None if a rollout diverges. The
@@ -178,9 +194,16 @@ class RolloutDerivatives(DifferenceSteps):
         delay = plant.output_delay(theta, len(ctrl) + 1)
         needs_origin = states is None or (delay is not None and plant.outputs.needs_sensors)
 
+        steps = step * self.parameter_scale
         moving = np.flatnonzero(plant.parameters.changes_motion)
-        h = (step * self.parameter_scale)[moving]
-        moves = _theta_moves(len(theta), moving, h, central, needs_origin)
+        if lumped is not None:
+            moving = np.setdiff1d(moving, lumped.lumped)
+        h = steps[moving]
+        forward = _unit_moves(len(theta), moving) * h[:, None]
+        if lumped is not None:
+            h = np.append(h, 1.0 / np.abs(lumped.probe / steps).max())
+            forward = np.concatenate([forward, lumped.probe[None] * h[-1]])
+        moves = _theta_moves(forward, central, needs_origin)
 
         sensors = None
         origin = np.zeros((len(ctrl) + 1, 0)) if states is None else states
@@ -194,8 +217,17 @@ class RolloutDerivatives(DifferenceSteps):
                 origin = out.states[-1]
                 sensors = None if out.sensors is None else out.sensors[-1]
             dx, dy = self._rollout_quotients(out, origin, h, central)
-            psi[..., moving] = np.moveaxis(dx, 0, 2)
-            G[..., moving] = np.moveaxis(dy, 0, 2)
+            psi[..., moving] = np.moveaxis(dx[: len(moving)], 0, 2)
+            G[..., moving] = np.moveaxis(dy[: len(moving)], 0, 2)
+
+            if lumped is not None:
+                psi = lumped.expanded(psi[..., lumped.base])
+                G = lumped.expanded(G[..., lumped.base])
+                if not self._is_explained(lumped, psi, G, dx[-1], dy[-1]):
+                    lumped.refuted = True
+                    return self._rollout_differences(
+                        theta, initial_state, ctrl, step, states=states, central=central
+                    )
 
         # Biases and the delay act on the outputs of the simulation.
         G += plant.bias_derivative
@@ -205,6 +237,29 @@ class RolloutDerivatives(DifferenceSteps):
             G = delay.apply(G) + by_delay
             y = delay.apply(y)
         return y, Sensitivity(psi=psi, G=G)
+
+    def _is_explained(
+        self, lumped: LumpedParameters, psi: Array, G: Array, dx: Array, dy: Array
+    ) -> bool:
+        """Check whether the probe of lumped parameters has no effect on states and outputs.
+
+        Args:
+            lumped: The lumped parameters.
+            psi: (N+1, nx, p) derivatives of the states by all parameters.
+            G: (N+1, ny, p) derivatives of the outputs by all parameters.
+            dx: (N+1, nx) derivatives of the states along the probe.
+            dy: (N+1, ny) derivatives of the outputs along the probe.
+        """
+        state_sizes = self.plant.sizes.state
+        if not lumped.explains(psi / state_sizes[:, None], dx / state_sizes):
+            return False
+
+        # Outputs without sensors are states.
+        if not self.plant.outputs.needs_sensors:
+            return True
+        largest = np.abs(G * self.plant.parameters.magnitude).max(axis=(0, 2))
+        sizes = np.where(largest > 0.0, largest, 1.0)
+        return lumped.explains(G / sizes[:, None], dy / sizes)
 
     def _rollout_quotients(
         self, out: Rollouts, origin: Array, h: Array, central: bool
@@ -391,25 +446,24 @@ class RolloutDerivatives(DifferenceSteps):
         return Response(first=first, y=y, common=common + bias, private=G[..., count:])
 
 
-def _theta_moves(p: int, moving: np.ndarray, h: Array, central: bool, needs_origin: bool) -> Array:
+def _unit_moves(p: int, moving: np.ndarray) -> Array:
+    """(n, p) unit move of each of the n parameters with the indices `moving`."""
+    return np.asarray(np.eye(p)[moving])
+
+
+def _theta_moves(forward: Array, central: bool, needs_origin: bool) -> Array:
     """(m, p) moves of theta, one for each rollout.
 
     There are n forward moves, n backward moves for two-sided differences, and a zero move if the
     rollout at theta is needed.
 
     Args:
-        p: Number of parameters.
-        moving: (n,) indices of the parameters that are moved.
-        h: (n,) difference steps of these parameters [theta-unit].
+        forward: (n, p) forward moves [theta-unit].
         central: True for two-sided differences.
         needs_origin: Whether the rollout at theta is needed.
     """
-    count = len(moving)
-    forward = np.zeros((count, p))
-    forward[np.arange(count), moving] = h
-
     backward = -forward if central else forward[:0]
-    origin = np.zeros((int(needs_origin), p))
+    origin = np.zeros((int(needs_origin), forward.shape[1]))
     return np.concatenate([forward, backward, origin])
 
 
