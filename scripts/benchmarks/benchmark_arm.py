@@ -4,14 +4,16 @@
 
 The parameters are p = 3, 10, 30 or 70 barycentric coordinates of the inertias of the last links.
 The experiment takes 5 s at 100 Hz, with position servos inside the model. The value of J needs psi,
-which takes 2p rollouts; its gradient needs one direction for every p.
+which takes two rollouts for each identifiable combination; its gradient needs one direction for
+every p. All cores: seconds of the processor in an iteration, which tell more than the time of an
+iteration where other programs run.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
 from mjfim.plant.mixed_derivatives import FORWARD_DIFFERENCES
+from mjfim.records.events import DesignEvent
 
 # Models that others wrote, beside the repository.
 MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
@@ -42,16 +45,26 @@ class Cost:
     Attributes:
         p: Number of parameters.
         identifiable: Number of identifiable combinations.
-        value: Time of J [s].
+        survey: Time of finding what is identifiable [s].
+        survey_steps: Engine steps of that.
+        all_moved: Time of J where all parameters are moved [s].
+        value: Time of J where lumped parameters follow from the others, as in a design [s].
         gradient: Time of the gradient of J, with A and B [s].
         iteration: Time of a whole iteration of the design [s].
+        processor: Time of all cores in an iteration of the design [s].
+        steps: Engine steps of an iteration of the design.
     """
 
     p: int
     identifiable: int
+    survey: float
+    survey_steps: int
+    all_moved: float
     value: float
     gradient: float
     iteration: float
+    processor: float
+    steps: float
 
 
 def experiment(model: Path, p: int, iterations: int) -> Experiment:
@@ -104,15 +117,37 @@ def measured(model: Path, p: int, iterations: int) -> Cost:
     """
     task = DesignTask.resolve(experiment(model, p, iterations))
     seconds: list[float] = []
-    design_task(task, callback=lambda event: seconds.append(event.row.seconds))
-    iteration = (seconds[-1] - seconds[0]) / max(len(seconds) - 1, 1)
+    processor: list[float] = []
+    steps: list[int] = []
+
+    def note(event: DesignEvent) -> None:
+        """Note the time and the engine steps of an iterate."""
+        seconds.append(event.row.seconds)
+        processor.append(time.process_time())
+        steps.append(event.row.steps)
+
+    design_task(task, callback=note)
+    count = max(len(seconds) - 1, 1)
 
     curve = task.initial
     sensitivity = task.plant.derivatives.sensitivity(task.theta, curve)
     if sensitivity is None:
         raise SystemExit("the arm diverges")
+
+    steps_before = task.plant.engine_steps
+    clock = time.perf_counter()
     basis = task.identifiability_test.along(curve, sensitivity).basis
+    survey = time.perf_counter() - clock
+    survey_steps = task.plant.engine_steps - steps_before
+
+    # The models at moved parameters are written before the clock starts, as in a design.
     problem = DescentLevel(task, basis).problem
+    without_lumping = replace(problem, lumped=None)
+    problem.point(curve, FORWARD_DIFFERENCES)
+
+    clock = time.perf_counter()
+    without_lumping.point(curve, FORWARD_DIFFERENCES)
+    all_moved = time.perf_counter() - clock
 
     clock = time.perf_counter()
     point = problem.point(curve, FORWARD_DIFFERENCES)
@@ -122,13 +157,17 @@ def measured(model: Path, p: int, iterations: int) -> Cost:
     problem.expand(point)
     gradient = time.perf_counter() - clock
 
-    identifiable = 0 if point.criterion is None else len(point.criterion.eigenvalues)
     return Cost(
         p=p,
-        identifiable=identifiable,
+        identifiable=0 if point.criterion is None else len(point.criterion.eigenvalues),
+        survey=survey,
+        survey_steps=survey_steps,
+        all_moved=all_moved,
         value=value,
         gradient=gradient,
-        iteration=iteration,
+        iteration=(seconds[-1] - seconds[0]) / count,
+        processor=(processor[-1] - processor[0]) / count,
+        steps=(steps[-1] - steps[0]) / count,
     )
 
 
@@ -136,7 +175,20 @@ def cost_table(costs: list[Cost]) -> Table:
     """Make table (e): one row for each p, with the growth beside the first one and a bar."""
     title = "(e) seconds per E-optimal iteration, seven-joint arm, 5 s at 100 Hz"
     table = Table(title=title, title_justify="left")
-    for heading in ("p", "identifiable", "J (psi)", "gradient", "gradient / p = 3", "iteration"):
+    headings = (
+        "p",
+        "identifiable",
+        "survey",
+        "its steps",
+        "J (all moved)",
+        "J (psi)",
+        "gradient",
+        "gradient / p = 3",
+        "iteration",
+        "all cores",
+        "its steps",
+    )
+    for heading in headings:
         table.add_column(heading, justify="right")
     table.add_column("curve")
 
@@ -145,10 +197,15 @@ def cost_table(costs: list[Cost]) -> Table:
         table.add_row(
             str(cost.p),
             str(cost.identifiable),
+            f"{cost.survey:.2f} s",
+            f"{cost.survey_steps:,}",
+            f"{cost.all_moved:.2f} s",
             f"{cost.value:.2f} s",
             f"{cost.gradient:.2f} s",
             f"{cost.gradient / costs[0].gradient:.2f}",
             f"{cost.iteration:.2f} s",
+            f"{cost.processor:.2f} s",
+            f"{cost.steps:,.0f}",
             "█" * max(1, round(24 * cost.iteration / longest)),
         )
 
@@ -171,6 +228,6 @@ def main() -> None:
     if not args.model.is_file():
         raise SystemExit(f"{args.model}: no such model; the arm is not part of this repository")
 
-    console = Console(highlight=False, width=130)
+    console = Console(highlight=False, width=170)
     costs = [measured(args.model, p, args.iterations) for p in COUNTS]
     console.print(cost_table(costs), f"{cores()} cores")
