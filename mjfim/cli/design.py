@@ -56,20 +56,23 @@ DEFAULT_SECONDS = 120.0
 
 @contextmanager
 def several(task: DesignTask, stated: StatedExecutor) -> Iterator[Workers | None]:
-    """Start the workers for the initial controls of a design under hard limits.
+    """Start the workers for the initial controls of a design.
 
     Args:
         task: The design.
         stated: Where they are, as the user states it.
 
     Yields:
-        The workers; None without hard limits, and for a single initial control on this computer,
-        which uses all threads.
+        The workers; None on this computer for a single initial control, and for few of them without
+        hard limits, each of which uses all threads.
     """
     from mjfim.cli.announcements import number_of_starts
 
-    count = number_of_starts(task.system) if task.is_limited else 1
-    with started_executor(stated, count, task.plant.simulator.threads) as workers:
+    threads = task.plant.simulator.threads
+    count = number_of_starts(task.system)
+    if not task.is_limited and count < threads:
+        count = 1
+    with started_executor(stated, count, threads) as workers:
         yield workers
 
 

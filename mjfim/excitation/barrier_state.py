@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import numpy as np
+
+from mjfim.arrays import Array
 from mjfim.budget import PausedBudget
 from mjfim.excitation.interior_problem import InteriorPoint
+from mjfim.excitation.run_result import RunResult
+from mjfim.excitation.search_slices import SearchSlice
+from mjfim.excitation.short_steps import ShortSteps
 from mjfim.optimize.projection_operator import DescentState
 from mjfim.optimize.structured_bfgs import StructuredBFGS
+from mjfim.records.design import Status
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,3 +74,31 @@ class BarrierState:
     begun: BetweenStages
     within: WithinStage
     budget: PausedBudget
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SearchState:
+    """State of a search at an iterate. It can be pickled.
+
+    Attributes:
+        barrier: State of the interior-point method.
+        best_of_stages: (N, nu) best feasible control of each barrier weight mu so far.
+        short_steps: Recognises a descent that is held up.
+    """
+
+    barrier: BarrierState
+    best_of_stages: dict[float, Array]
+    short_steps: ShortSteps
+
+
+def unfinished(result: RunResult, state: SearchState) -> SearchSlice[SearchState]:
+    """Describe a search that goes on later.
+
+    Args:
+        result: The result so far.
+        state: State from which it goes on.
+    """
+    earlier = tuple(state.best_of_stages.values())[:-1]
+    so_far = replace(result, status=Status.INTERRUPTED, earlier=earlier)
+    late = Status.MAX_ITERATIONS if np.isfinite(result.cost) else Status.INFEASIBLE
+    return SearchSlice(result=so_far, state=state, late_status=late)

@@ -11,6 +11,7 @@ from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.bandwidth import bandwidth_basis
+from mjfim.excitation.barrier_state import SearchState, unfinished
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierIterate, BarrierSchedule, InteriorPointMethod
@@ -19,10 +20,9 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.search_slices import (
-    SLICE_SECONDS,
     SearchSlice,
-    SearchState,
     SliceLength,
+    SliceOrder,
 )
 from mjfim.excitation.short_steps import ShortSteps
 from mjfim.excitation.task import DesignTask
@@ -112,8 +112,8 @@ class ConstrainedSearch:
         self,
         task: DesignTask | None,
         length: SliceLength,
-        before: SearchSlice | None = None,
-    ) -> Generator[DesignEvent, None, SearchSlice]:
+        before: SearchSlice[SearchState] | None = None,
+    ) -> Generator[DesignEvent, None, SearchSlice[SearchState]]:
         """Run a part of the search, with the same result to the last digit as the whole of it.
 
         Args:
@@ -144,22 +144,19 @@ class ConstrainedSearch:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SliceOrder:
-    """Order for a part of a search, for a worker.
+class ConstrainedSlice(SliceOrder[SearchState]):
+    """Order for a slice of a search under hard limits.
 
     Attributes:
         search: The search.
-        task_key: Text that is equal for searches on the same task, which a worker resolves once.
-        seconds: Time of the part [s].
-        iterations: Largest number of its iterates.
-        before: The part before; None for the first part.
     """
 
     search: ConstrainedSearch
-    task_key: str
-    seconds: float = SLICE_SECONDS
-    iterations: float = np.inf
-    before: SearchSlice | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the initial control."""
+        return self.search.start.name
 
 
 # Tasks that a worker keeps for later slices: those of the two rounds of a design.
@@ -167,7 +164,7 @@ _tasks = KeptPerThread[DesignTask](2)
 
 
 @one_blas_thread()
-def run_in_worker(order: SliceOrder) -> SearchSlice:
+def run_in_worker(order: ConstrainedSlice) -> SearchSlice[SearchState]:
     """Run a part of a search, for an executor.
 
     Args:
@@ -183,8 +180,7 @@ def run_in_worker(order: SliceOrder) -> SearchSlice:
     search = replace(search, budget=search.budget.with_stop(stop))
 
     task = _tasks.get(order.task_key, search.resolved)
-    length = SliceLength(seconds=order.seconds, iterations=order.iterations)
-    return consume(search.run_slice(task, length, order.before), None)
+    return consume(search.run_slice(task, order.length, order.before), None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -220,7 +216,7 @@ class _Search:
         order: ConstrainedSearch,
         task: DesignTask,
         length: SliceLength,
-        before: SearchSlice | None,
+        before: SearchSlice[SearchState] | None,
     ) -> _Search:
         """Set up the interior-point method; the time of the search counts from here."""
         budget = Budget(
@@ -270,7 +266,9 @@ class _Search:
             steps_before=steps_before,
         )
 
-    def run(self, before: SearchSlice | None) -> Generator[DesignEvent, None, SearchSlice]:
+    def run(
+        self, before: SearchSlice[SearchState] | None
+    ) -> Generator[DesignEvent, None, SearchSlice[SearchState]]:
         """Yield every iterate of this part, and return the best result so far.
 
         Args:
@@ -319,7 +317,7 @@ class _Search:
                     state = SearchState(
                         barrier=iterate.state, best_of_stages=best_of_stages, short_steps=steps
                     )
-                    return SearchSlice.unfinished(result, state)
+                    return unfinished(result, state)
         except (SimulationDivergedError, np.linalg.LinAlgError):
             status = Status.STALLED
 
@@ -327,7 +325,7 @@ class _Search:
         ended = replace(result, status=self._final_status(result, status), earlier=earlier)
         return SearchSlice(result=ended)
 
-    def _iterates(self, before: SearchSlice | None) -> Iterator[BarrierIterate]:
+    def _iterates(self, before: SearchSlice[SearchState] | None) -> Iterator[BarrierIterate]:
         """Iterates of the interior-point method, from the beginning or after those of a part."""
         if before is not None and before.state is not None:
             return self.method.resume(before.state.barrier, self.budget)

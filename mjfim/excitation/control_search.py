@@ -20,6 +20,7 @@ from mjfim.excitation.controls_within_limits import (
     keeps_limits,
 )
 from mjfim.excitation.evaluation import point_at_stated_rate
+from mjfim.excitation.free_slices import has_a_start_for_each, run_free_starts
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel, coarse_level
 from mjfim.excitation.limited_search import LimitedSearch
@@ -39,7 +40,7 @@ class ControlSearch:
     Attributes:
         stage: The stated level.
         first: The experiment's initial control, evaluated.
-        executor: Runs several starts under hard limits side by side, or None.
+        executor: Runs several starts side by side, or None.
         budget: Time of the search and the token that stops it.
         limited: Cost of controls that keep the hard limits; None without limits.
         outside: The initial control where it violates a limit; None where it keeps them.
@@ -65,8 +66,16 @@ class ControlSearch:
         coarse = coarse_level(task, self.first, basis)
         tasks = [task] if coarse is None else [coarse, task]
 
+        levels = [DescentLevel(level, basis) for level in tasks]
+
+        # Starts without limits are independent of each other.
+        if self.executor is not None and not task.is_limited:
+            starts = list(starts)
+            if has_a_start_for_each(self.executor, starts):
+                return (yield from run_free_starts(self.executor, levels, starts, self.budget))
+
         search = UnconstrainedSearch(
-            levels=[DescentLevel(level, basis) for level in tasks],
+            levels=levels,
             budget=self.budget,
             constraints=constraint_set_of(task) if task.is_limited else None,
             steps_before=sum(level.plant.engine_steps for level in tasks),

@@ -52,8 +52,8 @@ def design(
         initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's. The
             experiment's initial control remains the reference x_d of the tracking term.
         threads: Threads for simulations; default: one per core.
-        executor: Executor of `concurrent.futures` that runs several starts under hard limits side
-            by side.
+        executor: Executor of the kind of `concurrent.futures` that runs several starts side by
+            side: under hard limits, and without them if there is a start for each worker.
         stop: Token that ends the search early.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
@@ -108,7 +108,7 @@ def design_task(
         task: The task.
         callback: Called with a `DesignEvent` for every iterate.
         initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's.
-        executor: Runs several starts under hard limits side by side.
+        executor: Runs several starts side by side.
         budget: Time of the design and the token that stops it; default: `[descent] seconds`.
 
     Returns:

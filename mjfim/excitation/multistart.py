@@ -8,6 +8,7 @@ is evaluated; then it is optimised again within tighter limits.
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -18,7 +19,11 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget
-from mjfim.excitation.constrained import ConstrainedSearch
+from mjfim.excitation.constrained import (
+    ConstrainedSearch,
+    ConstrainedSlice,
+    run_in_worker,
+)
 from mjfim.excitation.controls_within_limits import LimitedCost
 from mjfim.excitation.feasibility import reduced_actuators, shrink_about_each
 from mjfim.excitation.initial_controls import InitialControl
@@ -535,10 +540,14 @@ class Multistart:
         if self.executor is None:
             return (yield from self._run_here(searches, stage))
 
-        # A worker needs no file of the caller.
+        # A worker needs no file of the caller, and resolves the task of all these searches once.
         packed = for_workers(task.experiment, task.system.source)
-        searches = [replace(search, experiment=packed) for search in searches]
-        return (yield from run_in_slices(self.executor, searches, self.budget))
+        key = uuid.uuid4().hex
+        orders = [
+            ConstrainedSlice(search=replace(search, experiment=packed), task_key=key)
+            for search in searches
+        ]
+        return (yield from run_in_slices(self.executor, orders, run_in_worker, self.budget))
 
     def _run_here(self, searches: Sequence[ConstrainedSearch], stage: DescentLevel) -> Runs:
         """Run searches one after the other while the budget lasts; the first one always begins."""

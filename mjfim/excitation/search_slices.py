@@ -1,4 +1,4 @@
-"""Slices of an optimisation under hard limits, which an executor runs one after the other.
+"""Slices of an optimisation from one initial control, which an executor runs one after the other.
 
 A worker runs a part of an optimisation and returns its state; the next part may run on another
 worker. So its progress is seen while it runs, and a request to stop or a worker that is killed
@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
-from mjfim.arrays import Array
-from mjfim.excitation.barrier_state import BarrierState
 from mjfim.excitation.run_result import RunResult
-from mjfim.excitation.short_steps import ShortSteps
 from mjfim.records.design import Status
+
+# State from which a search goes on.
+S = TypeVar("S")
 
 # Length of a slice [s]. A slice ends after the iterate that is then running, well before the time
 # is over for which a request to stop waits, and is long enough that its state costs little.
@@ -42,41 +43,43 @@ class SliceLength:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SearchState:
-    """State of a search at an iterate. It can be pickled.
-
-    Attributes:
-        barrier: State of the interior-point method.
-        best_of_stages: (N, nu) best feasible control of each barrier weight mu so far.
-        short_steps: Recognises a descent that is held up.
-    """
-
-    barrier: BarrierState
-    best_of_stages: dict[float, Array]
-    short_steps: ShortSteps
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SearchSlice:
+class SearchSlice(Generic[S]):
     """What a slice of a search returns.
 
     Attributes:
         result: The result so far. That of a search that has not ended counts where nothing
             follows, such as after a request to stop.
         state: State from which the search goes on; None where it has ended.
+        late_status: How the search ends where the time is over before it has ended.
     """
 
     result: RunResult
-    state: SearchState | None = None
+    state: S | None = None
+    late_status: Status = Status.MAX_ITERATIONS
 
-    @classmethod
-    def unfinished(cls, result: RunResult, state: SearchState) -> SearchSlice:
-        """Describe a search that goes on later.
 
-        Args:
-            result: The result so far.
-            state: State from which it goes on.
-        """
-        earlier = tuple(state.best_of_stages.values())[:-1]
-        so_far = replace(result, status=Status.INTERRUPTED, earlier=earlier)
-        return cls(result=so_far, state=state)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SliceOrder(Generic[S]):
+    """Order for a slice of a search, for a worker. It can be pickled.
+
+    Attributes:
+        task_key: Text that is equal for searches on the same task, which a worker resolves once.
+        seconds: Time of the slice [s].
+        iterations: Largest number of its iterates.
+        before: The slice before; None for the first one.
+    """
+
+    task_key: str
+    seconds: float = SLICE_SECONDS
+    iterations: float = math.inf
+    before: SearchSlice[S] | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the initial control."""
+        raise NotImplementedError
+
+    @property
+    def length(self) -> SliceLength:
+        """When the slice ends, if it begins now."""
+        return SliceLength(seconds=self.seconds, iterations=self.iterations)

@@ -1,34 +1,38 @@
-"""Searches under hard limits side by side on the workers of an executor, in slices."""
+"""Searches side by side on the workers of an executor, in slices."""
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-
-import numpy as np
+from typing import Any, Generic, TypeVar
 
 from mjfim.budget import Budget
-from mjfim.excitation.constrained import ConstrainedSearch, SliceOrder, run_in_worker
 from mjfim.excitation.run_result import RunResult, Runs
-from mjfim.excitation.search_slices import SearchSlice
+from mjfim.excitation.search_slices import SearchSlice, SliceOrder
 from mjfim.parallel import Dispatch, Outcome, Workers
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 
+# Order for a slice of some kind of search.
+Order = TypeVar("Order", bound=SliceOrder[Any])
+
 
 def run_in_slices(
-    executor: Executor, searches: Sequence[ConstrainedSearch], budget: Budget
+    executor: Executor,
+    orders: Sequence[Order],
+    function: Callable[[Order], SearchSlice[Any]],
+    budget: Budget,
 ) -> Runs:
-    """Run searches on the same task side by side.
+    """Run searches side by side.
 
     The results are those of one search after the other, to the last digit, where iterations limit
     the searches. A search that has begun goes on before another one begins.
 
     Args:
         executor: The workers, or an executor that they can wrap.
-        searches: The searches.
+        orders: The first slice of each search.
+        function: Runs a slice; it stands at the top of a module.
         budget: When it is exhausted, searches that have not begun are left out. Its token ends
             all.
 
@@ -38,7 +42,7 @@ def run_in_slices(
     Returns:
         One result per search that was begun, in the order of the searches.
     """
-    running = _SlicedSearches(searches, Dispatch(Workers.of(executor), run_in_worker, budget.stop))
+    running = _SlicedSearches(orders, Dispatch(Workers.of(executor), function, budget.stop))
     for outcome in running.dispatch.arrivals():
         for event in running.take(outcome, budget):
             if budget.stop.requested:
@@ -48,27 +52,24 @@ def run_in_slices(
     return running.results(budget)
 
 
-class _SlicedSearches:
+class _SlicedSearches(Generic[Order]):
     """Searches of which each has at most one slice under way.
 
     Args:
-        searches: The searches.
+        orders: The first slice of each search.
         dispatch: Carries out the slices.
     """
 
     def __init__(
-        self, searches: Sequence[ConstrainedSearch], dispatch: Dispatch[SliceOrder, SearchSlice]
+        self, orders: Sequence[Order], dispatch: Dispatch[Order, SearchSlice[Any]]
     ) -> None:
         self.dispatch = dispatch
-        self._latest: dict[int, SearchSlice] = {}
-
-        # A worker resolves the task of all these searches once.
-        key = uuid.uuid4().hex
-        self._orders = [SliceOrder(search=search, task_key=key) for search in searches]
-        for index, order in enumerate(self._orders):
+        self._latest: dict[int, SearchSlice[Any]] = {}
+        self._orders = orders
+        for index, order in enumerate(orders):
             dispatch.add(index, order)
 
-    def take(self, outcome: Outcome[SearchSlice], budget: Budget) -> Iterator[DesignEvent]:
+    def take(self, outcome: Outcome[SearchSlice[Any]], budget: Budget) -> Iterator[DesignEvent]:
         """Take what a slice returns, and let its search go on.
 
         Args:
@@ -104,14 +105,13 @@ class _SlicedSearches:
             found = self._latest[index]
             result = found.result
             if found.state is not None and not budget.stop.requested:
-                is_inside = np.isfinite(result.cost)
-                status = Status.MAX_ITERATIONS if is_inside else Status.INFEASIBLE
-                result = replace(result, status=status)
+                result = replace(result, status=found.late_status)
             results.append(result)
         return results
 
-    def _lost(self, index: int) -> SearchSlice:
+    def _lost(self, index: int) -> SearchSlice[Any]:
         """End a search whose worker is lost each time: its result so far counts."""
-        name = self._orders[index].search.start.name
-        latest = self._latest.get(index, SearchSlice(result=RunResult(name=name)))
-        return SearchSlice(result=replace(latest.result, status=Status.LOST))
+        name = self._orders[index].name
+        latest = self._latest.get(index)
+        result = RunResult(name=name) if latest is None else latest.result
+        return SearchSlice(result=replace(result, status=Status.LOST))

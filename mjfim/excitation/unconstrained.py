@@ -5,8 +5,8 @@ The E-criterion is replaced by a smooth one where the smallest eigenvalues meet.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,9 +19,18 @@ from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.search_slices import SearchSlice, SliceLength
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
-from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
+from mjfim.optimize.projection_operator import (
+    Armijo,
+    DescentState,
+    Direction,
+    Iterate,
+    Regulator,
+    optimize,
+)
+from mjfim.parallel import offer_result
 from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
 from mjfim.records.iterates import IterateMotion
@@ -128,6 +137,8 @@ class _Pass:
         direction: Descent direction with the curvature that it has learnt.
         eigenvalues_meet: True where the smallest eigenvalues met, which ended Algorithm 1.
         ends_run: True where no level may follow.
+        done: Number of iterations before.
+        descent: State of Algorithm 1 where the slice of the search is over; None elsewhere.
     """
 
     progress: _Progress
@@ -136,6 +147,25 @@ class _Pass:
     direction: Direction
     eigenvalues_meet: bool = False
     ends_run: bool = False
+    done: int = 0
+    descent: DescentState[DesignPoint] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FreeState:
+    """State of a descent without a barrier at an iterate. It can be pickled.
+
+    Attributes:
+        level: Number of the level.
+        power: Power of the E-criterion on this level.
+        interrupted: State of the run of Algorithm 1 on this level.
+        steps: Engine steps of all levels so far.
+    """
+
+    level: int
+    power: float
+    interrupted: _Pass
+    steps: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,12 +177,14 @@ class UnconstrainedSearch:
         budget: Time of all descents.
         constraints: Limits that a descent must not leave, or None; it ends where it does.
         steps_before: Engine steps of all levels' plants when the search began.
+        length: When a slice of a descent ends.
     """
 
     levels: Sequence[DescentLevel]
     budget: Budget
     constraints: ConstraintSet | None
     steps_before: int
+    length: SliceLength = field(default_factory=SliceLength)
 
     def run_all(self, starts: Iterable[InitialControl]) -> Runs:
         """Descend from one initial control after the other.
@@ -197,27 +229,62 @@ class UnconstrainedSearch:
         Returns:
             The result; with constraints its control is the last one that kept all limits.
         """
+        found = yield from self.run_slice(start)
+        return found.result
+
+    def run_slice(
+        self, start: InitialControl, before: FreeState | None = None
+    ) -> Generator[DesignEvent, None, SearchSlice[FreeState]]:
+        """Run a part of a descent, with the result of the whole one to the last digit.
+
+        Args:
+            start: The initial control.
+            before: State at the end of the part before; None to begin.
+
+        Yields:
+            Every iterate of the part.
+
+        Returns:
+            The result so far, and the state from which the next part goes on.
+        """
         progress = _Progress(result=RunResult(name=start.name))
         given = start.over_horizon
         control = given
-        power = np.inf
+        power = np.inf if before is None else before.power
         memory: Direction | None = None
+        resumed = None if before is None else before.interrupted
+        resumed_at = None if resumed is None else resumed.descent
 
-        for level in self.levels:
+        for number in range(0 if before is None else before.level, len(self.levels)):
             repeat = True
             while repeat:
-                stage = replace(level, power=power)
-                ended = yield from self._run_pass(stage, [control, given], progress, memory)
+                stage = replace(self.levels[number], power=power)
+                if resumed is None or resumed_at is None:
+                    ended = yield from self._run_pass(stage, [control, given], progress, memory)
+                else:
+                    ended = yield from self._resume_pass(stage, resumed, resumed_at)
+                resumed = None
                 progress = ended.progress
+                if ended.descent is not None:
+                    state = FreeState(
+                        level=number, power=power, interrupted=ended, steps=self.steps
+                    )
+                    return SearchSlice(result=progress.result, state=state)
                 if ended.ends_run:
-                    return progress.result
+                    return SearchSlice(result=progress.result)
 
                 control = ended.control
                 power, repeat = _next_power(stage, ended)
                 memory = None if repeat else ended.direction
 
         # Where a clamp acts, derivatives do not exist, so that the design needs a barrier.
-        return replace(progress.result, left_limits=progress.clamped_iterates > 0)
+        result = replace(progress.result, left_limits=progress.clamped_iterates > 0)
+        return SearchSlice(result=result)
+
+    @property
+    def steps(self) -> int:
+        """Engine steps of all levels since the search began."""
+        return sum(level.task.plant.engine_steps for level in self.levels) - self.steps_before
 
     def _run_pass(
         self,
@@ -231,7 +298,6 @@ class UnconstrainedSearch:
         The given control is compared with that of the coarse level, which may cost more here.
         """
         task = stage.task
-        rate = 1.0 / task.dt
         direction, problem = _direction_with_memory(stage, memory, progress.rate)
         ended = _Pass(
             progress=progress,
@@ -247,31 +313,71 @@ class UnconstrainedSearch:
         # Iterations are counted over all levels.
         history = progress.result.history
         done = history[-1].iteration + 1 if history else 0
-        tolerance, max_iterations = _stopping_rule(task)
+        begun = replace(ended, done=done)
+        return (yield from self._follow(stage, begun, self._iterates(stage, problem, begun, start)))
 
-        iterates = optimize(
+    def _resume_pass(
+        self, stage: DescentLevel, interrupted: _Pass, descent: DescentState[DesignPoint]
+    ) -> Generator[DesignEvent, None, _Pass]:
+        """Go on with a run of Algorithm 1, whose first iterate is known already."""
+        _, problem = direction_for(stage)
+        iterates = self._iterates(stage, problem, interrupted, descent.point)
+        begun = replace(interrupted, descent=None)
+        return (yield from self._follow(stage, begun, iterates, known=1))
+
+    def _iterates(
+        self, stage: DescentLevel, problem: DesignProblem, begun: _Pass, start: DesignPoint
+    ) -> Iterator[Iterate[DesignPoint]]:
+        """Iterates of Algorithm 1 from a point, or from that at which it was interrupted."""
+        tolerance, max_iterations = _stopping_rule(stage.task)
+        return optimize(
             problem,
             start,
-            direction,
-            regulator_for(task),
+            begun.direction,
+            regulator_for(stage.task),
             Armijo(),
             tolerance=tolerance,
-            max_iterations=max(max_iterations - done, 0),
+            max_iterations=max(max_iterations - begun.done, 0),
+            resumed=begun.descent,
         )
-        for iterate in iterates:
-            ended = _advance(ended, stage, iterate, rate)
 
-            if _is_new(ended.progress.result, done + iterate.index, rate):
-                ended = self._check_limits(ended, task)
+    def _follow(
+        self,
+        stage: DescentLevel,
+        begun: _Pass,
+        iterates: Iterator[Iterate[DesignPoint]],
+        known: int = 0,
+    ) -> Generator[DesignEvent, None, _Pass]:
+        """Observe Algorithm 1 until it ends, leaves the limits, or the time or slice is over.
+
+        Args:
+            stage: The level.
+            begun: The run before.
+            iterates: The iterates.
+            known: Number of iterates that were observed already.
+        """
+        rate = 1.0 / stage.task.dt
+        ended = begun
+        for count, iterate in enumerate(iterates):
+            is_new = False
+            if count >= known:
+                ended = _advance(ended, stage, iterate, rate)
+                is_new = _is_new(ended.progress.result, begun.done + iterate.index, rate)
+
+            if is_new:
+                ended = self._check_limits(ended, stage.task)
                 if ended.ends_run:
                     return ended
 
-                ended, row = self._record(ended, stage, iterate, done)
+                ended, row = self._record(ended, stage, iterate, begun.done)
+                offer_result(SearchSlice(result=ended.progress.result))
                 yield DesignEvent(start=ended.progress.result.name, row=row)
 
                 reason = self.budget.exhausted
                 if reason is not None:
                     return _stop(ended, reason)
+                if iterate.status is None and self.length.is_over(count):
+                    return replace(ended, descent=iterate.state)
 
             # Where the smallest eigenvalues meet, the exact criterion has a kink, at which steps
             # become too short.
@@ -308,7 +414,6 @@ class UnconstrainedSearch:
         self, ended: _Pass, stage: DescentLevel, iterate: Iterate[DesignPoint], done: int
     ) -> tuple[_Pass, HistoryRow]:
         """Append an iterate to the history."""
-        steps = sum(level.task.plant.engine_steps for level in self.levels) - self.steps_before
         point = _exact_point(stage, iterate.point)
         criterion = point.criterion
 
@@ -320,7 +425,7 @@ class UnconstrainedSearch:
             slope=iterate.slope,
             gamma=iterate.gamma,
             seconds=self.budget.seconds_used,
-            steps=steps,
+            steps=self.steps,
             rate=1.0 / stage.task.dt,
             motion=IterateMotion.of(point.trajectory),
         )

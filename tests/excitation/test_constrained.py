@@ -15,7 +15,7 @@ import pytest
 import mjfim
 from mjfim.budget import Budget, StopToken
 from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.excitation.constrained import ConstrainedSearch, SliceOrder, run_in_worker
+from mjfim.excitation.constrained import ConstrainedSearch, ConstrainedSlice, run_in_worker
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design_task
 from mjfim.excitation.feasibility import SHRINK_FACTORS
@@ -428,7 +428,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
         schedule=BarrierSchedule(),
         max_iterations=4,
     )
-    result = run_in_worker(SliceOrder(search=search, task_key="wild")).result
+    result = run_in_worker(ConstrainedSlice(search=search, task_key="wild")).result
     assert result.status is Status.INFEASIBLE
     assert result.cost == np.inf
     # another start is still optimised

@@ -7,21 +7,24 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from mjfim.budget import Budget, StopToken
-from mjfim.excitation import sliced_searches
-from mjfim.excitation.constrained import ConstrainedSearch, SliceOrder, run_in_worker
+from mjfim.excitation import free_slices
+from mjfim.excitation.constrained import ConstrainedSearch, ConstrainedSlice, run_in_worker
+from mjfim.excitation.design import design_task
+from mjfim.excitation.free_slices import FreeSlice
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.run_result import RunResult, consume
-from mjfim.excitation.search_slices import SearchSlice
+from mjfim.excitation.search_slices import SearchSlice, SliceOrder
 from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.excitation.task import DesignTask
-from mjfim.records.design import Status
+from mjfim.records.design import Design, Status
 from mjfim.records.events import DesignEvent
 from tests.support.limits import cart_inside
 
@@ -83,7 +86,7 @@ def test_a_search_in_slices_equals_the_whole_one_to_the_last_digit(
     iterations: int, searches: list[ConstrainedSearch], whole: RunResult
 ) -> None:
     """Each slice is pickled, as on its way to another process."""
-    order = SliceOrder(search=searches[0], task_key="slices", iterations=iterations)
+    order = ConstrainedSlice(search=searches[0], task_key="slices", iterations=iterations)
     slices = [run_in_worker(pickle.loads(pickle.dumps(order)))]
     while slices[-1].state is not None:
         following = replace(order, before=slices[-1])
@@ -100,17 +103,8 @@ def run_sliced(
     callback: Callable[[DesignEvent], None] | None = None,
 ) -> list[RunResult]:
     """Run searches in slices, each of which ends after every second iterate."""
-    return consume(run_in_slices(executor, searches, Budget(stop=stop)), callback)
-
-
-@pytest.fixture(autouse=True)
-def short_slices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the slices of all tests end after two iterates."""
-
-    def order(**values: Any) -> SliceOrder:
-        return SliceOrder(**{"iterations": 2, **values})
-
-    monkeypatch.setattr(sliced_searches, "SliceOrder", order)
+    orders = [ConstrainedSlice(search=each, task_key="short", iterations=2) for each in searches]
+    return consume(run_in_slices(executor, orders, run_in_worker, Budget(stop=stop)), callback)
 
 
 class LosingExecutor(Executor):
@@ -122,7 +116,7 @@ class LosingExecutor(Executor):
 
     _max_workers = 2
 
-    def __init__(self, is_lost: Callable[[SliceOrder, int], bool]) -> None:
+    def __init__(self, is_lost: Callable[[Any, int], bool]) -> None:
         self.is_lost = is_lost
         self.count = 0
 
@@ -189,7 +183,46 @@ def test_a_request_to_stop_loses_at_most_one_slice_on_threads(
 
 @pytest.mark.slow
 def test_a_slice_says_when_its_search_has_ended(searches: list[ConstrainedSearch]) -> None:
-    ended = run_in_worker(SliceOrder(search=searches[0], task_key="ended", seconds=np.inf))
+    ended = run_in_worker(ConstrainedSlice(search=searches[0], task_key="ended", seconds=np.inf))
     assert isinstance(ended, SearchSlice)
     assert ended.state is None
     assert ended.result.status is not Status.INTERRUPTED
+
+
+def assert_same_design(found: Design, serial: Design) -> None:
+    """Assert that two designs are equal to the last digit, apart from the time."""
+    assert (found.final.cost, found.status, found.steps) == (
+        serial.final.cost,
+        serial.status,
+        serial.steps,
+    )
+    assert np.array_equal(found.trajectory.ctrl, serial.trajectory.ctrl)
+    assert found.starts == serial.starts
+
+    # Without limits there is no margin.
+    found_rows, rows = (
+        [replace(row, seconds=0.0, motion=None, margin=0.0) for row in design.history]
+        for design in (found, serial)
+    )
+    assert found_rows == rows
+
+
+@pytest.mark.parametrize("method", ["lbfgs", pytest.param("metric", marks=pytest.mark.slow)])
+def test_free_starts_on_workers_give_the_design_of_one_process(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Slices of two iterates, some of which are lost, on a coarse and on the stated level."""
+    descent = {"starts": 2, "max_iterations": 6, "method": method, "coarse": 2}
+    cost = {"control": 1e-3}
+    task = cart_inside(tmp_path, horizon=0.4, limits={}, cost=cost, descent=descent)
+    serial = design_task(task)
+    assert len({row.rate for row in serial.history}) == (2 if method == "lbfgs" else 1)
+
+    def short_slice(**values: Any) -> FreeSlice:
+        return FreeSlice(**{"iterations": 2, **values})
+
+    monkeypatch.setattr(free_slices, "FreeSlice", short_slice)
+    executor = LosingExecutor(lambda order, count: count in (2, 3, 6))
+    found = design_task(task, executor=executor)
+    assert executor.count > 6
+    assert_same_design(found, serial)
