@@ -139,7 +139,13 @@ def run_free_starts(
     )
     orders = [replace(first, start=start) for start in starts]
     results = yield from run_in_slices(executor, orders, run_free_in_worker, budget)
-    return _counted_together(results)
+    found = _counted_together(results)
+
+    # The choice of the levels took some steps on the coarse plant, which the caller does not count.
+    if found and len(levels) > 1:
+        chosen = levels[0].task.plant.engine_steps
+        found[0] = replace(found[0], steps=found[0].steps + chosen)
+    return found
 
 
 def _counted_together(results: Sequence[RunResult]) -> list[RunResult]:
