@@ -122,7 +122,7 @@ def montecarlo(
     executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Compare estimates with the Cramér-Rao bound on the initial and on the designed trajectory."""
-    from mjfim.cli.announcements import announce_trials
+    from mjfim.cli.announcements import ANNOUNCED_SECONDS, announce_trials
     from mjfim.experiment.input_files import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
@@ -145,7 +145,7 @@ def montecarlo(
     expected = announce_trials(system, named, trials)
 
     # The start of processes takes longer than a short study.
-    start = started_if_stated if expected is None else started_executor
+    start = started_executor if expected.seconds >= ANNOUNCED_SECONDS else started_if_stated
     with (
         start(place, trials) as workers,
         progress(f"{trials} trials", expected=expected) as display,
