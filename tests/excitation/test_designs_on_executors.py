@@ -73,7 +73,7 @@ def test_all_executors_behave_alike(kind: str, tmp_path: Path) -> None:
         def ask(event: DesignEvent) -> None:
             """Ask for the end after some iterates."""
             asked.append(time.monotonic())
-            if len(asked) >= 5:
+            if len(asked) >= 12:
                 stop.request()
 
         stopped = design_task(long, callback=ask, executor=workers, budget=Budget(stop=stop))
