@@ -6,13 +6,13 @@ the speed of the computer.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from mjfim import budget
+from mjfim.budget import measured_by
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import StepCount
@@ -43,7 +43,7 @@ class StepClock:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> StepClock:
+def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[StepClock]:
     """The clock of all budgets."""
     clock = StepClock()
 
@@ -55,8 +55,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> StepClock:
         count.__dict__["counted"] = steps
 
     monkeypatch.setattr(StepCount, "steps", property(read, write), raising=False)
-    monkeypatch.setattr(budget, "time", SimpleNamespace(monotonic=clock, time=clock))
-    return clock
+    with measured_by(clock):
+        yield clock
 
 
 def weights(folder: Path, descent: dict[str, Any]) -> DesignTask:

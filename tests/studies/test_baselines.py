@@ -17,6 +17,7 @@ from mjfim.budget import StopToken
 from mjfim.excitation.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
 from mjfim.signals import (
     Chirp,
     ExcitationSettings,
@@ -205,16 +206,17 @@ def test_a_budget_of_steps_makes_it_repeatable() -> None:
 
 
 def test_workers_share_the_steps() -> None:
+    search = order(pendulum(), "steps", steps=40_000)
     with ThreadPoolExecutor(2) as executor:
         run = _MethodRun(
-            search=order(pendulum(), "steps", steps=40_000),
+            search=search,
             index=0,
             count=1,
             callback=None,
             executor=executor,
             stop=StopToken(),
         )
-        result = run.divided_baseline(executor)
+        result = run.divided_baseline(executor, System.resolve(search.experiment))
     assert result is not None
     assert result.control is not None
     assert result.steps < 1.2 * 40_000 + 2 * 8_000
