@@ -7,7 +7,6 @@ turns Ctrl-C into a request of a token.
 
 from __future__ import annotations
 
-import copy
 import math
 import signal
 import threading
@@ -174,7 +173,9 @@ class Budget:
         Returns:
             A budget with equal limits and equal use so far.
         """
-        other = copy.copy(self)
+        # `copy.copy` would restore the clock of another process.
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
         other.stop = stop
         return other
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 
-from mjfim.budget import Budget, StopReason, measured_by
+from mjfim.budget import Budget, StopReason, StopToken, measured_by
 
 
 def test_a_budget_keeps_the_clock_with_which_it_was_made() -> None:
@@ -19,6 +19,13 @@ def test_a_budget_keeps_the_clock_with_which_it_was_made() -> None:
         StopReason.SECONDS,
     )
     assert budget.exhausted is None and budget.share(0.5).exhausted is None
+
+    # A copy with another token goes on counting by the same clock.
+    token = StopToken()
+    other = budget.with_stop(token)
+    assert (other.seconds_used, other.seconds_left) == (6.0, 4.0)
+    token.request()
+    assert other.exhausted is StopReason.REQUESTED and budget.exhausted is None
 
     # The process of a worker has its own clock.
     restored = pickle.loads(pickle.dumps(Budget(seconds=1e6)))

@@ -84,11 +84,12 @@ class InteriorProblem:
     delta: float
     with_cost: bool = True
 
-    def point(self, ctrl: Array) -> InteriorPoint:
+    def point(self, ctrl: Array, *, lumps: bool = True) -> InteriorPoint:
         """Evaluate a control along its open-loop trajectory.
 
         Args:
             ctrl: (N, nu) control [u-unit].
+            lumps: False to move all parameters, see `DesignPoint`.
 
         Returns:
             The point; `DIVERGED_POINT` where the simulation diverges.
@@ -103,7 +104,7 @@ class InteriorProblem:
             return InteriorPoint(values=values, point=None, merit=0.0, barrier=barrier)
 
         accuracy = self.base.plant.derivatives.quickest_accuracy
-        point = self.base.point(values.trajectory, accuracy)
+        point = self.base.point(values.trajectory, accuracy, lumps=lumps)
         if point is DIVERGED:
             return DIVERGED_POINT
 
@@ -225,11 +226,12 @@ class InteriorProblem:
             The new point.
         """
         trajectory = values_of(point).trajectory
+        lumps = point.point is None or point.point.lumps
         if not K.any():
-            return self.point(trajectory.ctrl + gamma * zeta.v)
+            return self.point(trajectory.ctrl + gamma * zeta.v, lumps=lumps)
 
         moved = self.base.plant.project(self.base.theta, trajectory, zeta, gamma, K)
-        return DIVERGED_POINT if moved is None else self.point(moved.ctrl)
+        return DIVERGED_POINT if moved is None else self.point(moved.ctrl, lumps=lumps)
 
     def difference(self, new: InteriorPoint, old: InteriorPoint) -> TangentCurve:
         """(x_new - x_old, u_new - u_old) of two points."""

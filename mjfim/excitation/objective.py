@@ -89,6 +89,9 @@ class DesignPoint:
         accuracy: Differences with which the point is expanded.
         others: Points of this control at the further parameter samples of a robust design; their
             cost is not computed.
+        lumps: False where the motion, or one from which the search came, shows that the columns of
+            lumped parameters do not follow from the others. All parameters are moved then, here and
+            at the points to which the search goes from here.
     """
 
     trajectory: Trajectory | None
@@ -98,6 +101,7 @@ class DesignPoint:
     cost: float
     accuracy: DifferenceAccuracy
     others: tuple[DesignPoint, ...] = ()
+    lumps: bool = True
 
     @property
     def phi(self) -> tuple[float, ...]:
@@ -143,18 +147,23 @@ class DesignProblem:
     lumped: LumpedParameters | None = None
 
     def point(
-        self, trajectory: Trajectory, accuracy: DifferenceAccuracy = FORWARD_DIFFERENCES
+        self,
+        trajectory: Trajectory,
+        accuracy: DifferenceAccuracy = FORWARD_DIFFERENCES,
+        *,
+        lumps: bool = True,
     ) -> DesignPoint:
         """Evaluate the cost along a trajectory.
 
         Args:
             trajectory: A trajectory of the plant at theta.
             accuracy: Differences with which sensitivities are computed.
+            lumps: False to move all parameters, see `DesignPoint`.
 
         Returns:
             The point; `DIVERGED` where a simulation with moved parameters diverges.
         """
-        point = self._point_without_cost(self.theta, trajectory, accuracy)
+        point = self._point_without_cost(self.theta, trajectory, accuracy, lumps)
         if point.criterion is None:
             return DIVERGED
 
@@ -203,13 +212,18 @@ class DesignProblem:
         return self.parameter_samples.thetas[1:]
 
     def _point_without_cost(
-        self, theta: Array, trajectory: Trajectory, accuracy: DifferenceAccuracy
+        self,
+        theta: Array,
+        trajectory: Trajectory,
+        accuracy: DifferenceAccuracy,
+        lumps: bool = True,
     ) -> DesignPoint:
         """Point of a trajectory of the plant at theta: (p,), without its cost."""
         central = not accuracy.shared_origin
 
         # At other values, other combinations may be without effect.
-        lumped = self.lumped if theta is self.theta else None
+        may_lump = lumps and np.array_equal(theta, self.theta)
+        lumped = self.lumped if may_lump else None
         sensitivity = self.plant.derivatives.sensitivity(
             theta, trajectory, central=central, lumped=lumped
         )
@@ -224,6 +238,7 @@ class DesignProblem:
             criterion=self.information.evaluate(information),
             cost=np.inf,
             accuracy=accuracy,
+            lumps=lumps and (lumped is None or sensitivity.is_lumped),
         )
 
     def value(self, point: DesignPoint) -> float:
@@ -334,7 +349,9 @@ class DesignProblem:
         """
         trajectory, _, _ = _computed(point)
         moved = self.plant.project(self.theta, trajectory, zeta, gamma, K)
-        return DIVERGED if moved is None else self.point(moved, point.accuracy)
+        if moved is None:
+            return DIVERGED
+        return self.point(moved, point.accuracy, lumps=point.lumps)
 
     def difference(self, new: DesignPoint, old: DesignPoint) -> TangentCurve:
         """(x_new - x_old, u_new - u_old)."""

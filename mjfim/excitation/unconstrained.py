@@ -36,7 +36,7 @@ from mjfim.records.events import DesignEvent
 from mjfim.records.iterates import IterateMotion
 
 # Growth of a small deviation along the trajectory above which the projection uses feedback. It is
-# measured in the units of the state in which it is smallest.
+# measured in the best units of the state, see `amplification_in_best_units`.
 FEEDBACK_THRESHOLD = 10.0
 
 # Smallest tolerance on a coarse level. It is coarse, because the stated level refines the minimum.
@@ -108,6 +108,7 @@ def regulator_for(task: DesignTask) -> Regulator:
         R=np.diag(control_sizes**-2.0) * share,
         terminal=last,
         feedback_threshold=FEEDBACK_THRESHOLD,
+        state_sizes=state_sizes,
     )
 
 

@@ -111,32 +111,49 @@ def largest_amplification(A: Array, sizes: Array | None = None) -> float:
     if sizes is not None:
         A = A * (sizes / sizes[:, None])
 
-    products = _products(A)
-    return float(max(np.linalg.norm(each, 2, axis=(1, 2)).max() for each in products))
+    return _largest_norm(_products(A))
 
 
-def amplification_in_any_units(A: Array) -> float:
-    """Largest amplification of a deviation, in the units of the state in which it is smallest.
+def amplification_in_best_units(A: Array, sizes: Array | None = None) -> float:
+    """Upper bound of the amplification of deviations, in units of the state that make it small.
 
-    The entry (i, j) of a matrix M is the largest deviation of component i that follows from a
-    deviation 1 of component j, over the deviations of `largest_amplification`. Units D of the state
-    turn M into `D^-1 M D`. The smallest value, over all units, of its largest row sum is the
-    spectral radius of M (Perron and Frobenius).
+    It is the smaller one of two bounds over the deviations of `largest_amplification`, each in
+    units of its own.
+
+    The first bound is `largest_amplification` in units of the sizes.
+
+    For the second one, the entry (i, j) of a matrix M is the largest deviation of component i that
+    follows from a deviation 1 of component j. Units D of the state turn M into `D^-1 M D`. The
+    smallest value, over all units, of its largest row sum is the spectral radius of M (Perron and
+    Frobenius), and no deviation grows more than that in these units, in the largest norm.
 
     So a position that only integrates a speed does not count, however long the motion is, nor does
-    a slow oscillation, whose speeds are small beside its positions.
+    a slow oscillation, whose speeds are small beside its positions. But the entries of M are
+    largest at different times, so that the second bound grows with the number of states; the first
+    one does not.
 
     Args:
         A: (N, nx, nx) transition matrices.
+        sizes: (nx,) sizes of the state's components [x-unit]; default: 1.
 
     Returns:
-        The spectral radius of M, at least 1; infinite where a deviation overflows.
+        The bound, at least 1; infinite where a deviation overflows.
     """
-    largest = np.max([np.abs(each).max(axis=0) for each in _products(A)], axis=0)
+    if sizes is not None:
+        A = A * (sizes / sizes[:, None])
+
+    products = _products(A)
+    largest = np.max([np.abs(each).max(axis=0) for each in products], axis=0)
     if not np.isfinite(largest).all():
         return np.inf
 
-    return float(np.abs(np.linalg.eigvals(largest)).max(initial=1.0))
+    by_components = float(np.abs(np.linalg.eigvals(largest)).max(initial=1.0))
+    return min(by_components, _largest_norm(products))
+
+
+def _largest_norm(products: tuple[Array, Array]) -> float:
+    """Largest spectral norm of the products of `_products`."""
+    return float(max(np.linalg.norm(each, 2, axis=(1, 2)).max() for each in products))
 
 
 def _products(A: Array) -> tuple[Array, Array]:

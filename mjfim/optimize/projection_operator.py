@@ -18,7 +18,7 @@ from mjfim.optimize.eigenvalue_model import EigenvalueModel
 from mjfim.optimize.lq import (
     CurveCoordinates,
     TangentCurve,
-    amplification_in_any_units,
+    amplification_in_best_units,
     regulator,
 )
 from mjfim.records.design import Status
@@ -317,9 +317,11 @@ class Regulator:
         R: (nu, nu) weight of the control, multiplied by the sample period.
         terminal: (nx, nx) weight of the last state.
         period: Number of iterates after which K is renewed.
-        feedback_threshold: Amplification of deviations along the open-loop trajectory, in the units
-            in which it is smallest, up to which the projection needs no feedback and K is zero.
-            With 0 there is always feedback.
+        feedback_threshold: Amplification of deviations along the open-loop trajectory, in the best
+            units, up to which the projection needs no feedback and K is zero. With 0 there is
+            always feedback, with infinity never.
+        state_sizes: (nx,) sizes of the state's components [x-unit], units in which deviations are
+            measured besides the best ones; default: 1.
     """
 
     Q: Array
@@ -327,6 +329,7 @@ class Regulator:
     terminal: Array
     period: int = 10
     feedback_threshold: float = 0.0
+    state_sizes: Array | None = None
 
     def gain(self, expansion: Expansion) -> Array:
         """Gain about the trajectory of an expansion.
@@ -337,13 +340,22 @@ class Regulator:
         Returns:
             K: (N, nu, nx).
         """
-        if self.feedback_threshold:
-            growth = amplification_in_any_units(expansion.A)
-            if growth <= self.feedback_threshold:
-                N, nx, nu = expansion.B.shape
-                return np.zeros((N, nu, nx))
+        if self._needs_feedback(expansion):
+            return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
 
-        return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
+        N, nx, nu = expansion.B.shape
+        return np.zeros((N, nu, nx))
+
+    def _needs_feedback(self, expansion: Expansion) -> bool:
+        """Check whether deviations along the trajectory of an expansion grow above the threshold.
+
+        The two extreme thresholds need no amplification, whose computation takes time.
+        """
+        if self.feedback_threshold == 0.0 or np.isinf(self.feedback_threshold):
+            return self.feedback_threshold == 0.0
+
+        growth = amplification_in_best_units(expansion.A, self.state_sizes)
+        return growth > self.feedback_threshold
 
 
 def optimize(

@@ -12,12 +12,15 @@ from mjfim.arrays import Array
 # Smallest ratio of the last to the first pivot with which parameters are lumped.
 LEAST_PIVOT_RATIO = 1e-3
 
+# Entry of a direction, relative to its largest one, below which the entry is round-off.
+ROUND_OFF = 1e-12
+
 # Largest effect of the probe, relative to the effects that cancel in it, that counts as none. It is
 # above the curvature of one-sided differences.
 LARGEST_REMAINDER = 1e-4
 
 
-@dataclass(kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LumpedParameters:
     """Parameters that are lumped into others.
 
@@ -30,14 +33,12 @@ class LumpedParameters:
         coefficients: (b, k) psi of the lumped parameters is psi of the base ones times these.
         probe: (p,) a combination of the directions without effect, whose rollout shows whether they
             have none along a motion [theta-unit].
-        refuted: True since a motion showed an effect of the probe. All parameters are moved then.
     """
 
     base: np.ndarray
     lumped: np.ndarray
     coefficients: Array
     probe: Array
-    refuted: bool = False
 
     @staticmethod
     def of(directions: Array, size: Array) -> LumpedParameters | None:
@@ -54,7 +55,10 @@ class LumpedParameters:
         if not k:
             return None
 
+        # A parameter that takes part in a direction by round-off only does not take part in it.
         relative = directions / size[:, None]
+        largest = np.abs(relative).max(axis=0)
+        relative = np.where(np.abs(relative) > ROUND_OFF * largest, relative, 0.0)
         unit = relative / np.linalg.norm(relative, axis=0)
         _, triangle, pivots = scipy.linalg.qr(unit.T, mode="economic", pivoting=True)
         diagonal = np.abs(np.diag(triangle))

@@ -25,6 +25,9 @@ MAX_STEP_FACTOR = 100.0
 # Largest number of state values that are in memory at once.
 MAX_NUMBERS_AT_ONCE = 8_000_000
 
+# Largest effect of the parameters on an output, relative to the output, that may be round-off.
+ROUND_OFF_EFFECT = 1e-9
+
 # Smallest divisor; it prevents a division by zero.
 TINY = 1e-300
 
@@ -107,7 +110,7 @@ class RolloutDerivatives(DifferenceSteps):
                 output.
             lumped: Parameters whose columns follow from those of the others, without rollouts of
                 their own; None for none. Where this motion shows that they do not follow, all
-                parameters are moved, from now on.
+                parameters are moved.
 
         Returns:
             The sensitivities, or None if a perturbed rollout diverges.
@@ -124,12 +127,13 @@ class RolloutDerivatives(DifferenceSteps):
         return None if found is None else found[1]
 
     def _can_lump(self, lumped: LumpedParameters | None) -> bool:
-        """True where lumped parameters act on the motion alone, and no motion has refuted them."""
-        if lumped is None or lumped.refuted:
+        """True where all parameters that take part in the lumping change the motion."""
+        if lumped is None:
             return False
 
-        at_rest = ~self.plant.parameters.changes_motion
-        return not (at_rest[lumped.lumped].any() or lumped.probe[at_rest].any())
+        without_motion_effect = ~self.plant.parameters.changes_motion
+        lumps_others = without_motion_effect[lumped.lumped].any()
+        return not (lumps_others or lumped.probe[without_motion_effect].any())
 
     def calibrated_step_factors(self, theta: Array, trajectory: Trajectory) -> Array | None:
         """Factors of the parameters' difference steps with which their effect exceeds round-off.
@@ -194,16 +198,8 @@ class RolloutDerivatives(DifferenceSteps):
         delay = plant.output_delay(theta, len(ctrl) + 1)
         needs_origin = states is None or (delay is not None and plant.outputs.needs_sensors)
 
-        steps = step * self.parameter_scale
-        moving = np.flatnonzero(plant.parameters.changes_motion)
-        if lumped is not None:
-            moving = np.setdiff1d(moving, lumped.lumped)
-        h = steps[moving]
-        forward = _unit_moves(len(theta), moving) * h[:, None]
-        if lumped is not None:
-            h = np.append(h, 1.0 / np.abs(lumped.probe / steps).max())
-            forward = np.concatenate([forward, lumped.probe[None] * h[-1]])
-        moves = _theta_moves(forward, central, needs_origin)
+        moving, directions, h = self._moved_directions(step, lumped)
+        moves = _theta_moves(directions * h[:, None], central, needs_origin)
 
         sensors = None
         origin = np.zeros((len(ctrl) + 1, 0)) if states is None else states
@@ -223,8 +219,8 @@ class RolloutDerivatives(DifferenceSteps):
             if lumped is not None:
                 psi = lumped.expanded(psi[..., lumped.base])
                 G = lumped.expanded(G[..., lumped.base])
-                if not self._is_explained(lumped, psi, G, dx[-1], dy[-1]):
-                    lumped.refuted = True
+                y = plant.outputs(out.states[0], None if out.sensors is None else out.sensors[0])
+                if not self._is_explained(lumped, psi, G, np.abs(y).max(axis=0), dx[-1], dy[-1]):
                     return self._rollout_differences(
                         theta, initial_state, ctrl, step, states=states, central=central
                     )
@@ -236,10 +232,39 @@ class RolloutDerivatives(DifferenceSteps):
             by_delay = delay.derivative(y)[..., None] * plant.parameters.delay_derivative
             G = delay.apply(G) + by_delay
             y = delay.apply(y)
-        return y, Sensitivity(psi=psi, G=G)
+        return y, Sensitivity(psi=psi, G=G, is_lumped=lumped is not None)
+
+    def _moved_directions(
+        self, step: float | Array, lumped: LumpedParameters | None
+    ) -> tuple[np.ndarray, Array, Array]:
+        """Directions of theta along which rollouts are differentiated.
+
+        Args:
+            step: Difference step relative to `parameter_scale`, one number or (p,).
+            lumped: Parameters that are not moved alone, or None. Their probe is the last direction.
+
+        Returns:
+            Indices of the parameters that are moved alone; (n, p) directions [theta-unit]; (n,)
+            lengths of their steps.
+        """
+        steps = step * self.parameter_scale
+        moving = np.flatnonzero(self.plant.parameters.changes_motion)
+        if lumped is None:
+            return moving, _unit_moves(len(steps), moving), steps[moving]
+
+        moving = np.setdiff1d(moving, lumped.lumped)
+        of_probe = 1.0 / np.abs(lumped.probe / steps).max()
+        directions = np.concatenate([_unit_moves(len(steps), moving), lumped.probe[None]])
+        return moving, directions, np.append(steps[moving], of_probe)
 
     def _is_explained(
-        self, lumped: LumpedParameters, psi: Array, G: Array, dx: Array, dy: Array
+        self,
+        lumped: LumpedParameters,
+        psi: Array,
+        G: Array,
+        largest_outputs: Array,
+        dx: Array,
+        dy: Array,
     ) -> bool:
         """Check whether the probe of lumped parameters has no effect on states and outputs.
 
@@ -247,6 +272,7 @@ class RolloutDerivatives(DifferenceSteps):
             lumped: The lumped parameters.
             psi: (N+1, nx, p) derivatives of the states by all parameters.
             G: (N+1, ny, p) derivatives of the outputs by all parameters.
+            largest_outputs: (ny,) largest values of the outputs along the motion [y-unit].
             dx: (N+1, nx) derivatives of the states along the probe.
             dy: (N+1, ny) derivatives of the outputs along the probe.
         """
@@ -257,8 +283,10 @@ class RolloutDerivatives(DifferenceSteps):
         # Outputs without sensors are states.
         if not self.plant.outputs.needs_sensors:
             return True
-        largest = np.abs(G * self.plant.parameters.magnitude).max(axis=(0, 2))
-        sizes = np.where(largest > 0.0, largest, 1.0)
+
+        # An output that shows nothing but round-off does not count.
+        effects = np.abs(G * self.plant.parameters.magnitude).max(axis=(0, 2))
+        sizes = np.where(effects > ROUND_OFF_EFFECT * largest_outputs, effects, np.inf)
         return lumped.explains(G / sizes[:, None], dy / sizes)
 
     def _rollout_quotients(

@@ -22,6 +22,9 @@ class WrittenModels:
 
     A design asks for the same values at every iterate. They are written once.
 
+    One thread at a time may ask for models and simulate them, because a call overwrites models of
+    earlier calls.
+
     Attributes:
         source: Model into which the parameters are written.
         parameters: The p parameters, of which none needs a compile.

@@ -99,10 +99,12 @@ class Sensitivity:
     Attributes:
         psi: (N+1, nx, p) dx/dtheta [x-unit / theta-unit]; zero at the initial state.
         G: (N+1, ny, p) dy/dtheta [y-unit / theta-unit], `G_k = C_k psi_k + H_k`.
+        is_lumped: True where some columns were computed from those of the other parameters.
     """
 
     psi: Array
     G: Array
+    is_lumped: bool = False
 
     def __post_init__(self) -> None:
         freeze(self, "psi", "G")

@@ -178,6 +178,8 @@ def _cell(results: Results, seconds: float) -> str:
 def picture(results: list[Results], path: Path) -> None:
     """Draw J against seconds, divided by the lowest J of the experiment.
 
+    Where this is not positive, such as for D-optimality, the difference from it is drawn.
+
     Args:
         results: Results of all experiments.
         path: The PNG file.
@@ -211,12 +213,16 @@ def _draw(results: Results, axis: Any) -> None:
     for method in results.methods:
         costs = np.array([results.cost(method, seconds) for seconds in budgets])
         if method != DESIGN:
-            axis.plot(budgets, costs / lowest, color=OTHER.colour, lw=1.0, marker=".", label=label)
+            axis.plot(
+                budgets, _beside(costs, lowest), color=OTHER.colour, lw=1.0, marker=".", label=label
+            )
             label = None
     mine = np.array([results.cost(DESIGN, seconds) for seconds in budgets])
-    axis.plot(budgets, mine / lowest, color=DESIGNED.colour, lw=2.0, marker="o", label="design")
+    shown = _beside(mine, lowest)
+    axis.plot(budgets, shown, color=DESIGNED.colour, lw=2.0, marker="o", label="design")
 
-    axis.set_title(results.case, fontsize=10)
+    title = results.case if lowest > 0.0 else f"{results.case} (J minus the lowest J)"
+    axis.set_title(title, fontsize=10)
     axis.set_xscale("log")
     axis.set_xticks(budgets, [f"{seconds:g}" for seconds in budgets])
     axis.minorticks_off()
@@ -225,6 +231,11 @@ def _draw(results: Results, axis: Any) -> None:
         for formatter in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
             formatter(StrMethodFormatter("{x:g}"))
     axis.grid(alpha=0.3)
+
+
+def _beside(costs: np.ndarray, lowest: float) -> np.ndarray:
+    """Costs divided by the lowest one; their differences from it where it is not positive."""
+    return costs / lowest if lowest > 0.0 else costs - lowest
 
 
 def main() -> int:

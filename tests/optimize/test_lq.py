@@ -9,14 +9,14 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import expm, solve_discrete_are
 
 from mjfim.optimize.lq import (
     LinearRecursion,
     RiccatiSolution,
     TangentCurve,
     Weights,
-    amplification_in_any_units,
+    amplification_in_best_units,
     descent,
     largest_amplification,
     regulator,
@@ -311,36 +311,52 @@ def test_growth_is_the_largest_amplification_from_the_start_or_to_the_end() -> N
     assert largest_amplification(late) == pytest.approx(3.3**12)
 
 
-def test_growth_in_any_units_counts_neither_drift_nor_slow_oscillation() -> None:
+def test_growth_in_best_units_counts_neither_drift_nor_slow_oscillation() -> None:
     # The position of a cart that keeps its speed for 100 s.
     drift = np.tile([[1.0, 0.1], [0.0, 1.0]], (1000, 1, 1))
     assert largest_amplification(drift) > 99.0
-    assert amplification_in_any_units(drift) == pytest.approx(1.0)
+    assert amplification_in_best_units(drift) == pytest.approx(1.0)
 
     # A pendulum that swings once a minute.
     turn = 2.0 * np.pi / 60.0
     cosine, sine = np.cos(0.5 * turn), np.sin(0.5 * turn)
     swing = np.tile([[cosine, sine / turn], [-turn * sine, cosine]], (240, 1, 1))
     assert largest_amplification(swing) > 9.0
-    assert amplification_in_any_units(swing) == pytest.approx(2.0, rel=1e-2)
+    assert amplification_in_best_units(swing) == pytest.approx(2.0, rel=1e-2)
 
 
-def test_growth_in_any_units_is_that_of_an_unstable_motion() -> None:
+def test_growth_in_best_units_is_that_of_an_unstable_motion() -> None:
     # An inverted pendulum, whose deviations grow by a factor of e in 0.3 s.
     rate = 1.0 / 0.3
     cosh, sinh = np.cosh(0.01 * rate), np.sinh(0.01 * rate)
     fall = np.tile([[cosh, sinh / rate], [rate * sinh, cosh]], (200, 1, 1))
-    assert amplification_in_any_units(fall) == pytest.approx(np.exp(2.0 * rate), rel=1e-6)
+    assert amplification_in_best_units(fall) == pytest.approx(np.exp(2.0 * rate), rel=1e-6)
 
     # Deviations that overflow have grown without a bound.
-    assert np.isinf(amplification_in_any_units(np.full((400, 1, 1), 10.0)))
+    assert np.isinf(amplification_in_best_units(np.full((400, 1, 1), 10.0)))
 
 
-def test_growth_in_any_units_does_not_depend_on_the_units() -> None:
+def test_growth_in_best_units_does_not_depend_on_the_units() -> None:
     rng = np.random.default_rng(13)
     A = rng.normal(size=(9, 4, 4))
     units = np.array([1e-6, 1.0, 1e3, 25.4])
     other = A * units / units[:, None]
-    expected = amplification_in_any_units(A)
+    expected = amplification_in_best_units(A)
     assert expected > 1.0
-    assert amplification_in_any_units(other) == pytest.approx(expected, rel=1e-9)
+    found = amplification_in_best_units(other, 1.0 / units)
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_growth_in_best_units_of_many_stable_oscillators_needs_no_feedback() -> None:
+    # Twenty equal masses in a row, each coupled to its neighbours by a spring, without damping.
+    n = 20
+    stiffness = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    zero = np.zeros((n, n))
+    step = expm(0.5 * np.block([[zero, np.eye(n)], [-stiffness, zero]]))
+    chain = np.tile(step, (60, 1, 1))
+    assert amplification_in_best_units(chain) < 10.0
+
+    # The same in other units, with the sizes of its own.
+    units = np.repeat([1e3, 1e-2], n)
+    other = chain * units / units[:, None]
+    assert amplification_in_best_units(other, 1.0 / units) < 10.0

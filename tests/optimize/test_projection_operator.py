@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from mjfim.optimize import projection_operator
 from mjfim.optimize.directions import LBFGS, MetricDescent
-from mjfim.optimize.lq import TangentCurve, amplification_in_any_units
+from mjfim.optimize.lq import TangentCurve, amplification_in_best_units
 from mjfim.optimize.projection_operator import (
     Armijo,
     Direction,
@@ -541,9 +542,19 @@ def test_lbfgs_on_a_finer_grid_keeps_its_curvature_and_direction() -> None:
 
 def test_feedback_only_above_the_threshold_of_amplification() -> None:
     expansion = Pendulum().expand(start(Pendulum()))
-    amplification = amplification_in_any_units(expansion.A)
+    amplification = amplification_in_best_units(expansion.A)
     assert not replace(REGULATOR, feedback_threshold=1.01 * amplification).gain(expansion).any()
     np.testing.assert_array_equal(
         replace(REGULATOR, feedback_threshold=0.99 * amplification).gain(expansion),
         REGULATOR.gain(expansion),
     )
+
+
+def test_without_a_bound_on_the_growth_it_is_not_computed(monkeypatch) -> None:
+    def refuse(*_: object) -> float:
+        raise AssertionError("the amplification was computed")
+
+    monkeypatch.setattr(projection_operator, "amplification_in_best_units", refuse)
+    expansion = Pendulum().expand(start(Pendulum()))
+    assert not replace(REGULATOR, feedback_threshold=np.inf).gain(expansion).any()
+    assert replace(REGULATOR, feedback_threshold=0.0).gain(expansion).any()
