@@ -21,6 +21,9 @@ from typing import Any
 
 from mjfim.interruption import current_interruption
 
+# Longest time that a budget may take to another process [s]. More is a difference of the clocks.
+LONGEST_WAY = 60.0
+
 
 class StopReason(Enum):
     """Reason why a computation ended early; the value is a sentence for the user."""
@@ -202,7 +205,10 @@ class Budget:
         wall, then = state.pop("moment")
         self.__dict__.update(state)
         self._now = time.monotonic
-        shift = (self._now() - then) - (time.time() - wall)
+
+        # The clocks of two computers may differ, but the way between them takes a moment only.
+        on_the_way = min(max(time.time() - wall, 0.0), LONGEST_WAY)
+        shift = (self._now() - then) - on_the_way
         self.begun += shift
         self.deadline += shift
         self.stop = StopToken()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import pickle
+import time
 
-from mjfim.budget import Budget, StopReason, StopToken, measured_by
+import pytest
+
+from mjfim.budget import LONGEST_WAY, Budget, StopReason, StopToken, measured_by
 
 
 def test_a_budget_keeps_the_clock_with_which_it_was_made() -> None:
@@ -30,3 +33,15 @@ def test_a_budget_keeps_the_clock_with_which_it_was_made() -> None:
     # The process of a worker has its own clock.
     restored = pickle.loads(pickle.dumps(Budget(seconds=1e6)))
     assert restored.exhausted is None and 0.0 <= restored.seconds_used < 1e3
+
+
+@pytest.mark.parametrize("ahead", [-3600.0, 3600.0])
+def test_the_time_left_is_kept_on_a_computer_whose_clock_differs(
+    monkeypatch: pytest.MonkeyPatch, ahead: float
+) -> None:
+    sent = pickle.dumps(Budget(seconds=1000.0))
+    there = time.time() + ahead
+    monkeypatch.setattr("mjfim.budget.time.time", lambda: there)
+
+    restored = pickle.loads(sent)
+    assert 1000.0 - LONGEST_WAY - 10.0 <= restored.seconds_left <= 1000.0

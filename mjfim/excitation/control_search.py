@@ -30,7 +30,11 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import verify
 from mjfim.information.smoothness import roughness
+from mjfim.parallel import LostWorkError
 from mjfim.records.design import Status
+
+# Largest number of searches, stopped on a coarse level, that are compared at the stated rate.
+EVALUATED_STOPPED = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -209,15 +213,14 @@ def choose(
     if not results:
         results.append(RunResult(name="initial control", status=Status.INTERRUPTED))
 
-    # A search that was stopped on the coarse level has no point at the stated rate yet.
-    last = results[-1]
-    if last.point is None and last.control is not None:
-        point = point_at_stated_rate(search.stage, last.control)
-        cost = np.inf if point is None else point.cost
-        results[-1] = replace(last, point=point, cost=cost)
-
+    _evaluate_stopped(search.stage, results)
     best = min(results, key=lambda result: (not result.is_feasible, result.cost))
     if best.point is None and not interrupted:
+        if all(result.status is Status.LOST for result in results):
+            raise LostWorkError(
+                "the workers of all starts were lost several times (their processes were ended "
+                "from outside, perhaps because the memory was full), so there is no design"
+            )
         raise SimulationDivergedError("the simulation diverges from every start")
 
     # The beginning counts where it costs less than the best run, or where that breaks a limit.
@@ -229,6 +232,35 @@ def choose(
         status = Status.BEST_SEEN if best.status is Status.INFEASIBLE else best.status
         return replace(best, status=status), min(cheaper, key=lambda begin: begin.cost)
     return best, begins[0] if best.point is None else best.point
+
+
+def _evaluate_stopped(stage: DescentLevel, results: list[RunResult]) -> None:
+    """Evaluate the best searches that were stopped on a coarse level, at the stated rate.
+
+    On workers several searches may be stopped there. Each evaluation costs as much as an iterate,
+    so that only those of lowest cost on their levels are compared.
+
+    Args:
+        stage: The stated level.
+        results: One result per run; the evaluated ones are replaced.
+    """
+
+    def last_cost(index: int) -> float:
+        """J of the last iterate on its level."""
+        history = results[index].history
+        return history[-1].cost if history else np.inf
+
+    stopped = [
+        index
+        for index, result in enumerate(results)
+        if result.point is None and result.control is not None
+    ]
+    for index in sorted(stopped, key=last_cost)[:EVALUATED_STOPPED]:
+        result = results[index]
+        assert result.control is not None
+        point = point_at_stated_rate(stage, result.control)
+        cost = np.inf if point is None else point.cost
+        results[index] = replace(result, point=point, cost=cost)
 
 
 def _is_bounded_by_weights(task: DesignTask) -> bool:

@@ -74,7 +74,7 @@ class PackedFiles:
         if isinstance(self.held, SharedValue):
             return self
         size = sum(map(len, self.held.values()))
-        return PackedFiles(digest=self.digest, held=SharedValue(self.digest, self.held, size))
+        return PackedFiles(digest=self.digest, held=SharedValue.of(self.digest, self.held, size))
 
     def content(self, path: Path) -> bytes | None:
         """Return the bytes of a file; None if it is not among the packed files."""

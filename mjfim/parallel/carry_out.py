@@ -26,7 +26,7 @@ def carry_out(
     a lost order is done again, up to three times, and a broken pool of processes is made anew. An
     order must not depend on the others, nor on anything that changes.
 
-    A request to stop is heeded within `dispatch.GRACE` seconds on every executor. The tasks of a
+    A request to stop takes effect within `dispatch.GRACE` seconds on every executor. The tasks of a
     `Pool` see it (`pool_stop_token`) and return what they have, or have offered it
     (`offer_result`). Those of other executors do not see it, so that orders should be small enough
     to end within that time.

@@ -1,4 +1,4 @@
-"""Orders under way on workers: lost ones are done again, and a request to stop is heeded."""
+"""Orders under way on workers: lost ones are done again, and a request to stop takes effect."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ class Dispatch(Generic[Order, T]):
     """Orders under way on workers; an order can be added at any time.
 
     A task whose worker is killed is submitted again. Where all tasks of an executor are lost
-    together, it is not known which of them was the cause: an order that is lost for the last time
-    but one is therefore done while nothing else runs.
+    together, it is not known which of them was the cause: an order that is lost for the second time
+    is therefore done while nothing else runs.
 
     Args:
         workers: The workers.

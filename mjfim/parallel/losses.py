@@ -24,10 +24,13 @@ PICKLE_WORDS = ("pickle", "local object")
 def is_loss(error: BaseException | None) -> bool:
     """Check whether a task failed because its worker has gone, so that it can be done again.
 
+    A terminal sends Ctrl-C to the workers as well, and those of other executors than `Pool` do not
+    ignore it. Their tasks are lost; the caller decides by its own token whether the work goes on.
+
     Args:
         error: Error of the task; None where it has none.
     """
-    if isinstance(error, BrokenExecutor | CancelledError):
+    if isinstance(error, BrokenExecutor | CancelledError | KeyboardInterrupt):
         return True
 
     kinds = type(error).__mro__
@@ -73,6 +76,7 @@ def renewed(executor: Any) -> Executor | None:
             executor._mp_context,
             executor._initializer,
             executor._initargs,
+            max_tasks_per_child=executor._max_tasks_per_child,
         )
 
     # joblib has a copy of loky, with the same names.

@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
@@ -51,7 +52,9 @@ class _Processes(ProcessPoolExecutor):
         self.stop = context.RawValue(ctypes.c_bool, False)
 
         # The workers end when nobody holds the writing end of this pipe any more.
-        lifeline, self._hold = context.Pipe(duplex=False)
+        lifeline, hold = context.Pipe(duplex=False)
+        self._hold: connection.Connection | None = hold
+        self._lock = threading.Lock()
         with _safe_path():
             super().__init__(count, context, initialize_worker, (self.stop, lifeline, address))
 
@@ -64,13 +67,20 @@ class _Processes(ProcessPoolExecutor):
 
     def end(self) -> None:
         """End the processes at once, whether or not their tasks have ended."""
-        self._hold.close()
+        self._release()
         self.shutdown(wait=False, cancel_futures=True)
 
     def _end_if_broken(self, future: Future[Any]) -> None:
         """End the other processes at once after one of them was ended from outside."""
         if not future.cancelled() and isinstance(future.exception(), BrokenExecutor):
-            self._hold.close()
+            self._release()
+
+    def _release(self) -> None:
+        """Close the end of the pipe on which the workers wait, once: several threads ask for it."""
+        with self._lock:
+            hold, self._hold = self._hold, None
+        if hold is not None:
+            hold.close()
 
 
 class Pool(Executor):

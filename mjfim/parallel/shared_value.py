@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
@@ -52,6 +53,20 @@ class SharedValue(Generic[T]):
         self.size = size
         self._value: tuple[T, ...] = (value,)
         _owned[digest] = self
+
+    @classmethod
+    def of(cls, digest: str, value: T, size: int = 0) -> SharedValue[T]:
+        """Return the value of a hash that this process has made already, or else make it.
+
+        Two of them would not be found by the same hash any more after one of them is deleted.
+
+        Args:
+            digest: Hash of the value; equal for equal values only.
+            value: The value, which can be pickled and is never changed.
+            size: About the memory that the value takes [bytes].
+        """
+        own: SharedValue[T] | None = _owned.get(digest)
+        return cls(digest, value, size) if own is None else own
 
     @property
     def value(self) -> T:
@@ -110,6 +125,8 @@ class _ReceivedValues:
 
     def has(self, digest: str) -> bool:
         """Check whether a value is here, and count that as a use of it."""
+        if digest in _of_task.values:
+            return True
         with self._lock:
             if digest in self._values:
                 self._values.move_to_end(digest)
@@ -117,6 +134,8 @@ class _ReceivedValues:
 
     def get(self, digest: str) -> Any:
         """Return a value; AbsentValueError where it was not received, or forgotten since."""
+        if digest in _of_task.values:
+            return _of_task.values[digest].value
         with self._lock:
             if digest not in self._values:
                 raise AbsentValueError(digest)
@@ -128,6 +147,25 @@ class _ReceivedValues:
         """Size of all values [bytes]."""
         return sum(sent.size for sent in self._values.values())
 
+
+class _TaskValues(threading.local):
+    """Values that came with the task of this thread; tasks of other threads cannot replace them."""
+
+    def __init__(self) -> None:
+        """Start without any value."""
+        self.values: Mapping[str, SentValue] = {}
+
+    @contextmanager
+    def held(self, values: Mapping[str, SentValue]) -> Iterator[None]:
+        """Hold values while a task of this thread runs."""
+        before, self.values = self.values, values
+        try:
+            yield
+        finally:
+            self.values = before
+
+
+_of_task = _TaskValues()
 
 # Values that this process has made and still uses, and values that it has received.
 _owned: WeakValueDictionary[str, SharedValue[Any]] = WeakValueDictionary()
@@ -191,7 +229,8 @@ def attempt(
     """
     _received.put(values)
     try:
-        return function(order)
+        with _of_task.held(values):
+            return function(order)
     except AbsentValueError as error:
         return AbsentValue(digests=error.digests)
 

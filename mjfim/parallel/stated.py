@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -86,11 +87,11 @@ class StatedExecutor:
         """
         executor = self._cluster() if self.kind is ExecutorKind.DASK else self._made()
         if not hasattr(executor, "__enter__"):
-            yield Workers(executor)
+            yield Workers.of(executor)
             return
 
         with executor as entered:
-            yield Workers(entered)
+            yield Workers.of(entered)
 
     def _require_place(self) -> None:
         """Raise ExperimentError where the place does not fit the kind."""
@@ -149,6 +150,12 @@ class StatedExecutor:
                 f"{CONNECTION_SECONDS:g} s; start one with `dask scheduler`, and check the address "
                 "and the firewall"
             ) from error
+        except TypeError as error:
+            # Dask refuses an encrypted address so where it has no certificates.
+            raise ExperimentError(
+                f"executor: {self.text!r}: Dask cannot use this address: {error}; for tls:// state "
+                "the certificates in the configuration of Dask, under distributed.comm.tls"
+            ) from error
 
         try:
             _require_same_versions(client)
@@ -181,13 +188,33 @@ class StatedExecutor:
             if spec is None or spec.loader is None:
                 raise ImportError(f"{place} is no Python file")
             module = importlib.util.module_from_spec(spec)
-            spec.loader.exec_module(module)
+            with _known_module(module):
+                spec.loader.exec_module(module)
         except (ImportError, OSError) as error:
             raise ExperimentError(
                 f"executor: {self.text!r}: {place} cannot be imported: {error}; state the name of "
                 "an installed module, or the path of a file that ends with .py"
             ) from error
         return module
+
+
+@contextmanager
+def _known_module(module: ModuleType) -> Iterator[None]:
+    """Let a module be found by its name while it is executed, as dataclasses in it need.
+
+    Later it is not found, so that cloudpickle sends its functions by their contents: the workers
+    cannot import them.
+    """
+    name = module.__name__
+    before = sys.modules.get(name)
+    sys.modules[name] = module
+    try:
+        yield
+    finally:
+        if before is None:
+            sys.modules.pop(name, None)
+        else:
+            sys.modules[name] = before
 
 
 def own_versions() -> tuple[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from mjfim.errors import ExperimentError
@@ -39,13 +40,19 @@ class Workers(Executor):
             share of the workers where there are fewer tasks than workers.
 
     Raises:
-        ExperimentError: The object cannot run tasks, or a number is not positive.
+        ExperimentError: The object cannot run tasks or is wrapped already, or a number is not
+            positive.
     """
 
     def __init__(self, executor: Any, count: int | None = None, threads: int | None = None) -> None:
         for name, number in (("count", count), ("threads", threads)):
             if number is not None and number < 1:
                 raise ExperimentError(f"Workers: {name} is {number}; it must be at least 1")
+        if isinstance(executor, Workers):
+            raise ExperimentError(
+                "Workers: the executor is wrapped already; state count and threads where it is "
+                "wrapped first"
+            )
         if not hasattr(executor, "submit"):
             raise ExperimentError(
                 f"executor: {type(executor).__name__} has no method `submit`; pass an executor of "
@@ -118,8 +125,9 @@ class Workers(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the executor; the arguments are those of `concurrent.futures.Executor.shutdown`."""
-        # The executor of Dask cannot cancel here what is not begun.
-        options = {"cancel_futures": True} if cancel_futures else {}
+        # The executor of Dask has no such option: without waiting, it cancels everything.
+        is_known = cancel_futures and not self.is_cluster
+        options = {"cancel_futures": True} if is_known else {}
         self._executor.shutdown(wait, **options)
 
     def _found_count(self) -> int:
@@ -136,6 +144,8 @@ class Workers(Executor):
     def _cluster_size(self) -> int:
         """Number of threads of all workers of a Dask cluster; each of them does one task."""
         if time.monotonic() >= self._count_until:
-            self._known_count = sum(self._client.nthreads().values())
+            # Where the scheduler does not answer, the results so far must not be lost here.
+            with suppress(OSError):
+                self._known_count = sum(self._client.nthreads().values())
             self._count_until = time.monotonic() + COUNT_PERIOD
         return self._known_count

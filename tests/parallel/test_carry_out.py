@@ -5,15 +5,16 @@ from __future__ import annotations
 import itertools
 import math
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import (
     BrokenExecutor,
     CancelledError,
     Executor,
     Future,
+    ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
+from multiprocessing import get_context
 from typing import Any
 
 import pytest
@@ -28,6 +29,7 @@ from mjfim.parallel import (
     Workers,
     carry_out,
     dispatch,
+    losses,
     results_or_here,
 )
 
@@ -68,7 +70,7 @@ def squares(executor: Any, count: int = 5) -> list[Outcome[int]]:
     return list(carry_out(executor, square, range(count), Budget()))
 
 
-@pytest.mark.parametrize("error", [BrokenExecutor("killed"), CancelledError()])
+@pytest.mark.parametrize("error", [BrokenExecutor("killed"), CancelledError(), KeyboardInterrupt()])
 def test_lost_orders_are_done_again_and_the_results_are_the_same(error: BaseException) -> None:
     executor = FakeExecutor(lambda order, times: error if times <= order % 3 else None)
     assert [each.result for each in squares(executor)] == [0, 1, 4, 9, 16]
@@ -131,8 +133,14 @@ def test_where_all_are_lost_together_the_suspect_runs_alone_in_the_end() -> None
 
 
 def test_outcomes_come_in_the_order_of_the_orders_and_the_callback_has_them_at_once() -> None:
+    is_last = threading.Event()
+
     def slow_first(order: int) -> int:
-        time.sleep(0.1 if order == 0 else 0.0)
+        """The first order ends after the last one has."""
+        if order == 0:
+            is_last.wait(20.0)
+        if order == 3:
+            is_last.set()
         return order
 
     early: list[int] = []
@@ -154,6 +162,20 @@ def test_orders_may_be_added_while_others_are_carried_out() -> None:
             if len(found) < 3:
                 work.add(len(found), found[-1])
     assert found == [9, 81, 6561]
+
+
+def test_ctrl_c_that_reaches_the_workers_as_well_keeps_the_results_so_far() -> None:
+    stop = StopToken()
+
+    def interrupted(order: int, times: int) -> BaseException | None:
+        """A terminal sends Ctrl-C to the caller, which requests the token, and to the workers."""
+        if order < 2:
+            return None
+        stop.request()
+        return KeyboardInterrupt()
+
+    found = carry_out(FakeExecutor(interrupted), square, range(9), Budget(stop=stop))
+    assert [each.result for each in found] == [0, 1]
 
 
 def test_a_request_to_stop_is_heeded_in_time_by_tasks_that_do_not_see_it(
@@ -208,24 +230,46 @@ def test_the_number_of_workers_is_stated_or_found() -> None:
 
     workers = Workers(unknown)
     assert Workers.of(workers) is workers
+    with pytest.raises(ExperimentError, match="wrapped already"):
+        Workers(workers, threads=2)
+
+
+def test_a_process_pool_that_is_made_anew_has_the_same_settings() -> None:
+    pool = ProcessPoolExecutor(3, mp_context=get_context("spawn"), max_tasks_per_child=5)
+    other = losses.renewed(pool)
+    assert isinstance(other, ProcessPoolExecutor)
+    assert (other._max_workers, other._max_tasks_per_child) == (3, 5)  # type: ignore[attr-defined]
 
 
 class FakeClient:
     """As a Dask client: it has an executor, and a number of threads per worker that changes."""
 
-    def __init__(self) -> None:
-        self.sizes = itertools.chain([{}], itertools.repeat({"a": 2, "b": 3}))
+    def __init__(self, *further: OSError) -> None:
+        self.sizes = itertools.chain([{}], further, itertools.repeat({"a": 2, "b": 3}))
 
     def submit(self) -> None:
         """Only its executor is used."""
 
     def nthreads(self) -> dict[str, int]:
-        return next(self.sizes)
+        size = next(self.sizes)
+        if isinstance(size, OSError):
+            raise size
+        return size
 
     def get_executor(self) -> FakeExecutor:
-        executor = FakeExecutor(lambda order, times: None, count=None)
-        executor._client = self  # type: ignore[attr-defined]
-        return executor
+        return FakeDaskExecutor(self)
+
+
+class FakeDaskExecutor(FakeExecutor):
+    """As the executor of a Dask client, which has no option `cancel_futures`."""
+
+    def __init__(self, client: FakeClient) -> None:
+        super().__init__(lambda order, times: None, count=None)
+        self._client = client
+        self.waited: list[bool] = []
+
+    def shutdown(self, wait: bool = True) -> None:  # type: ignore[override]
+        self.waited.append(wait)
 
 
 def test_a_cluster_has_as_many_workers_as_threads_and_may_grow(
@@ -236,6 +280,20 @@ def test_a_cluster_has_as_many_workers_as_threads_and_may_grow(
     assert [cluster.count, cluster.count] == [1, 5]
     assert cluster.is_cluster
     assert cluster.threads_for(1) == 1
+
+
+def test_a_scheduler_that_does_not_answer_leaves_the_number_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mjfim.parallel.workers.COUNT_PERIOD", -1.0)
+    cluster = Workers(FakeClient(OSError("the scheduler is gone")))
+    assert [cluster.count for _ in range(3)] == [1, 1, 5]
+
+
+def test_a_cluster_is_ended_without_an_option_that_dask_does_not_have() -> None:
+    executor = FakeDaskExecutor(FakeClient())
+    Workers(executor).shutdown(wait=False, cancel_futures=True)
+    assert executor.waited == [False]
 
 
 @pytest.mark.parametrize("numbers", [{"count": 0}, {"threads": -1}])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,11 +13,25 @@ from mjfim.parallel import stated
 from mjfim.parallel.stated import StatedExecutor
 
 FACTORY = """
+from __future__ import annotations
+
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import mjfim
+
+
+@dataclass
+class Settings:
+    count: int = 3
 
 
 def make():
-    return ThreadPoolExecutor(3)
+    return ThreadPoolExecutor(Settings().count)
+
+
+def make_stated():
+    return mjfim.Workers(ThreadPoolExecutor(3), count=16, threads=4)
 """
 
 
@@ -53,6 +68,14 @@ def test_an_executor_of_a_file_is_made_by_its_function(tmp_path: Path) -> None:
         workers.submit(len, "ended")
 
 
+def test_workers_of_a_file_keep_their_stated_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "cluster.py"
+    path.write_text(FACTORY, encoding="utf-8")
+    with StatedExecutor.parse(f"python:{path}:make_stated").started() as workers:
+        assert (workers.count, workers.threads_for(2)) == (16, 4)
+    assert "cluster" not in sys.modules
+
+
 @pytest.mark.parametrize(
     ("place", "message"),
     [
@@ -71,6 +94,17 @@ def test_a_missing_dask_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     place = StatedExecutor.parse("dask://host:8786")
     with pytest.raises(ExperimentError, match=r"pip install 'mjfim\[dask\]'"), place.started():
+        pass
+
+
+def test_missing_certificates_are_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    def client(**settings: object) -> None:
+        """As the client of Dask for a tls:// address where no certificates are configured."""
+        raise TypeError("TLS expects a `ssl_context` argument of type ssl.SSLContext")
+
+    monkeypatch.setitem(sys.modules, "distributed", SimpleNamespace(Client=client))
+    place = StatedExecutor.parse("dask:tls://host:8786")
+    with pytest.raises(ExperimentError, match=r"distributed\.comm\.tls"), place.started():
         pass
 
 
