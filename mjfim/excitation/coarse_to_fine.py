@@ -2,10 +2,10 @@
 
 An iteration on a coarse level takes a small part of the time of one on the stated level, and its
 minima lie close to those of the stated level. So most of the way is done there: all starts are
-optimised with a large barrier weight on the coarsest level, the best of them with smaller weights
-on finer levels, and the best one of all on the stated level in the end. After each round, the
-largest share of each control that keeps all limits of the unmodified model is kept, so that there
-is a good control within the limits however early the time ends.
+optimised with a large barrier weight on the coarsest level, and after each level the best quarter
+of them continues with smaller weights on the next finer one, up to the stated level. After each
+round, the largest share of each control that keeps all limits of the unmodified model is kept, so
+that there is a good control within the limits however early the time ends.
 """
 
 from __future__ import annotations
@@ -22,7 +22,14 @@ from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.multistart import HALVING_RATE, Multistart, append_run, renumber
+from mjfim.excitation.multistart import (
+    HALVING_RATE,
+    SECONDS_AFTER_STOP,
+    Multistart,
+    append_run,
+    renumber,
+    without_discarded_winner,
+)
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.records.design import Status
@@ -77,6 +84,30 @@ class _State:
         """Whether there is a control that keeps all limits."""
         return any(np.isfinite(result.cost) for result in self.results.values())
 
+    def discard_others(self) -> None:
+        """Mark starts within the limits that do not take part in the next round."""
+        continuing = {start.name for start in self.starts}
+        for name, result in self.results.items():
+            is_usable = np.isfinite(result.cost) and result.status is not Status.LOST
+            if name not in continuing and is_usable:
+                self.results[name] = replace(result, status=Status.LEFT)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Candidate:
+    """A control with which the next round may begin.
+
+    Attributes:
+        cost: J by which candidates are compared: that on the coarse level, or that on the stated
+            plant where the coarse one is too low.
+        start: The control.
+        is_new: Whether the round has found it; else the round began with it.
+    """
+
+    cost: float
+    start: InitialControl
+    is_new: bool = True
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CoarseToFine(Multistart):
@@ -111,12 +142,20 @@ class CoarseToFine(Multistart):
             if state.results and self._is_over(level, state):
                 break
 
+            # The last iterations are for the stated level.
+            is_first_or_last = not state.results or level is self.fine
+            if not is_first_or_last and state.iterations >= self._max_iterations:
+                continue
+
+            state.discard_others()
             found = yield from self._run_level(level, state, last_mu)
-            self._take(found, level, state, last_mu)
+            self._take(found, level, state)
             if found and all(r.is_held_up and r.cost > self.cost_to_beat for r in found):
                 break
+            if level is not self.fine and not self.budget.stop.requested:
+                self._choose_starts(found, level, state, last_mu)
 
-        return list(state.results.values())
+        return without_discarded_winner(list(state.results.values()))
 
     def _affordable(self, starts: Sequence[InitialControl]) -> list[InitialControl]:
         """The first starts, as many as can be optimised roughly in the time of the first round."""
@@ -138,6 +177,10 @@ class CoarseToFine(Multistart):
     def _is_over(self, level: DescentLevel, state: _State) -> bool:
         """Check whether there is no time for a useful round on a level."""
         if self.budget.stop.requested:
+            return True
+
+        # A coarse level does not end within the limits, so that it cannot help any more.
+        if self.budget.exhausted is not None and level is not self.fine:
             return True
         if not state.has_feasible:
             return False
@@ -171,63 +214,126 @@ class CoarseToFine(Multistart):
         state.seconds_per_step = elapsed / max(turns * longest, 1) / _engine_steps(level)
         return found
 
-    def _take(
+    def _take(self, found: Sequence[RunResult], level: DescentLevel, state: _State) -> None:
+        """Take the results of a round, with the controls that keep all limits.
+
+        All of them are brought inside the limits. After the end of the time this goes on for a few
+        seconds only, as soon as there is any control inside.
+        """
+        waiting = Budget(seconds=SECONDS_AFTER_STOP)
+        merged: dict[str, RunResult] = {}
+        has_feasible = state.has_feasible
+
+        for result in sorted(found, key=lambda result: result.cost):
+            is_late = self.budget.exhausted is not None and waiting.exhausted is not None
+            stated = result
+            if level is not self.fine:
+                stated = self._on_stated_plant(
+                    result, level, is_tried=not (is_late and has_feasible)
+                )
+
+            merged[result.name] = self._merged(state.results.get(result.name), stated)
+            has_feasible = has_feasible or bool(np.isfinite(stated.cost))
+
+        # The results stay in the order of the starts.
+        state.results.update({result.name: merged[result.name] for result in found})
+
+    def _choose_starts(
         self, found: Sequence[RunResult], level: DescentLevel, state: _State, last_mu: float
     ) -> None:
-        """Take the results of a round, and choose the starts and the weight of the next one."""
+        """Choose the starts and the barrier weight of the round after one on a coarse level.
+
+        A round without any usable control changes nothing but the level.
+        """
         begun = {start.name: start for start in state.starts}
-        candidates: list[tuple[float, InitialControl]] = []
-        state.mu = last_mu
+        usable = [result for result in found if result.control is not None]
+        count = max(1, len(usable) // HALVING_RATE)
 
-        for result in found:
-            merged = self._merged(state.results.get(result.name), result, level)
-            state.results[result.name] = merged
-            if result.control is None or level is self.fine:
-                continue
+        # The cost of a candidate is never lower than that on the coarse level. So the rest need not
+        # be checked as soon as there are enough better ones.
+        candidates: list[_Candidate] = []
+        for result in sorted(usable, key=lambda result: result.cost):
+            if sum(candidate.cost <= result.cost for candidate in candidates) >= count:
+                break
+            candidates.append(self._candidate(result, begun[result.name], level))
 
-            control = self._at_stated_rate(result.control, level)
-            start = InitialControl(name=result.name, control=control)
-            if self._is_misled(start, result.cost):
-                start = self._better(start, begun[result.name])
-            candidates.append((result.cost, start))
+        best = sorted(candidates, key=lambda candidate: candidate.cost)[:count]
+        state.starts = [candidate.start for candidate in best] or state.starts
+        if any(candidate.is_new for candidate in best):
+            state.mu = last_mu
 
-        # A round without any usable control changes nothing but the level.
-        candidates.sort(key=lambda candidate: candidate[0])
-        count = max(1, len(candidates) // HALVING_RATE)
-        state.starts = [start for _, start in candidates[:count]] or state.starts[:1]
+    def _candidate(
+        self, result: RunResult, begun: InitialControl, level: DescentLevel
+    ) -> _Candidate:
+        """The control that a coarse level has found, or the one before where that is better.
 
-    def _is_misled(self, found: InitialControl, cost: float) -> bool:
-        """Check whether a control costs much more on the stated plant than on a coarse level."""
-        point = self._point_without_limits(found.control)
-        if point is None:
-            return True
-        return not point.cost - cost <= LARGEST_ERROR * self.fine.problem.size(point)
+        The control before is tried only where the found one costs much more on the stated plant
+        than on the coarse level.
 
-    def _better(self, found: InitialControl, begun: InitialControl) -> InitialControl:
-        """The better of the control that a misleading level has found and of that before it."""
-        points = [self._point_without_limits(start.control) for start in (found, begun)]
-        costs = [np.inf if point is None else point.cost for point in points]
-        return found if costs[0] < costs[1] else replace(begun, basis=None)
+        Args:
+            result: Result of a round on a coarse level, with a control.
+            begun: Control with which the round began.
+            level: The coarse level.
+        """
+        control = self._without_jumps(np.asarray(result.control), level)
+        found = InitialControl(name=result.name, control=control)
+        point = self._point_without_limits(control)
+        cost = np.inf if point is None else point.cost
+        if point is not None and cost - result.cost <= LARGEST_ERROR * self.fine.problem.size(
+            point
+        ):
+            return _Candidate(cost=result.cost, start=found)
 
-    def _merged(
-        self, before: RunResult | None, result: RunResult, level: DescentLevel
+        point_before = self._point_without_limits(begun.control)
+        cost_before = np.inf if point_before is None else point_before.cost
+        is_new = cost < cost_before
+        return _Candidate(
+            cost=max(result.cost, min(cost, cost_before)),
+            start=found if is_new else replace(begun, basis=None),
+            is_new=is_new,
+        )
+
+    def _on_stated_plant(
+        self, result: RunResult, level: DescentLevel, *, is_tried: bool
     ) -> RunResult:
+        """Result of a coarse level with a control that keeps all limits on the stated plant.
+
+        Args:
+            result: The result.
+            level: The coarse level.
+            is_tried: Whether there is time to look for such a control; without it, J is infinite.
+        """
+        inside = self._inside(result, level) if is_tried else None
+        status = result.status
+        if inside is None:
+            has_ended = is_tried and status not in (Status.INTERRUPTED, Status.LOST)
+            status = Status.INFEASIBLE if has_ended else status
+
+        # An optimum of a coarse level is none of the stated one.
+        elif status is Status.INFEASIBLE:
+            status = Status.MAX_ITERATIONS
+        status = Status.MAX_ITERATIONS if status.success else status
+
+        return replace(
+            result,
+            control=result.control if inside is None else inside.control,
+            cost=np.inf if inside is None else inside.cost,
+            status=status,
+            earlier=(),
+        )
+
+    def _merged(self, before: RunResult | None, result: RunResult) -> RunResult:
         """Result of a start after a round, with the best control that keeps all limits.
 
         Args:
             before: Its result before the round, or None.
-            result: Its result of this round.
-            level: Level of the round.
+            result: Its result of this round; J is that on the stated plant.
         """
-        merged = result if before is None else append_run(before, result)
-        inside = None
-        if level is not self.fine:
-            inside = self._inside(result, level)
-            cost = np.inf if inside is None else inside.cost
-            control = result.control if inside is None else inside.control
-            merged = replace(merged, control=control, cost=cost, earlier=())
         if before is None:
-            return merged
+            return result
+        merged = append_run(before, result)
+        if merged.control is None:
+            merged = replace(merged, control=before.control)
 
         # The best control of an earlier round remains, also as a substitute.
         was_inside = np.isfinite(before.cost) and before.control is not None
@@ -250,20 +356,24 @@ class CoarseToFine(Multistart):
         if result.control is None:
             return None
         centre = self.fine.task.centre
-        control = self._at_stated_rate(result.control, level)
+        control = self._without_jumps(result.control, level)
 
         # This takes a few simulations, also after a request to stop, so that nothing is lost.
         trials = ControlsWithinLimits(cost=self._limited_cost, budget=Budget())
         return trials.largest(centre, control - centre)
 
-    def _at_stated_rate(self, control: Array, level: DescentLevel) -> Array:
+    def _without_jumps(self, control: Array, level: DescentLevel) -> Array:
         """A control of a level, (N, nu), without steps where rates of controls are limited."""
         factor = level.task.system.variant.sample_factor
         if factor == 1 or self._limited_cost.constraints.rate is None:
             return control
 
-        # The values of the longer samples hold at their middles.
+        # A control that consists of curves, such as a Fourier series, is smooth already.
         values = control[::factor]
+        if not np.array_equal(control, np.repeat(values, factor, axis=0)):
+            return control
+
+        # The values of the longer samples hold at their middles.
         middles = factor * (np.arange(len(values)) + 0.5) - 0.5
         times = np.arange(len(control))
         columns = [np.interp(times, middles, column) for column in values.T]

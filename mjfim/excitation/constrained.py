@@ -159,7 +159,7 @@ class ConstrainedSlice(SliceOrder[SearchState]):
         return self.search.start.name
 
 
-# Tasks that a worker keeps for later slices: those of the two rounds of a design.
+# Tasks that a worker keeps for later slices: those of two rounds of a design.
 _tasks = KeptPerThread[DesignTask](2)
 
 
@@ -180,7 +180,7 @@ def run_in_worker(order: ConstrainedSlice) -> SearchSlice[SearchState]:
     search = replace(search, budget=search.budget.with_stop(stop))
 
     task = _tasks.get(order.task_key, search.resolved)
-    return consume(search.run_slice(task, order.length, order.before), None)
+    return consume(search.run_slice(task, order.length, order.own_before), None)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -291,10 +291,13 @@ class _Search:
                 point = self._exact_point(iterate)
                 result = self._updated(result, iterate, point)
 
-                # The next iterate may take longer than anybody waits for after Ctrl-C.
-                offer_result(SearchSlice(result=replace(result, status=Status.INTERRUPTED)))
                 if np.isfinite(result.cost) and result.control is not None:
                     best_of_stages[iterate.mu] = result.control
+
+                # The next iterate may take longer than anybody waits for after Ctrl-C.
+                earlier = tuple(best_of_stages.values())[:-1]
+                so_far = replace(result, status=Status.INTERRUPTED, earlier=earlier)
+                offer_result(SearchSlice(result=so_far))
                 if iterate.repaired:
                     continue
 
@@ -304,8 +307,8 @@ class _Search:
 
                 # Later stages of the barrier bring a good iterate back inside the limits.
                 has_short_steps = steps.hold_up(row.gamma, row.mu) and self.order.until_held_up
-                is_hopeless = iterate.feasible or row.cost > self.order.cost_to_beat
-                is_held_up = has_short_steps and is_hopeless
+                may_end_here = iterate.feasible or row.cost > self.order.cost_to_beat
+                is_held_up = has_short_steps and may_end_here
                 is_held_up = is_held_up or self._is_too_slow(min(row.cost, result.cost))
                 result = replace(result, is_held_up=is_held_up)
                 if is_held_up or self.budget.stop.requested:

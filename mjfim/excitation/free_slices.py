@@ -81,7 +81,8 @@ def run_free_in_worker(order: FreeSlice) -> SearchSlice[FreeState]:
     stop = StopToken(also=lambda: order_stop.requested or pool_stop.requested)
 
     tasks = _tasks.get(order.task_key, order.resolved)
-    state = None if order.before is None else order.before.state
+    before = order.own_before
+    state = None if before is None else before.state
     steps_done = 0 if state is None else state.steps
     search = UnconstrainedSearch(
         levels=[DescentLevel(task, order.basis) for task in tasks],

@@ -141,8 +141,12 @@ def has_similar_cost(coarse: DescentLevel, first: DesignPoint, size: float, shar
         share: Largest tolerated difference of the two costs, relative to the size.
 
     Returns:
-        True where the difference is small enough.
+        True where the difference is small enough; False where the cost on the stated level is
+        infinite.
     """
+    if not np.isfinite(first.cost):
+        return False
+
     try:
         point = coarse.problem.point(coarse.task.initial)
     except SimulationDivergedError:

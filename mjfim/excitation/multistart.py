@@ -601,13 +601,26 @@ def _merge_rounds(first: Sequence[RunResult], second: Sequence[RunResult]) -> li
         for result in first
     ]
 
-    # A discarded start may be the best after all, and so may one whose second run found nothing
-    # feasible.
-    best = min(range(len(merged)), key=lambda i: merged[i].cost)
-    if np.isfinite(merged[best].cost) and merged[best].status in (Status.LEFT, Status.INFEASIBLE):
-        merged[best] = replace(merged[best], status=Status.MAX_ITERATIONS)
+    return without_discarded_winner(merged)
 
-    return merged
+
+def without_discarded_winner(results: Sequence[RunResult]) -> list[RunResult]:
+    """Results of all rounds, of which the best one does not count as discarded or infeasible.
+
+    A discarded start may be the best after all, and so may one whose later run found nothing
+    feasible.
+
+    Args:
+        results: Result of every start.
+    """
+    results = list(results)
+    best = min(range(len(results)), key=lambda i: results[i].cost, default=None)
+    if best is None or not np.isfinite(results[best].cost):
+        return results
+
+    if results[best].status in (Status.LEFT, Status.INFEASIBLE):
+        results[best] = replace(results[best], status=Status.MAX_ITERATIONS)
+    return results
 
 
 def _merge(first: RunResult, second: RunResult) -> RunResult:

@@ -7,9 +7,10 @@ costs at most one part.
 
 from __future__ import annotations
 
+import copy
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 from mjfim.excitation.run_result import RunResult
@@ -65,7 +66,8 @@ class SliceOrder(Generic[S]):
     Attributes:
         task_key: Text that is equal for searches on the same task, which a worker resolves once.
         seconds: Time of the slice [s].
-        iterations: Largest number of its iterates.
+        iterations: Number of new iterates after which it ends, except where the search begins or
+            passes to another level; there it may be a little longer.
         before: The slice before; None for the first one.
     """
 
@@ -78,6 +80,16 @@ class SliceOrder(Generic[S]):
     def name(self) -> str:
         """Name of the initial control."""
         raise NotImplementedError
+
+    @property
+    def own_before(self) -> SearchSlice[S] | None:
+        """The slice before with a copy of its state, which the search may change.
+
+        An order that is lost on a thread is done again from the same state.
+        """
+        if self.before is None:
+            return None
+        return replace(self.before, state=copy.deepcopy(self.before.state))
 
     @property
     def length(self) -> SliceLength:
