@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -186,7 +186,7 @@ class IdentifiabilityTest:
         single_steps = _single_step_null_space(self, [trajectory])
 
         # One difference step is enough if all singular values are far larger than round-off.
-        quick = _null_space(self, [J], None, single_steps)
+        quick = _null_space(self, [J], None, single_steps.directions)
         if quick.smallest > CLEAR_SINGULAR_VALUE and not quick.count:
             return _with_groups(self, quick, quick)
 
@@ -245,7 +245,7 @@ def _identifiability(
     trajectory: Trajectory,
     J: Array,
     error: Array,
-    single_steps: Array | None,
+    single_steps: _SingleSteps,
     stop: Callable[[], bool],
 ) -> Identifiability:
     """Null space of given rows, and the part of it that remains with random trajectories.
@@ -255,16 +255,17 @@ def _identifiability(
         trajectory: One of the trajectories to which the rows belong.
         J: (n, p) whitened rows of G.
         error: (n, p) their change with a longer difference step.
-        single_steps: (t, k) directions without effect on single steps, or None.
+        single_steps: What single steps of the trajectory show.
         stop: Asked before every random trajectory; true leaves out the rest of them.
     """
-    single_steps = _hidden_from_rows(test, single_steps, J, error)
-    along_trajectory = _null_space(test, [J], [error], single_steps)
+    directions = _hidden_from_rows(test, single_steps.directions, J, error)
+    along_trajectory = _null_space(test, [J], [error], directions)
     if not along_trajectory.count or stop():
         return _with_groups(test, along_trajectory, along_trajectory)
 
     tried = list(itertools.takewhile(lambda _: not stop(), test.probes(PROBES)))
-    known = _single_step_null_space(test, [trajectory, *tried], single_steps)
+    shown = replace(single_steps, directions=directions)
+    known = _single_step_null_space(test, [trajectory, *tried], shown).directions
     known = _hidden_from_rows(test, known, J, error)
     stack, errors = [J], [error]
 
@@ -281,9 +282,11 @@ def _identifiability(
 
 
 def _single_step_null_space(
-    test: IdentifiabilityTest, trajectories: Sequence[Trajectory], known: Array | None = None
-) -> Array | None:
-    """Directions (t, k) without effect on single steps and their outputs.
+    test: IdentifiabilityTest,
+    trajectories: Sequence[Trajectory],
+    known: _SingleSteps | None = None,
+) -> _SingleSteps:
+    """Directions without effect on single steps and their outputs.
 
     Such a direction changes no motion and no output. Single steps show this accurately, even if
     motions are chaotic.
@@ -291,32 +294,37 @@ def _single_step_null_space(
     Args:
         test: The plant and its parameters.
         trajectories: Trajectories whose samples are tested.
-        known: (t, k) directions without effect on single steps of the first trajectory, or None
-            where they are not known.
+        known: What single steps of the first trajectory show, or None where it is not known.
 
     Returns:
-        The directions; None if no wanted parameter changes the model, or if all steps diverge.
+        The directions, none if no wanted parameter changes the model or if all steps diverge.
     """
     parameters = test.parameters
     inside = parameters.interest[parameters.changes_model[parameters.interest]]
     if not len(inside):
-        return None
+        return _SingleSteps(few=None, directions=None)
 
     # A few samples are tested first. Another sample may show an effect of the directions that have
     # none there, such as a contact that depends on them. One combination of them is tested at all
     # samples, and every parameter only where that combination has an effect.
-    few = _step_effects(test, trajectories[:1], FEW_SAMPLES)
+    few = _step_effects(test, trajectories[:1], FEW_SAMPLES) if known is None else known.few
     if few is not None:
-        directions = _without_effect(test, few, inside) if known is None else known
-        others = trajectories if known is None else trajectories[1:]
+        others = trajectories[1:]
+        directions = None if known is None else known.directions
+        if directions is None:
+            others = trajectories
+            directions = _without_effect(test, few, inside)
+
         if not _has_effect(test, others, few, directions):
-            return _hidden_from_earlier(test, directions)
+            return _SingleSteps(few=few, directions=_hidden_from_earlier(test, directions))
 
     longest = max(trajectory.samples for trajectory in trajectories)
     found = _step_effects(test, trajectories, longest)
     if found is None:
-        return None
-    return _hidden_from_earlier(test, _without_effect(test, found, inside))
+        return _SingleSteps(few=few, directions=None)
+
+    directions = _without_effect(test, found, inside)
+    return _SingleSteps(few=few, directions=_hidden_from_earlier(test, directions))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -332,6 +340,21 @@ class _StepEffects:
     J: Array
     error: Array
     output_sizes: Array | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SingleSteps:
+    """What single steps of trajectories show.
+
+    Attributes:
+        few: Effects of each parameter at a few samples of the first trajectory; None where no
+            parameter changes the model or all of these steps diverge.
+        directions: (t, k) directions without effect on the steps, or None where there are no
+            such parameters or steps.
+    """
+
+    few: _StepEffects | None
+    directions: Array | None
 
 
 def _step_effects(
