@@ -115,6 +115,20 @@ def test_an_order_can_be_done_again(searches: list[ConstrainedSearch]) -> None:
     assert pickle.dumps(first.state.short_steps) == pickle.dumps(second.state.short_steps)
 
 
+def test_slices_find_out_once_that_parameters_are_not_lumped(task: DesignTask) -> None:
+    """The combination that counts as without effect has one, as the first trajectory shows."""
+    with_effect = np.array([[1.0], [1.0], [0.0]])
+    basis = np.linalg.qr(with_effect, mode="complete")[0][:, 1:]
+    search = replace(search_of(task), combinations=basis, max_iterations=4)
+
+    order = ConstrainedSlice(search=search, task_key="lumped", iterations=2)
+    slices = [run_in_worker(order)]
+    while slices[-1].state is not None:
+        slices.append(run_in_worker(pickle.loads(pickle.dumps(replace(order, before=slices[-1])))))
+    assert len(slices) > 1
+    assert_same(slices[-1].result, consume(search.run(), None))
+
+
 def run_sliced(
     searches: list[ConstrainedSearch],
     executor: Executor,
