@@ -9,6 +9,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.plant.batch import Rollouts
+from mjfim.plant.delay import OutputDelay
 from mjfim.plant.difference_steps import DifferenceSteps
 from mjfim.plant.lumped_parameters import LumpedParameters
 from mjfim.records.trajectory import Sensitivity, Trajectory
@@ -225,14 +226,31 @@ class RolloutDerivatives(DifferenceSteps):
                         theta, initial_state, ctrl, step, states=states, central=central
                     )
 
-        # Biases and the delay act on the outputs of the simulation.
-        G += plant.bias_derivative
-        y = plant.outputs(origin, sensors) + plant.bias_derivative @ theta
-        if delay is not None:
-            by_delay = delay.derivative(y)[..., None] * plant.parameters.delay_derivative
-            G = delay.apply(G) + by_delay
-            y = delay.apply(y)
+        y, G = self._with_bias_and_delay(theta, plant.outputs(origin, sensors), G, delay)
         return y, Sensitivity(psi=psi, G=G, is_lumped=lumped is not None)
+
+    def _with_bias_and_delay(
+        self, theta: Array, y: Array, G: Array, delay: OutputDelay | None
+    ) -> tuple[Array, Array]:
+        """Outputs with the biases and the delay, which act on those of the simulation.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            y: (N+1, ny) outputs of the simulation [y-unit].
+            G: (N+1, ny, p) their derivatives by theta [y-unit / theta-unit]; it is changed.
+            delay: The delay, or None.
+
+        Returns:
+            The outputs and their derivatives.
+        """
+        plant = self.plant
+        y = y + plant.bias_derivative @ theta
+        G += plant.bias_derivative
+        if delay is None:
+            return y, G
+
+        by_delay = delay.derivative(y)[..., None] * plant.parameters.delay_derivative
+        return delay.apply(y), delay.apply(G) + by_delay
 
     def _moved_directions(
         self, step: float | Array, lumped: LumpedParameters | None
