@@ -179,15 +179,15 @@ def cost_table(costs: list[Cost]) -> Table:
     headings = (
         "p",
         "identifiable",
-        "finding what is identifiable",
-        "steps of finding it",
+        "finding what\nis identifiable",
+        "steps of\nfinding it",
         "J (all moved)",
         "J (psi)",
         "gradient",
-        "gradient / p = 3",
+        "gradient\n/ p = 3",
         "iteration",
         "all cores",
-        "steps of an iteration",
+        "steps of an\niteration",
     )
     for heading in headings:
         table.add_column(heading, justify="right")
