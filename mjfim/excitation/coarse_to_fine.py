@@ -66,12 +66,14 @@ class _State:
         mu: Weight of the barrier with which the next round begins.
         seconds_per_step: Time of an iteration over the engine steps of one simulation [s]; 0 before
             the first round.
+        steps: Engine steps on the stated plant between the rounds.
     """
 
     starts: list[InitialControl]
     results: dict[str, RunResult] = field(default_factory=dict)
     mu: float = BarrierSchedule().first
     seconds_per_step: float = 0.0
+    steps: int = 0
 
     @property
     def iterations(self) -> int:
@@ -134,6 +136,7 @@ class CoarseToFine(Multistart):
         if not self.levels:
             return (yield from super().run(starts))
 
+        plant = self.fine.task.plant
         state = _State(starts=self._affordable(starts))
         levels = (*self.levels, self.fine)
 
@@ -149,13 +152,25 @@ class CoarseToFine(Multistart):
 
             state.discard_others()
             found = yield from self._run_level(level, state, last_mu)
+            steps_before = plant.engine_steps
             self._take(found, level, state)
-            if found and all(r.is_held_up and r.cost > self.cost_to_beat for r in found):
-                break
-            if level is not self.fine and not self.budget.stop.requested:
+            is_over = self._is_last_round(found, level)
+            if not is_over:
                 self._choose_starts(found, level, state, last_mu)
+            state.steps += plant.engine_steps - steps_before
+            if is_over:
+                break
 
-        return without_discarded_winner(list(state.results.values()))
+        results = without_discarded_winner(list(state.results.values()))
+        if results:
+            results[0] = replace(results[0], steps=results[0].steps + state.steps)
+        return results
+
+    def _is_last_round(self, found: Sequence[RunResult], level: DescentLevel) -> bool:
+        """Check whether the search ends with the results of a round on a level."""
+        if level is self.fine or self.budget.stop.requested:
+            return True
+        return len(found) > 0 and self._are_beaten(found)
 
     def _affordable(self, starts: Sequence[InitialControl]) -> list[InitialControl]:
         """The first starts, as many as can be optimised roughly in the time of the first round."""
