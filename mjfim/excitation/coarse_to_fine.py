@@ -45,7 +45,7 @@ LAST_WEIGHTS: dict[int, tuple[float, ...]] = {
     3: (0.03, 3e-4, 1e-4),
 }
 
-# Largest part of J on the stated plant that a coarse level may miss. Beyond that it misleads, and
+# Largest part of J on the stated plant that a coarse level may miss. Beyond that it is wrong, and
 # the next level begins where this one began, if that is better.
 LARGEST_ERROR = 1.0 / 3.0
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken
+from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.barrier_state import SearchState, unfinished
@@ -23,13 +23,14 @@ from mjfim.excitation.search_slices import (
     SearchSlice,
     SliceLength,
     SliceOrder,
+    worker_budget,
 )
 from mjfim.excitation.short_steps import ShortSteps
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import RELAXED, ModelVariant
-from mjfim.parallel import offer_result, one_blas_thread, pool_stop_token
+from mjfim.parallel import offer_result, one_blas_thread
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.records.design import HistoryRow, Status, extended
 from mjfim.records.events import DesignEvent
@@ -175,10 +176,7 @@ def run_in_worker(order: ConstrainedSlice) -> SearchSlice[SearchState]:
         The result so far, and the state.
     """
     search = order.search
-    search_stop, pool_stop = search.budget.stop, pool_stop_token()
-    stop = StopToken(also=lambda: search_stop.requested or pool_stop.requested)
-    search = replace(search, budget=search.budget.with_stop(stop))
-
+    search = replace(search, budget=worker_budget(search.budget))
     task = _tasks.get(order.task_key, search.resolved)
     return consume(search.run_slice(task, order.length, order.own_before), None)
 

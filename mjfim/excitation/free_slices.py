@@ -10,18 +10,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken
+from mjfim.budget import Budget
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult, Runs, consume
-from mjfim.excitation.search_slices import SearchSlice, SliceOrder
+from mjfim.excitation.search_slices import SearchSlice, SliceOrder, worker_budget
 from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import FreeState, UnconstrainedSearch
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import ModelVariant
-from mjfim.parallel import Workers, one_blas_thread, pool_stop_token
+from mjfim.parallel import Workers, one_blas_thread
 from mjfim.parallel.kept import KeptPerThread
 
 
@@ -77,16 +77,13 @@ def run_free_in_worker(order: FreeSlice) -> SearchSlice[FreeState]:
     Returns:
         The result so far with the engine steps of all levels, and the state.
     """
-    order_stop, pool_stop = order.budget.stop, pool_stop_token()
-    stop = StopToken(also=lambda: order_stop.requested or pool_stop.requested)
-
     tasks = _tasks.get(order.task_key, order.resolved)
     before = order.own_before
     state = None if before is None else before.state
     steps_done = 0 if state is None else state.steps
     search = UnconstrainedSearch(
         levels=[DescentLevel(task, order.basis) for task in tasks],
-        budget=order.budget.with_stop(stop),
+        budget=worker_budget(order.budget),
         constraints=None,
         steps_before=sum(task.plant.engine_steps for task in tasks) - steps_done,
         length=order.length,

@@ -13,7 +13,9 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
+from mjfim.budget import Budget, StopToken
 from mjfim.excitation.run_result import RunResult
+from mjfim.parallel import pool_stop_token
 from mjfim.records.design import Status
 
 # State from which a search goes on.
@@ -57,6 +59,16 @@ class SearchSlice(Generic[S]):
     result: RunResult
     state: S | None = None
     late_status: Status = Status.MAX_ITERATIONS
+
+
+def worker_budget(budget: Budget) -> Budget:
+    """Budget of an order on a worker, which a request to stop by the worker's pool ends as well.
+
+    Args:
+        budget: Budget of the whole design, as the order states it.
+    """
+    order_stop, pool_stop = budget.stop, pool_stop_token()
+    return budget.with_stop(StopToken(also=lambda: order_stop.requested or pool_stop.requested))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

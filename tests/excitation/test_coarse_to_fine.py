@@ -72,7 +72,12 @@ def test_every_round_leaves_controls_that_keep_all_limits(fine: DescentLevel) ->
     starts = list(initial_controls_of(fine.task, None))
     events: list[DesignEvent] = []
     search = search_of(fine, Budget())
+    tasks = [level.task for level in (*search.levels, fine)]
+    assert all(len(task.centres) for task in tasks)
+    steps_before = sum(task.plant.engine_steps for task in tasks)
     results = consume(search.run(starts), events.append)
+    taken = sum(task.plant.engine_steps for task in tasks) - steps_before
+    assert sum(result.steps for result in results) == taken
     rows = [event.row for event in events]
 
     # All starts are optimised on the coarsest level, one of them on all levels.
