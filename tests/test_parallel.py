@@ -150,10 +150,16 @@ def test_an_interrupted_design_keeps_the_results_of_its_workers(
     assert design.final.cost < design.initial.cost
 
 
+@pytest.mark.slow
 def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(
     tmp_path: Path, pool: mjfim.Pool
 ) -> None:
     task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 30})
+
+    # Both processes have imported what they need.
+    processes: set[int] = set()
+    while len(processes) < 2:
+        processes |= {future.result() for future in [pool.submit(identity) for _ in range(8)]}
 
     stop = StopToken()
 

@@ -70,7 +70,7 @@ def several(task: DesignTask, stated: StatedExecutor) -> Iterator[Workers | None
 
     threads = task.plant.simulator.threads
     count = number_of_starts(task.system)
-    if not task.is_limited and count < threads:
+    if not task.is_limited and count < (stated.processes or threads):
         count = 1
     with started_executor(stated, count, threads) as workers:
         yield workers

@@ -22,6 +22,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
 from mjfim.information.marginal import shared
+from mjfim.parallel import Workers
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.events import DesignCallback
@@ -78,6 +79,7 @@ def design_jointly(
         designs: list[Design | None] = [None] * len(tasks)
         finished: list[Design] = []
         last = np.inf
+        workers = Workers.of_any(executor)
 
         for _ in range(rounds):
             for i, task in enumerate(tasks):
@@ -93,7 +95,7 @@ def design_jointly(
                     task.restated(task.experiment, added_information=added),
                     callback=show,
                     initial_control=None if earlier is None else earlier.trajectory.ctrl,
-                    executor=executor,
+                    executor=workers,
                     budget=design_budget(task, token),
                 )
                 information[i] = design.data

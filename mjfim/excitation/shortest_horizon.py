@@ -30,6 +30,7 @@ from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
+from mjfim.parallel import Workers
 from mjfim.recordings import formats
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
@@ -203,7 +204,7 @@ def shortest_experiment(
     ):
         task = DesignTask.resolve(experiment, threads=threads)
         require_controls(task.system, "the search for the shortest horizon")
-        search = _HorizonSearch(task, tolerance, show, executor, token)
+        search = _HorizonSearch(task, tolerance, show, Workers.of_any(executor), token)
         return search.run(_default_longest(task) if longest is None else longest)
 
 

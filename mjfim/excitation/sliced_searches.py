@@ -42,7 +42,7 @@ def run_in_slices(
     Returns:
         One result per search that was begun, in the order of the searches.
     """
-    running = _SlicedSearches(orders, Dispatch(Workers.of(executor), function, budget.stop))
+    running = _SlicedSearches(orders, Dispatch(Workers.of(executor), function, budget))
     for outcome in running.dispatch.arrivals():
         for event in running.take(outcome, budget):
             if budget.stop.requested:

@@ -36,15 +36,27 @@ def load_spec(path: Path) -> Any:
             f"{path}: an experiment file, but a model (MJCF or URDF) is needed, such as the one "
             "that this file states"
         )
+    check_model_file(path)
+    return _parsed_spec(path, _engine_path(path), None)
+
+
+def check_model_file(path: Path) -> None:
+    """Check a model file before MuJoCo reads it.
+
+    Args:
+        path: MJCF or URDF file.
+
+    Raises:
+        ModelError: A number is not finite, or the model would not fit into the memory.
+    """
     check_file_numbers(path)
     check_expanded_size(path)
-    return _parsed_spec(path, _engine_path(path), None)
 
 
 def load_packed_spec(path: Path, files: Any) -> Any:
     """MjSpec of an MJCF or URDF file that is not on the disk.
 
-    The file was loaded from the disk before it was packed, so that it is not checked again.
+    The file was checked when it was packed (`check_model_file`), so that it is not checked again.
 
     Args:
         path: The file.

@@ -47,7 +47,7 @@ def carry_out(
         Exception: The error of an order that failed.
         ExperimentError: The orders or the function cannot be sent to the workers.
     """
-    dispatch = Dispatch[Order, T](Workers.of(executor), function, budget.stop)
+    dispatch = Dispatch[Order, T](Workers.of(executor), function, budget)
     for index, order in enumerate(orders):
         dispatch.add(index, order)
 

@@ -11,7 +11,7 @@ from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Generic, TypeVar
 
-from mjfim.budget import StopToken
+from mjfim.budget import Budget
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.interruption import hurried
 from mjfim.parallel.losses import is_loss, is_refused_by_pickle, is_shared_loss
@@ -25,6 +25,12 @@ Order = TypeVar("Order")
 # the request after each iterate; those of other executors end after their slice. A second Ctrl-C
 # ends the waiting.
 GRACE = 4.0
+
+# Time after the end of the budget at which running tasks are given up [s], and the same as a share
+# of the budget's time; the longer one counts. A task may end long after the time, because a single
+# iterate may take long, so that this is for tasks that hang.
+LONGEST_OVERTIME = 30.0
+OVERTIME_SHARE = 0.5
 
 # Period at which the stop token is checked while tasks run [s].
 POLL_INTERVAL = 0.2
@@ -99,13 +105,14 @@ class Dispatch(Generic[Order, T]):
         workers: The workers.
         function: Carries out an order; both can be pickled, and the result depends on the order
             alone.
-        stop: Token that ends the work early.
+        budget: Its token ends the work early; see `arrivals` for its time.
     """
 
-    def __init__(self, workers: Workers, function: Callable[[Order], T], stop: StopToken) -> None:
+    def __init__(self, workers: Workers, function: Callable[[Order], T], budget: Budget) -> None:
         self._workers = workers
         self._function = function
-        self._stop = stop
+        self._budget = budget
+        self._has_arrived = False
         self._waiting: deque[_Work[Order]] = deque()
         self._running: dict[Future[T | AbsentValue], _Work[Order]] = {}
         self._ended: SimpleQueue[Future[T | AbsentValue]] = SimpleQueue()
@@ -135,24 +142,30 @@ class Dispatch(Generic[Order, T]):
         """Carry out all orders, also those that are added meanwhile.
 
         After a request to stop nothing more is begun, and what has ended within `GRACE` seconds is
-        reported. If the caller ends the iteration, what runs is stopped.
+        reported. If the caller ends the iteration, what runs is stopped. So is what still runs long
+        after the time of the budget is over, as a task that hangs, if there is any outcome.
 
         Yields:
             The outcome of every order, in the order of arrival.
 
         Raises:
             Exception: The error of an order that failed; the others are stopped.
-            ExperimentError: An order or its function cannot be sent to the workers.
+            ExperimentError: An order or its function cannot be sent to the workers, or a cluster
+                had no workers until its time was over.
         """
         try:
-            while not self._stop.requested:
+            while not self._budget.stop.requested:
                 self._fill()
                 if not self._running:
                     return
 
                 outcome = self._next_outcome()
                 if outcome is not None:
+                    self._has_arrived = True
                     yield outcome
+                elif self._is_overdue():
+                    self._abandon()
+                    return
 
             yield from self._collected()
         finally:
@@ -224,6 +237,32 @@ class Dispatch(Generic[Order, T]):
         return Outcome(index=work.index, loss=sentence)
 
     # ---- the end before all orders are carried out
+
+    def _is_overdue(self) -> bool:
+        """Check whether the time has been over for so long that nobody waits for what runs.
+
+        Raises:
+            ExperimentError: A cluster had no workers until the time was over.
+        """
+        budget = self._budget
+        limit = budget.deadline - budget.begun
+        if budget.seconds_used - limit <= max(LONGEST_OVERTIME, OVERTIME_SHARE * limit):
+            return False
+        if not self._has_arrived and self._workers.is_empty:
+            raise ExperimentError(
+                "executor: the cluster had no workers until the time was over; start workers, and "
+                "wait for them before, as with client.wait_for_workers(1)"
+            )
+        return self._has_arrived
+
+    def _abandon(self) -> None:
+        """End all tasks at once; what they have found is lost."""
+        self.withdraw()
+        for future in self._running:
+            future.cancel()
+        if self._running and self._workers.pool is not None:
+            self._workers.pool.end_running()
+        self._running.clear()
 
     def _collected(self) -> list[Outcome[T]]:
         """Stop all tasks, and collect what has ended within `GRACE`, or was offered until then."""

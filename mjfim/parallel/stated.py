@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -72,7 +73,7 @@ class StatedExecutor:
     @property
     def processes(self) -> int | None:
         """Stated number of local processes; None where none is stated."""
-        return int(self.place) if self.place else None
+        return int(self.place) if self.kind is ExecutorKind.LOCAL and self.place else None
 
     @contextmanager
     def started(self) -> Iterator[Workers]:
@@ -88,6 +89,16 @@ class StatedExecutor:
         executor = self._cluster() if self.kind is ExecutorKind.DASK else self._made()
         if not hasattr(executor, "__enter__"):
             yield Workers.of(executor)
+            return
+
+        # Those of Python would wait for tasks that nobody needs any more, before a result is
+        # written.
+        if isinstance(executor, ThreadPoolExecutor | ProcessPoolExecutor):
+            workers = Workers(executor)
+            try:
+                yield workers
+            finally:
+                workers.shutdown(wait=False, cancel_futures=True)
             return
 
         with executor as entered:

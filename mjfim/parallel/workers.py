@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Executor, Future
-from contextlib import suppress
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
+from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any, TypeVar
 
 from mjfim.errors import ExperimentError
@@ -36,8 +43,8 @@ class Workers(Executor):
             executorlib, threads), a Dask `Client`, or what its method `get_executor` returns.
         count: Number of tasks that run at once; default: what the executor says, else 1. A Dask
             cluster may grow and shrink meanwhile.
-        threads: Threads that each task may use; default: 1 on a cluster, and elsewhere an equal
-            share of the workers where there are fewer tasks than workers.
+        threads: Threads that each task may use; default: an equal share of the workers where there
+            are fewer tasks than workers and all of them are on this computer, else 1.
 
     Raises:
         ExperimentError: The object cannot run tasks or is wrapped already, or a number is not
@@ -74,6 +81,15 @@ class Workers(Executor):
         """View an executor as workers; what is viewed so already remains as it is."""
         return executor if isinstance(executor, Workers) else cls(executor)
 
+    @classmethod
+    def of_any(cls, executor: Any | None) -> Workers | None:
+        """View an executor as workers; None remains None.
+
+        A study of several parts does so once, so that an executor that is made anew in one part is
+        also used by the next one.
+        """
+        return None if executor is None else cls.of(executor)
+
     @property
     def pool(self) -> Pool | None:
         """The pool, whose tasks can be asked to stop; None for other executors."""
@@ -83,6 +99,11 @@ class Workers(Executor):
     def is_cluster(self) -> bool:
         """True for a Dask cluster, whose tasks can always be cancelled, even while they run."""
         return self._client is not None
+
+    @property
+    def is_empty(self) -> bool:
+        """True for a Dask cluster without any worker."""
+        return self.is_cluster and not self._found_count()
 
     @property
     def count(self) -> int:
@@ -103,7 +124,7 @@ class Workers(Executor):
         """
         if self._stated_threads is not None:
             return self._stated_threads
-        return 1 if self.is_cluster else max(self.count // max(tasks, 1), 1)
+        return max(self.count // max(tasks, 1), 1) if self._is_local else 1
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Submit a task; the arguments are those of `concurrent.futures.Executor.submit`.
@@ -115,7 +136,8 @@ class Workers(Executor):
             kwargs = {**kwargs, "pure": False}
 
         try:
-            return self._executor.submit(fn, *args, **kwargs)
+            with _large_tasks() if self.is_cluster else nullcontext():
+                return self._executor.submit(fn, *args, **kwargs)
         except BrokenExecutor:
             executor = renewed(self._executor)
             if executor is None:
@@ -129,6 +151,14 @@ class Workers(Executor):
         is_known = cancel_futures and not self.is_cluster
         options = {"cancel_futures": True} if is_known else {}
         self._executor.shutdown(wait, **options)
+
+    @property
+    def _is_local(self) -> bool:
+        """True where all workers are known to be on this computer, so that they share its cores."""
+        is_loky = "loky" in type(self._executor).__module__.split(".")
+        return is_loky or isinstance(
+            self._executor, Pool | ProcessPoolExecutor | ThreadPoolExecutor
+        )
 
     def _found_count(self) -> int:
         """Number of workers that the executor states; 0 where it is not known."""
@@ -149,3 +179,15 @@ class Workers(Executor):
                 self._known_count = sum(self._client.nthreads().values())
             self._count_until = time.monotonic() + COUNT_PERIOD
         return self._known_count
+
+
+def _large_tasks() -> AbstractContextManager[object]:
+    """Let Dask take large tasks without a warning: what they share is sent once per worker."""
+    dask = sys.modules.get("dask")
+    if dask is None:
+        return nullcontext()
+
+    settings: AbstractContextManager[object] = dask.config.set(
+        {"distributed.admin.large-graph-warning-threshold": "1TB"}
+    )
+    return settings

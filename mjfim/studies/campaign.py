@@ -30,6 +30,7 @@ from mjfim.excitation.target_accuracy import (
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.identify import identify_system
+from mjfim.parallel import Workers
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
@@ -102,7 +103,7 @@ def run_campaign(
         stop_on_interrupt(stop) as token,
         shown_progress("campaign", callback, progress) as show,
     ):
-        campaign = _CampaignRun(task, rounds, show, executor, token)
+        campaign = _CampaignRun(task, rounds, show, Workers.of_any(executor), token)
         status = campaign.run(measure, done)
         return campaign.record(status)
 

@@ -136,6 +136,7 @@ def compare_task(
     )
 
     rows: list[MethodResult] = []
+    workers = Workers.of_any(executor)
     with stop_on_interrupt(stop) as token:
         for i, method in enumerate(chosen):
             run = _MethodRun(
@@ -143,7 +144,7 @@ def compare_task(
                 index=i,
                 count=len(chosen),
                 callback=callback,
-                executor=executor,
+                executor=workers,
                 stop=token,
             )
             row = run.design(evaluation) if method == DESIGN else run.baseline(evaluation)

@@ -23,7 +23,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.information.identifiability import require_visible
 from mjfim.memory import NUMBER_BYTES, require_memory
-from mjfim.parallel import one_blas_thread
+from mjfim.parallel import Workers, one_blas_thread
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.progress import shown_progress
@@ -137,7 +137,8 @@ def monte_carlo_system(
     sets: dict[str, TrialStatistics] = {}
     information: dict[str, Array] = {}
     with stop_on_interrupt(stop) as token:
-        plan = _Plan(trials=trials, executor=executor, budget=Budget(stop=token))
+        workers = Workers.of_any(executor)
+        plan = _Plan(trials=trials, executor=workers, budget=Budget(stop=token))
         for i, (name, curve) in enumerate(named.items()):
             progress = _Progress(callback=callback, part=name, index=i, count=len(named))
             found = _trial_set(systems[name], curve, plan, generators[i], progress)

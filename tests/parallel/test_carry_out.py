@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import (
@@ -14,7 +15,9 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
+from contextlib import AbstractContextManager, nullcontext
 from multiprocessing import get_context
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -154,7 +157,7 @@ def test_outcomes_come_in_the_order_of_the_orders_and_the_callback_has_them_at_o
 
 def test_orders_may_be_added_while_others_are_carried_out() -> None:
     with ThreadPoolExecutor(2) as executor:
-        work = Dispatch[int, int](Workers(executor), square, StopToken())
+        work = Dispatch[int, int](Workers(executor), square, Budget())
         work.add(0, 3)
         found = []
         for outcome in work.arrivals():
@@ -198,6 +201,43 @@ def test_a_request_to_stop_is_heeded_in_time_by_tasks_that_do_not_see_it(
     assert {each.result for each in found}.isdisjoint({1, 8})
 
 
+def test_a_task_that_hangs_is_given_up_long_after_the_time_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before, the whole design waited for it, whatever its limit of time."""
+    monkeypatch.setattr(dispatch, "LONGEST_OVERTIME", 0.05)
+    monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.02)
+    go_on = threading.Event()
+
+    def work(order: int) -> int:
+        if order == 1:
+            go_on.wait(20.0)
+        return order
+
+    with ThreadPoolExecutor(2) as executor:
+        found = list(carry_out(executor, work, range(2), Budget(seconds=0.0)))
+        go_on.set()
+    assert [each.result for each in found] == [0]
+
+
+def test_a_cluster_without_workers_is_an_error_when_the_time_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(dispatch, "GRACE", 0.05)
+    monkeypatch.setattr(dispatch, "LONGEST_OVERTIME", 0.05)
+    monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.02)
+
+    class Idle(FakeDaskExecutor):
+        """A cluster on which nothing begins."""
+
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            return Future()
+
+    monkeypatch.setattr(FakeClient, "nthreads", lambda self: {})
+    with pytest.raises(ExperimentError, match="had no workers"):
+        list(carry_out(Idle(FakeClient()), square, range(2), Budget(seconds=0.0)))
+
+
 def test_without_time_the_first_order_is_carried_out_and_the_rest_is_left_out() -> None:
     executor = FakeExecutor(lambda order, times: None)
     found = list(carry_out(executor, square, range(9), Budget(seconds=0.0)))
@@ -223,6 +263,10 @@ def test_the_number_of_workers_is_stated_or_found() -> None:
     assert Workers(ThreadPoolExecutor(4)).threads_for(2) == 2
     assert Workers(ThreadPoolExecutor(4), threads=3).threads_for(2) == 3
 
+    # Only workers that are known to be on this computer share its cores.
+    far = FakeExecutor(lambda order, times: None, count=128)
+    assert Workers(far).threads_for(8) == 1
+
     # Where it is not known, all tasks are submitted, so that no worker is idle.
     unknown = FakeExecutor(lambda order, times: None, count=None)
     assert Workers(unknown).count == 1
@@ -230,6 +274,8 @@ def test_the_number_of_workers_is_stated_or_found() -> None:
 
     workers = Workers(unknown)
     assert Workers.of(workers) is workers
+    assert Workers.of_any(workers) is workers
+    assert Workers.of_any(None) is None
     with pytest.raises(ExperimentError, match="wrapped already"):
         Workers(workers, threads=2)
 
@@ -288,6 +334,21 @@ def test_a_scheduler_that_does_not_answer_leaves_the_number_as_it_was(
     monkeypatch.setattr("mjfim.parallel.workers.COUNT_PERIOD", -1.0)
     cluster = Workers(FakeClient(OSError("the scheduler is gone")))
     assert [cluster.count for _ in range(3)] == [1, 1, 5]
+
+
+def test_large_tasks_are_submitted_to_dask_without_a_warning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = []
+
+    def noted(values: dict[str, str]) -> AbstractContextManager[None]:
+        settings.append(values)
+        return nullcontext()
+
+    monkeypatch.setitem(sys.modules, "dask", SimpleNamespace(config=SimpleNamespace(set=noted)))
+    workers = Workers(FakeClient())
+    workers.submit(lambda order, pure: order, 1)
+    assert settings == [{"distributed.admin.large-graph-warning-threshold": "1TB"}]
 
 
 def test_a_cluster_is_ended_without_an_option_that_dask_does_not_have() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -55,6 +56,7 @@ def test_a_wrong_form_is_refused_with_the_right_ones(text: str, message: str) ->
 def test_local_processes_are_counted() -> None:
     assert StatedExecutor.parse("local").processes is None
     assert StatedExecutor.parse("local:3").processes == 3
+    assert StatedExecutor.parse("dask://host:8786").processes is None
 
 
 def test_an_executor_of_a_file_is_made_by_its_function(tmp_path: Path) -> None:
@@ -66,6 +68,17 @@ def test_an_executor_of_a_file_is_made_by_its_function(tmp_path: Path) -> None:
 
     with pytest.raises(RuntimeError, match="shutdown"):
         workers.submit(len, "ended")
+
+
+def test_the_end_does_not_wait_for_tasks_that_nobody_needs(tmp_path: Path) -> None:
+    path = tmp_path / "cluster.py"
+    path.write_text(FACTORY, encoding="utf-8")
+    go_on = threading.Event()
+    with StatedExecutor.parse(f"python:{path}:make").started() as workers:
+        task = workers.submit(go_on.wait, 20.0)
+    assert not task.done()
+    go_on.set()
+    assert task.result(timeout=20.0)
 
 
 def test_workers_of_a_file_keep_their_stated_numbers(tmp_path: Path) -> None:
