@@ -49,7 +49,7 @@ def test_an_executor_of_the_user_finds_the_same_estimates(
     found = []
     for place in ("local", f"python:{cluster}:make"):
         out = tmp_path / f"mc{len(found)}"
-        options = ("--trials", 200, "--executor", place)
+        options = ("--trials", 100, "--executor", place)
         assert run("montecarlo", study, archived, "-o", out, *options).exit_code == 0
         found.append(read(out / "montecarlo.json")["final"]["covariance"])
 
