@@ -8,7 +8,7 @@ from mjfim.memory import NUMBER_BYTES, require_memory
 from mjfim.optimize.directions import LBFGS
 
 # Factor from the counted numbers to the peak: short-lived copies, and what the allocator keeps.
-PEAK_FACTOR = 1.3
+PEAK_FACTOR = 1.45
 
 # Memory that does not depend on the number of samples [bytes].
 FIXED_BYTES = 2**24
