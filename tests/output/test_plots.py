@@ -286,6 +286,13 @@ def test_the_first_iterate_is_called_initial_only_where_it_is() -> None:
         assert label in texts
 
 
+def test_convergence_of_one_iterate_on_two_levels(tmp_path: Path) -> None:
+    """A search that is stopped early has no range of iterations."""
+    design = make_design()
+    history = (design.history[0], design.history[0])
+    render(plots.convergence(dataclasses.replace(design, history=history)), tmp_path)
+
+
 def test_convergence_is_logarithmic() -> None:
     assert [axes.get_yscale() for axes in plots.convergence(make_design()).axes] == ["log"] * 3
 

@@ -99,7 +99,9 @@ def _format_panel(axes: Axes, name: str, iterations: Array) -> None:
     axes.xaxis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True))
     if axes.get_yscale() == "log":
         set_plain_log_ticks(axes.yaxis)
-    if len(iterations) > 1:
+
+    # A search that is stopped early may have one iterate on each of two levels.
+    if len(set(iterations)) > 1:
         margin = X_MARGIN * float(np.ptp(iterations))
         axes.set_xlim(iterations.min() - margin, iterations.max() + margin)
 
