@@ -183,7 +183,7 @@ class Budget:
         return other
 
     def paused(self) -> PausedBudget:
-        """What is used and left now, for a computation that goes on later or elsewhere."""
+        """Freeze what is used and left now, for a computation that goes on later or elsewhere."""
         return PausedBudget(
             seconds_used=self.seconds_used,
             seconds_left=self.seconds_left,

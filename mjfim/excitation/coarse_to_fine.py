@@ -58,7 +58,7 @@ ITERATIONS_OF_A_START = 50
 
 @dataclass(eq=False, kw_only=True)
 class _State:
-    """What the rounds have found so far.
+    """Results of the rounds so far.
 
     Attributes:
         starts: Controls with which the next round begins, the best one first.

@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
-from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.levels import (
-    MAX_CONSTRAINED_COARSE_CHANGE,
-    MIN_COARSE_SAMPLES,
-    DescentLevel,
-    has_similar_cost,
-)
-from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.levels import MIN_COARSE_SAMPLES, DescentLevel, first_point, similar_level
 from mjfim.excitation.task import DesignTask
-from mjfim.model.variants import ModelVariant
 
 # Factors by which the samples of the levels are longer, the coarsest level first. The timestep
 # becomes longer by the same factor.
@@ -36,7 +29,7 @@ def coarser_levels(fine: DescentLevel) -> tuple[DescentLevel, ...]:
     if task.experiment.descent.coarse != "auto" or task.system.grid.substeps > 1:
         return ()
 
-    first = _first_point(fine)
+    first = first_point(fine)
     if first is None:
         return ()
 
@@ -44,7 +37,7 @@ def coarser_levels(fine: DescentLevel) -> tuple[DescentLevel, ...]:
     stated = task.system.variant
     smooth = replace(stated, smoothed=bool(stated.smoothing_speeds))
     variants = [replace(smooth, sample_factor=factor) for factor in _factors(task)]
-    levels = [_similar_level(fine, first, variant) for variant in variants]
+    levels = [similar_level(fine, first, partial(task.with_variant, each)) for each in variants]
     return tuple(level for level in levels if level is not None)
 
 
@@ -52,24 +45,3 @@ def _factors(task: DesignTask) -> list[int]:
     """Factors of the samples that divide the horizon and leave enough samples."""
     N = task.samples
     return [k for k in SAMPLE_FACTORS if N % k == 0 and MIN_COARSE_SAMPLES * k <= N]
-
-
-def _first_point(fine: DescentLevel) -> DesignPoint | None:
-    """The initial control on the stated level; None where the simulation diverges."""
-    try:
-        return fine.problem.point(fine.task.initial)
-    except SimulationDivergedError:
-        return None
-
-
-def _similar_level(
-    fine: DescentLevel, first: DesignPoint, variant: ModelVariant
-) -> DescentLevel | None:
-    """A level on a variant of the plant; None where the initial control costs much else there."""
-    try:
-        level = DescentLevel(fine.task.with_variant(variant), fine.basis)
-    except ExperimentError:
-        return None
-
-    size = fine.problem.size(first)
-    return level if has_similar_cost(level, first, size, MAX_CONSTRAINED_COARSE_CHANGE) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -147,12 +148,8 @@ def has_similar_cost(coarse: DescentLevel, first: DesignPoint, size: float, shar
     if not np.isfinite(first.cost):
         return False
 
-    try:
-        point = coarse.problem.point(coarse.task.initial)
-    except SimulationDivergedError:
-        return False
-
-    return abs(point.cost - first.cost) <= share * size
+    point = first_point(coarse)
+    return point is not None and abs(point.cost - first.cost) <= share * size
 
 
 def easier_level(fine: DescentLevel) -> DescentLevel | None:
@@ -168,9 +165,8 @@ def easier_level(fine: DescentLevel) -> DescentLevel | None:
     has_dry_friction = bool(fine.task.system.variant.smoothing_speeds)
     smooth = replace(fine, task=fine.task.smoothed()) if has_dry_friction else fine
 
-    try:
-        first = smooth.problem.point(smooth.task.initial)
-    except SimulationDivergedError:
+    first = first_point(smooth)
+    if first is None:
         return None
 
     # Take the longest timestep with which the initial control costs nearly as much.
@@ -217,12 +213,37 @@ def _coarser(level: DescentLevel, first: DesignPoint, factor: int) -> DescentLev
     if not (longer_timestep or longer_samples):
         return None
 
+    coarser = task.stretched if longer_timestep else task.coarser
+    return similar_level(level, first, lambda: coarser(factor))
+
+
+def first_point(level: DescentLevel) -> DesignPoint | None:
+    """The initial control on a level; None where the simulation diverges."""
     try:
-        coarse_task = task.stretched(factor) if longer_timestep else task.coarser(factor)
+        return level.problem.point(level.task.initial)
+    except SimulationDivergedError:
+        return None
+
+
+def similar_level(
+    fine: DescentLevel, first: DesignPoint, make: Callable[[], DesignTask]
+) -> DescentLevel | None:
+    """Make a coarse level under hard limits, where the initial control costs nearly as much.
+
+    Args:
+        fine: The finer level.
+        first: Its initial control, evaluated.
+        make: Makes the task of the coarse level; it may raise ExperimentError.
+
+    Returns:
+        The level; None where the model does not allow it, or where the initial cost differs from
+        that of the finer level by more than `MAX_CONSTRAINED_COARSE_CHANGE`.
+    """
+    try:
+        coarse = DescentLevel(make(), fine.basis)
     except ExperimentError:
         return None
 
-    coarse = DescentLevel(coarse_task, level.basis)
-    size = task.problem.size(first)
+    size = fine.task.problem.size(first)
     similar = has_similar_cost(coarse, first, size, MAX_CONSTRAINED_COARSE_CHANGE)
     return coarse if similar else None

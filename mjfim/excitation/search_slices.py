@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
@@ -47,7 +48,7 @@ class SliceLength:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchSlice(Generic[S]):
-    """What a slice of a search returns.
+    """Result and state of a search at the end of a slice.
 
     Attributes:
         result: The result so far. That of a search that has not ended counts where nothing
@@ -72,7 +73,7 @@ def worker_budget(budget: Budget) -> Budget:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SliceOrder(Generic[S]):
+class SliceOrder(ABC, Generic[S]):
     """Order for a slice of a search, for a worker. It can be pickled.
 
     Attributes:
@@ -89,9 +90,9 @@ class SliceOrder(Generic[S]):
     before: SearchSlice[S] | None = None
 
     @property
+    @abstractmethod
     def name(self) -> str:
         """Name of the initial control."""
-        raise NotImplementedError
 
     @property
     def own_before(self) -> SearchSlice[S] | None:

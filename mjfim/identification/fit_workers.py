@@ -121,10 +121,10 @@ def _without_values(rows: int, outputs: int) -> AlignedRecording:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Found(Generic[T]):
-    """What a worker has found, and how much it has simulated.
+    """Result of a worker, and how much it has simulated.
 
     Attributes:
-        result: What it has found.
+        result: The result.
         steps: Engine steps that this took.
     """
 
@@ -324,6 +324,6 @@ _Orders = WeakKeyDictionary[FitProblem, dict[tuple[int, ...], SharedValue[_Probl
 
 
 def _counted_here(problem: FitProblem, found: _Found[T]) -> T:
-    """What a worker has found; its engine steps are added to those of the problem."""
+    """Result of a worker, whose engine steps are added to those of the problem."""
     problem.system.plant.simulator.add_steps(found.steps)
     return found.result

@@ -607,7 +607,7 @@ class FitProblem:
     def _of_batches(
         self, work: BatchWork[T], batches: Iterable[SegmentBatch], at: UnknownValues
     ) -> Iterator[T | None]:
-        """What a work on batches finds, in the order of the batches.
+        """Results of a work on batches, in the order of the batches.
 
         Args:
             work: `losses_of_batch` or `blocks_of_batch`.

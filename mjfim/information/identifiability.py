@@ -344,7 +344,7 @@ class _StepEffects:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _SingleSteps:
-    """What single steps of trajectories show.
+    """Effects of the parameters on single steps of trajectories.
 
     Attributes:
         few: Effects of each parameter at a few samples of the first trajectory; None where no

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import mujoco
 
 from mjfim.model.loading import ModelSource
 from mjfim.model.packed_files import PackedFiles, name_of
+from mjfim.parallel.kept import Kept
 
 # Number of packed models that a process keeps ready for use. A worker seldom serves more studies
 # than these in turn, and each model takes the memory of its meshes several times.
@@ -32,29 +32,10 @@ def packed_model(files: PackedFiles, path: Path) -> ModelSource:
     Raises:
         ModelError: MuJoCo cannot read or compile the model.
     """
-    return _models.get(files, path)
-
-
-class _KeptModels:
-    """The latest packed models of this process, by the hash of their files."""
-
-    def __init__(self) -> None:
-        """Start without any model."""
-        self._lock = threading.Lock()
-        self._models: OrderedDict[tuple[str, str], ModelSource] = OrderedDict()
-
-    def get(self, files: PackedFiles, path: Path) -> ModelSource:
-        """Return the model of a file, and forget the one that was not used for the longest time."""
-        key = (files.digest, name_of(path))
-
-        # A second thread that asks for the same model waits until the first one has compiled it.
-        with self._lock:
-            if key not in self._models:
-                self._models[key] = ModelSource(path, files=_file_system(files))
-            self._models.move_to_end(key)
-            while len(self._models) > KEPT_MODELS:
-                self._models.popitem(last=False)
-            return self._models[key]
+    # A second thread that asks for the same model waits until the first one has compiled it.
+    key = files.digest, name_of(path)
+    with _lock:
+        return _models.get(key, lambda: ModelSource(path, files=_file_system(files)))
 
 
 def _file_system(files: PackedFiles) -> Any:
@@ -65,4 +46,6 @@ def _file_system(files: PackedFiles) -> Any:
     return system
 
 
-_models = _KeptModels()
+# The latest packed models of this process, by the hash of their files and their name.
+_models = Kept[ModelSource](KEPT_MODELS)
+_lock = threading.Lock()

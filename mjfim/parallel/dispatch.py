@@ -45,7 +45,7 @@ class LostWorkError(MjfimError):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome(Generic[T]):
-    """What became of an order.
+    """Result or loss of an order.
 
     Attributes:
         index: Number of the order.

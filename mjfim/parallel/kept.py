@@ -1,35 +1,35 @@
-"""What the tasks of a worker have in common, made by the first of them and kept for the others."""
+"""Objects that are made once and kept for later use, the latest ones of them."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
 
-class KeptPerThread(threading.local, Generic[T]):
-    """Objects by key, each of which is used by one thread only.
-
-    A worker process does one task after the other; a worker of several threads, as of Dask, has
-    objects of each thread.
+class Kept(Generic[T]):
+    """Objects by key. Those that were not used for the longest time are forgotten.
 
     Args:
-        count: Number of objects that a thread keeps; those that were not used for the longest time
-            are forgotten.
+        count: Number of objects that are kept.
     """
 
     def __init__(self, count: int) -> None:
         self._count = count
-        self._objects: OrderedDict[str, T] = OrderedDict()
+        self._objects: OrderedDict[Hashable, T] = OrderedDict()
 
-    def get(self, key: str, make: Callable[[], T]) -> T:
-        """Return the object of a key, made where this thread does not have it.
+    def __len__(self) -> int:
+        """Number of objects that are kept now."""
+        return len(self._objects)
+
+    def get(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return the object of a key, made where it is not kept.
 
         Args:
-            key: Text that identifies the object, such as a hash.
+            key: What identifies the object, such as a hash.
             make: Makes it.
         """
         if key not in self._objects:
@@ -38,3 +38,14 @@ class KeptPerThread(threading.local, Generic[T]):
         while len(self._objects) > self._count:
             self._objects.popitem(last=False)
         return self._objects[key]
+
+
+class KeptPerThread(threading.local, Kept[T]):
+    """What the tasks of a worker have in common, made by the first of them.
+
+    A worker process does one task after the other; a worker of several threads, as of Dask, has
+    objects of each thread.
+
+    Args:
+        count: Number of objects that each thread keeps.
+    """

@@ -18,6 +18,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.model import packed_models
+from mjfim.parallel.kept import Kept
 from tests.support.mesh_model import write_mesh_model
 from tests.support.paths import MODELS, SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
@@ -130,7 +131,7 @@ def test_a_process_parses_a_packed_model_once(
         return original(path, **options)
 
     monkeypatch.setattr(packed_models, "ModelSource", counted)
-    monkeypatch.setattr(packed_models, "_models", packed_models._KeptModels())
+    monkeypatch.setattr(packed_models, "_models", Kept(packed_models.KEPT_MODELS))
     experiment = stated(tmp_path)
 
     for _ in range(3):
@@ -141,7 +142,7 @@ def test_a_process_parses_a_packed_model_once(
 
 
 def test_only_the_latest_models_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = packed_models._KeptModels()
+    kept = Kept(packed_models.KEPT_MODELS)
     monkeypatch.setattr(packed_models, "_models", kept)
     for number in range(packed_models.KEPT_MODELS + 2):
         (tmp_path / "m.xml").write_text(
@@ -157,7 +158,7 @@ def test_only_the_latest_models_are_kept(tmp_path: Path, monkeypatch: pytest.Mon
         )
         System.resolve(experiment.packed(), threads=1)
 
-    assert len(kept._models) == packed_models.KEPT_MODELS
+    assert len(kept) == packed_models.KEPT_MODELS
 
 
 def test_messages_of_packed_files_name_the_file_of_the_user(tmp_path: Path) -> None:

@@ -51,6 +51,12 @@ NAME_WIDTH, LABEL_WIDTH = 18, 1.05
 # Largest number of decimals of a value at an axis, and size up to which it has no power of ten.
 MAX_DECIMALS, LARGEST_PLAIN = 6, 1e5
 
+# Smallest and largest number of digits of other values.
+MIN_DIGITS, MAX_DIGITS = 2, 6
+
+# Height of the mark of the guess in the panel of a density.
+GUESS_HEIGHT = 0.02
+
 # Height of a row of panels, and of all that is above and below them [inch].
 ROW_HEIGHT, FRAME_HEIGHT = 1.15, 1.3
 
@@ -79,6 +85,17 @@ class _Estimates:
     def std(self) -> Array:
         """(k,) standard deviations [theta-unit]."""
         return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def guess_in_stds(self) -> Array | None:
+        """(k,) differences of the guess from the values, in standard deviations, or None."""
+        return None if self.guess is None else (self.guess - self.values) / self.std
+
+    @property
+    def has_guess_in_range(self) -> bool:
+        """Whether the guess of at least one parameter is on its axis."""
+        guess = self.guess_in_stds
+        return guess is not None and bool((np.abs(guess) < RANGE).any())
 
     def part(self, chosen: NDArray[np.intp]) -> _Estimates:
         """Return some of the parameters."""
@@ -167,7 +184,7 @@ def _draw(estimates: _Estimates, title: str, note: str) -> Figure:
         Line2D([], [], color=shown.colour, linewidth=7.0, alpha=opacity + 0.1, label=f"{size:g} σ")
         for size, opacity in reversed(ELLIPSES)
     ]
-    if shown.guess is not None and _guesses_in_range(shown):
+    if shown.has_guess_in_range:
         handles.append(
             Line2D([], [], color=NOMINAL_COLOUR, marker="x", linestyle="", label=NOMINAL.word)
         )
@@ -184,42 +201,59 @@ def _shown_parameters(estimates: _Estimates) -> NDArray[np.intp]:
     """Return the parameters to draw: of many, those with the largest correlations."""
     std = estimates.std
     known = np.flatnonzero(np.isfinite(std) & (std > 0.0))
-    correlation = estimates.covariance[np.ix_(known, known)] / np.outer(std[known], std[known])
+
+    covariance = estimates.covariance[np.ix_(known, known)]
+    correlation = covariance / np.outer(std[known], std[known])
     np.fill_diagonal(correlation, 0.0)
+
+    # The largest correlation of each parameter with any other one decides.
     largest = np.abs(np.nan_to_num(correlation)).max(axis=0)
-    return np.sort(known[np.argsort(-largest, kind="stable")[:MAX_PARAMETERS]])
+    by_correlation = np.argsort(-largest, kind="stable")
+    return np.sort(known[by_correlation[:MAX_PARAMETERS]])
 
 
 def _draw_density(axes: Axes, shown: _Estimates, i: int) -> None:
     """Draw the normal density of one parameter."""
     x = np.linspace(-RANGE, RANGE, CURVE_POINTS)
-    axes.fill_between(x, norm.pdf(x), color=shown.colour, alpha=0.25, linewidth=0.0)
-    axes.plot(x, norm.pdf(x), color=shown.colour)
+    density = norm.pdf(x)
+    axes.fill_between(x, density, color=shown.colour, alpha=0.25, linewidth=0.0)
+    axes.plot(x, density, color=shown.colour)
+
     axes.set(xlim=(-RANGE, RANGE), ylim=(0.0, 0.45), yticks=[])
     axes.spines["left"].set_visible(False)
     axes.set_title(shorten(shown.names[i], NAME_WIDTH), fontsize=SMALL_FONT, pad=3)
-    if shown.guess is not None:
-        guess = float((shown.guess[i] - shown.values[i]) / shown.std[i])
-        if abs(guess) < RANGE:
-            axes.plot(guess, 0.02, "x", color=NOMINAL_COLOUR, markersize=5)
+
+    guess = shown.guess_in_stds
+    if guess is not None:
+        _mark_guess(axes, float(guess[i]), GUESS_HEIGHT)
 
 
 def _draw_ellipses(axes: Axes, shown: _Estimates, i: int, j: int) -> None:
     """Draw the ellipses of parameter j (across) and i (up), in standard deviations."""
     std = shown.std
-    correlation = float(np.clip(shown.covariance[i, j] / (std[i] * std[j]), -1.0, 1.0))
+    ratio = shown.covariance[i, j] / (std[i] * std[j])
+    correlation = float(np.clip(ratio, -1.0, 1.0))
+
+    # The ellipse of one standard deviation.
     angle = np.linspace(0.0, 2.0 * np.pi, CURVE_POINTS)
     x = np.cos(angle)
     y = correlation * x + np.sqrt(1.0 - correlation**2) * np.sin(angle)
+
     for size, opacity in ELLIPSES:
         axes.fill(size * x, size * y, facecolor=shown.colour, alpha=opacity, linewidth=0.0)
     axes.plot(2.0 * x, 2.0 * y, color=shown.colour, linewidth=0.8)
     axes.plot(0.0, 0.0, ".", color=shown.colour, markersize=4)
     axes.set(xlim=(-RANGE, RANGE), ylim=(-RANGE, RANGE))
-    if shown.guess is not None:
-        guess = (shown.guess - shown.values) / std
-        if max(abs(guess[i]), abs(guess[j])) < RANGE:
-            axes.plot(guess[j], guess[i], "x", color=NOMINAL_COLOUR, markersize=5)
+
+    guess = shown.guess_in_stds
+    if guess is not None:
+        _mark_guess(axes, float(guess[j]), float(guess[i]))
+
+
+def _mark_guess(axes: Axes, x: float, y: float) -> None:
+    """Mark the guess at a place in standard deviations, if it lies within the axes."""
+    if abs(x) < RANGE and abs(y) < RANGE:
+        axes.plot(x, y, "x", color=NOMINAL_COLOUR, markersize=5)
 
 
 def _label_ticks(axes: Axes, shown: _Estimates, i: int, j: int) -> None:
@@ -246,18 +280,14 @@ def _label(shown: _Estimates, i: int) -> str:
 
 def _value(shown: _Estimates, i: int, stds: float) -> str:
     """Write the value of a parameter at a distance from its estimate, in steps of its σ."""
-    value, std = float(shown.values[i] + stds * shown.std[i]), float(shown.std[i])
+    estimate, std = float(shown.values[i]), float(shown.std[i])
+    value = estimate + stds * std
+    largest = abs(estimate) + TICK * std
 
     # All values of a parameter have the same decimals, those that its σ can change.
     decimals = int(np.ceil(-np.log10(std)))
-    largest = float(np.abs(shown.values[i])) + TICK * std
     if 0 <= decimals <= MAX_DECIMALS and largest < LARGEST_PLAIN:
         return f"{value:.{decimals}f}".replace("-", "−")
-    return format_number(value, int(np.clip(np.ceil(np.log10(largest / std)) + 1.0, 2, 6)))
 
-
-def _guesses_in_range(shown: _Estimates) -> bool:
-    """Return whether the guess of at least one parameter is on its axis."""
-    if shown.guess is None:
-        return False
-    return bool((np.abs(shown.guess - shown.values) < RANGE * shown.std).any())
+    digits = int(np.ceil(np.log10(largest / std))) + 1
+    return format_number(value, int(np.clip(digits, MIN_DIGITS, MAX_DIGITS)))

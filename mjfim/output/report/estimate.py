@@ -374,11 +374,15 @@ def _signal_panel(signals: _Signals, j: int, labels: Labels, linked: str) -> Pan
 
 def _shown_outputs(estimate: Estimate) -> list[int]:
     """Return the numbers of the outputs to draw: of many, those with the largest residuals."""
-    rms = list(estimate.residual_rms.items())
-    measured = [j for j, (_, value) in enumerate(rms) if np.isfinite(value)]
-    sizes = {j: rms[j][1] / max(estimate.sigma.get(rms[j][0], 1.0), 1e-300) for j in measured}
-    largest = sorted(measured, key=lambda j: -sizes[j])
-    return sorted(largest[:MAX_OUTPUTS])
+    sizes: dict[int, float] = {}
+    for j, (name, rms) in enumerate(estimate.residual_rms.items()):
+        # An output that was not measured has no residuals.
+        if np.isfinite(rms):
+            sigma = estimate.sigma.get(name, 1.0)
+            sizes[j] = rms / max(sigma, np.finfo(float).tiny)
+
+    largest_first = sorted(sizes, key=lambda j: -sizes[j])
+    return sorted(largest_first[:MAX_OUTPUTS])
 
 
 def _vertical_range(signals: _Signals, j: int) -> Plotly:

@@ -71,11 +71,13 @@ def palettes() -> dict[str, dict[str, Any]]:
     """Return the colours by theme, `light` and `dark`, and role."""
     light: dict[str, Any] = {**LIGHT, "diverging": _diverging(DIVERGING_LIGHT)}
     dark: dict[str, Any] = {**DARK, "diverging": _diverging(DIVERGING_DARK)}
+
     for term in (*TERMS, OTHER):
         light[term.word] = term.colour
         dark[term.word] = term.colour_on_dark
-    for i, (bright, pale) in enumerate(zip(SERIES_LIGHT, SERIES_DARK, strict=True)):
-        light[f"series{i}"], dark[f"series{i}"] = bright, pale
+
+    light.update((f"series{i}", colour) for i, colour in enumerate(SERIES_LIGHT))
+    dark.update((f"series{i}", colour) for i, colour in enumerate(SERIES_DARK))
     return {"light": light, "dark": dark}
 
 
