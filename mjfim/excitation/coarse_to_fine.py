@@ -22,16 +22,13 @@ from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.multistart import (
-    HALVING_RATE,
-    SECONDS_AFTER_STOP,
-    Multistart,
-    append_run,
-    renumber,
-    without_discarded_winner,
-)
+from mjfim.excitation.merged_results import append_run, renumber, without_discarded_winner
+from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.search_round import RoundTerms
+from mjfim.excitation.survivors import HALVING_RATE
+from mjfim.excitation.winner_repair import SECONDS_AFTER_STOP
 from mjfim.records.design import Status
 
 # Share of the time that is left, and of the iterations, for a round that is not the last one.
@@ -186,7 +183,7 @@ class CoarseToFine(Multistart):
         problem.expand(problem.point(initial))
         each = ITERATIONS_OF_A_START * (self.budget.seconds_used - begun)
         counts = range(1, len(starts) + 1)
-        affordable = [count for count in counts if self._turns(count) * each <= seconds]
+        affordable = [count for count in counts if self.rounds.turns(count) * each <= seconds]
         return list(starts[: max(affordable, default=1)])
 
     def _is_over(self, level: DescentLevel, state: _State) -> bool:
@@ -212,16 +209,15 @@ class CoarseToFine(Multistart):
         """Run one round on a level down to a barrier weight."""
         share = 1.0 if level is self.fine else ROUND_SHARE
         iterations_left = self._max_iterations - state.iterations
-        turns = self._turns(len(state.starts))
+        turns = self.rounds.turns(len(state.starts))
         begun = self.budget.seconds_used
 
-        events = self._round(
-            level,
-            state.starts,
-            BarrierSchedule(first=state.mu, last=last_mu),
-            int(np.ceil(share * max(iterations_left, 1))),
-            share * self._seconds_left / turns,
+        terms = RoundTerms(
+            schedule=BarrierSchedule(first=state.mu, last=last_mu),
+            max_iterations=int(np.ceil(share * max(iterations_left, 1))),
+            seconds=share * self._seconds_left / turns,
         )
+        events = self.rounds.run(level, state.starts, terms)
         found = yield from renumber(events, state.iterations)
 
         longest = max((len(result.history) for result in found), default=0)

@@ -19,7 +19,7 @@ from mjfim.excitation.controls_within_limits import (
 )
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import easier_level
-from mjfim.excitation.multistart import append_run
+from mjfim.excitation.merged_results import append_run
 from mjfim.excitation.random_search import LEAST_PROGRESS, PATIENCE, RandomSearch
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.task import DesignTask

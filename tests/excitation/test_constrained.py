@@ -17,16 +17,20 @@ from mjfim.budget import Budget, StopToken
 from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.constrained import ConstrainedSearch, ConstrainedSlice, run_in_worker
 from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.controls_within_limits import LimitedCost
 from mjfim.excitation.design import design_task
 from mjfim.excitation.feasibility import SHRINK_FACTORS
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.interior_point import BarrierSchedule, InteriorPointMethod, updated_tightening
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.multistart import Multistart, _Feasible, _merge_rounds
+from mjfim.excitation.merged_results import merge_rounds
+from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.search_round import RoundTerms
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import verify
+from mjfim.excitation.winner_repair import CostedControl, WinnerRepair
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.task_tables import Descent
 from mjfim.output.summaries.design import describe_design
@@ -221,7 +225,7 @@ def test_a_stopped_search_shrinks_only_the_actuator_that_leaves_its_limit(tmp_pa
     control = task.centre + wave * [1.6, 0.3]
     search = multistart_of(task.relaxed())
     search.budget.stop.request()
-    shrunk = search._shrink(control)
+    shrunk = search.repair.shrink(control)
     assert np.isfinite(shrunk.cost)
 
     left = RunResult(name="x", control=control, cost=0.1 * shrunk.cost)
@@ -266,39 +270,34 @@ def test_a_design_says_what_the_initial_control_violates_and_when(tmp_path: Path
     assert Design.load(tmp_path).initial_violations == design.initial_violations
 
 
-class Rigid(Multistart):
-    """Several starts whose controls cannot be shrunk inside the limits."""
+class Rigid(WinnerRepair):
+    """Repairs results whose controls cannot be shrunk inside the limits."""
 
-    def _shrink(self, control: Array) -> _Feasible:
-        return _Feasible(np.inf, control)
+    def shrink(self, control: Array) -> CostedControl:
+        return CostedControl(cost=np.inf, control=control)
 
 
 def test_a_winner_that_cannot_be_shrunk_does_not_hide_a_feasible_start(tmp_path: Path) -> None:
     task = cart_inside(tmp_path)
-    free = task.relaxed()
-    rigid = Rigid(fine=DescentLevel(free, None), coarse=None, budget=Budget())
+    limited = LimitedCost(level=DescentLevel(task.relaxed(), None))
+    rigid = Rigid(cost=limited, budget=Budget())
     inside = 0.2 * task.control
-    cost = rigid._cost_on_stated_plant(inside)
+    cost = limited(inside)
     assert np.isfinite(cost)
     wild = RunResult(name="wild", control=30.0 * task.control, cost=0.1 * cost)
     calm = RunResult(name="calm", control=inside, cost=cost)
 
-    first, second = consume(replace(rigid, budget=over()).tighten_winner([wild, calm]), None)
+    first, second = rigid.repaired([wild, calm])
     assert not np.isfinite(first.cost)
     assert first.status is Status.INFEASIBLE
     assert second is calm
 
     # The best feasible control of an earlier stage of the same start counts as well.
     wild = replace(wild, earlier=(0.1 * task.control, inside, 20.0 * task.control))
-    (found,) = consume(replace(rigid, budget=over()).tighten_winner([wild]), None)
+    (found,) = rigid.repaired([wild])
     assert found.status is Status.BEST_SEEN
-    assert found.cost == min(cost, rigid._cost_on_stated_plant(0.1 * task.control))
+    assert found.cost == min(cost, limited(0.1 * task.control))
     assert_inside(task, found.control)
-
-
-def over() -> Budget:
-    """A budget whose time is used up."""
-    return Budget(seconds=0.0)
 
 
 @pytest.mark.slow
@@ -333,7 +332,7 @@ def test_a_motion_about_the_holding_control_is_found_and_improved(
 
     # The search continued from the shrunk motion, so that the design tells more than that.
     multistart = multistart_of(task.relaxed())
-    shrunk = multistart._shrink(task.control)
+    shrunk = multistart.repair.shrink(task.control)
     assert np.isfinite(shrunk.cost)
     assert design.final.cost < 0.99 * shrunk.cost
 
@@ -568,7 +567,7 @@ def test_a_second_round_that_converges_at_a_higher_cost_is_not_reported() -> Non
     control = np.zeros((3, 1))
     first = RunResult(name="x", control=control, cost=1.0, status=Status.MAX_ITERATIONS)
     second = RunResult(name="x", control=control + 1.0, cost=2.0, status=Status.CONVERGED)
-    (merged,) = _merge_rounds([first], [second])
+    (merged,) = merge_rounds([first], [second])
     assert merged.control is control
     assert merged.status is Status.BEST_SEEN
 
@@ -638,9 +637,9 @@ def test_an_interrupted_multistart_keeps_the_best_so_far(tmp_path: Path) -> None
 def test_a_fourier_start_is_optimised_as_a_series_in_the_first_round(tmp_path: Path) -> None:
     task = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
     starts = list(initial_controls_of(task, None))
-    first_round = multistart_of(task.relaxed())._round(
-        DescentLevel(task.relaxed(), None), starts, BarrierSchedule(last=0.01), 6, np.inf
-    )
+    terms = RoundTerms(schedule=BarrierSchedule(last=0.01), max_iterations=6, seconds=np.inf)
+    level = DescentLevel(task.relaxed(), None)
+    first_round = multistart_of(task.relaxed()).rounds.run(level, starts, terms)
     first = {result.name: result.control for result in consume(first_round, None)}
     assert list(first) == ["initial control", "Fourier series of 2 Hz"]
     waves = [f(2 * np.pi * 2.0 * k * task.t) for k in range(1, 16) for f in (np.sin, np.cos)]

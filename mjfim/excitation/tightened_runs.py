@@ -1,0 +1,64 @@
+"""Runs within tighter limits, where the best result violates a limit of the unmodified model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
+from mjfim.excitation.merged_results import append_run, continued
+from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.search_round import RoundTerms, SearchRounds
+from mjfim.excitation.winner_repair import WinnerRepair
+
+# Largest number of runs within tighter limits.
+MAX_TIGHTENED_RUNS = 3
+
+# First barrier weight mu of a run within tighter limits.
+TIGHTENED_RUN_MU = 1e-3
+
+# Largest number of iterations of a run within tighter limits.
+TIGHTENED_RUN_ITERATIONS = 60
+
+
+def run_within_tighter_limits(
+    rounds: SearchRounds, repair: WinnerRepair, results: Sequence[RunResult]
+) -> Runs:
+    """Optimise the best result again while it violates a limit on the unmodified model.
+
+    Args:
+        rounds: Runs the searches.
+        repair: Tells whether the best result violates a limit.
+        results: Result of every start.
+
+    Yields:
+        Every iterate.
+
+    Returns:
+        The results, of which the best one is replaced. It may still violate a limit.
+    """
+    results = list(results)
+    tightening = dict[str, float]()
+
+    for _ in range(MAX_TIGHTENED_RUNS):
+        winner = repair.violating(results)
+        if winner is None or rounds.budget.exhausted is not None:
+            break
+
+        tightening = updated_tightening(tightening, winner.margins)
+        repeated = yield from rounds.run(
+            repair.cost.level,
+            [continued(results[winner.index])],
+            RoundTerms(
+                schedule=BarrierSchedule(first=TIGHTENED_RUN_MU),
+                max_iterations=TIGHTENED_RUN_ITERATIONS,
+                seconds=rounds.budget.seconds_left,
+                tightening=tightening,
+            ),
+        )
+        for result in repeated:
+            if np.isfinite(result.cost):
+                results[winner.index] = append_run(results[winner.index], result)
+
+    return results
