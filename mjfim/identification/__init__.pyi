@@ -1,4 +1,4 @@
-from .residuals import FitProblem
+from .fit_problem import FitProblem
 from .task import FitTask
 
 __all__ = [

@@ -9,7 +9,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.robust_covariance import block_length, robust_uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
@@ -195,12 +195,11 @@ def _robust(
         duration = sum(float(recording.t[-1]) for recording in problem.recordings)
         length = settings.blocks * rows / duration
 
-    recording_of_block, rows_of_block = problem.blocks
     return robust_uncertainty(
         solution.condensed,
         problem.common_values(solution.unknowns),
-        recording_of_block,
-        rows_of_block,
+        problem.blocks.recording_of_block,
+        problem.blocks.mean_rows,
         min_rows=length,
         draws=settings.bootstrap,
         rng=np.random.default_rng(settings.seed),

@@ -19,9 +19,9 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality, fit_quality
 from mjfim.identification.residual_tests import misfit_reasons
-from mjfim.identification.residuals import FitProblem
 from mjfim.identification.searches import FitSearch, quick_subset
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace

@@ -15,7 +15,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Prediction, PredictionErrors

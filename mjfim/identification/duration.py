@@ -8,7 +8,8 @@ from dataclasses import replace
 from mjfim.duration import estimated_seconds
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.records.recording import Recording
 
 
@@ -29,7 +30,7 @@ def pass_seconds(system: System, recordings: Sequence[Recording]) -> float | Non
         """Compute the derivatives of the first rows of the longest recording."""
         part = _first_rows(longest, count)
         problem = FitProblem.of(system, [part])
-        problem.sensitivity_rows(problem.begin(system.parameters.guess))
+        sensitivity_rows(problem, problem.begin(system.parameters.guess))
 
     # The derivatives are computed with two steps of the differences, a fit needs one of them.
     try:

@@ -20,7 +20,9 @@ from mjfim.budget import Budget, StopToken
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.residuals import BatchWork, FitProblem, Pins
+from mjfim.identification.batch_workers import BatchWork
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.pins import Pins
 from mjfim.identification.segment_simulation import SegmentBatch, SegmentSimulation
 from mjfim.identification.segments import Segment
 from mjfim.identification.unknowns import UnknownLayout
@@ -231,7 +233,7 @@ class FitWorkers:
         batches: Sequence[SegmentBatch],
         at: UnknownValues,
     ) -> Sequence[T | None]:
-        """Do a work on all batches. See `residuals.BatchWorkers`."""
+        """Do a work on all batches. See `batch_workers.BatchWorkers`."""
         # One batch is simulated by all threads of this process.
         if len(batches) < 2:
             return [work(problem, at, batch) for batch in batches]
@@ -260,7 +262,7 @@ class FitWorkers:
         settings: SearchSettings,
         budget: Budget,
     ) -> Iterator[Solution | None]:
-        """Search from several starts. See `residuals.BatchWorkers`."""
+        """Search from several starts. See `batch_workers.BatchWorkers`."""
         needed = {segment.recording for segment in problem.segments}
         threads = self._executor.threads_for(len(begins))
         shared = self._order_of(problem, sorted(needed), threads)

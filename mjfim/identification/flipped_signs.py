@@ -14,7 +14,7 @@ import numpy as np
 
 from mjfim.budget import Budget
 from mjfim.errors import RecordingError
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise

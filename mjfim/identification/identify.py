@@ -21,10 +21,11 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.continuation import continued_fit
 from mjfim.identification.extreme_values import describe_extreme_value
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.report import FitResult, estimate_from
-from mjfim.identification.residuals import FitProblem
 from mjfim.identification.searches import NEWTON, FitSearch, of_subset, quick_subset
+from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import FitTask, Method
 from mjfim.information.null_space import NullSpace, find_null_space
 from mjfim.optimize.levenberg_marquardt import (
@@ -286,7 +287,7 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
     The data are the recordings and the priors.
     """
     parameters = task.system.parameters
-    rows = problem.sensitivity_rows(problem.begin(task.start))
+    rows = sensitivity_rows(problem, problem.begin(task.start))
     J = np.concatenate([row for row, _ in rows])
     change = np.concatenate([error for _, error in rows])
 

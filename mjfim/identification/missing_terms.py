@@ -18,7 +18,7 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.model.coordinates import scalar_joints
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.units import JOINT_FIELD_UNITS

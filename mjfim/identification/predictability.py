@@ -12,7 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segments import MIN_SAMPLES
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.trajectory import Trajectory

@@ -17,6 +17,7 @@ from mjfim.experiment.stated_units import probable_degrees
 from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality
 from mjfim.identification.flipped_signs import (
     POOR_FIT,
@@ -27,7 +28,6 @@ from mjfim.identification.flipped_signs import (
 from mjfim.identification.missing_terms import find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
-from mjfim.identification.residuals import FitProblem
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet

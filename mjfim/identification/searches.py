@@ -10,7 +10,7 @@ import numpy as np
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
 from mjfim.identification.task import FitTask
 from mjfim.model.parameter_samples import sample_parameters

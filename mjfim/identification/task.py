@@ -14,7 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.fit_memory import require_memory_for_recordings
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.same_data import refuse_same_data
 from mjfim.records.recording import Recording
 

@@ -23,9 +23,10 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
 from mjfim.identification.fit_memory import require_memory_for_recordings
-from mjfim.identification.residuals import FitProblem
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.same_data import refuse_same_data
 from mjfim.identification.segments import recorded_release
+from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest
 from mjfim.information.marginal import shared
@@ -167,7 +168,7 @@ def check_recordings(
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
     # Rows of G at the times of the measurements, and the error of their finite differences.
-    recorded = fit.sensitivity_rows(fit.begin(task.theta))
+    recorded = sensitivity_rows(fit, fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
     count = len(recordings)
 

@@ -22,8 +22,8 @@ from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.system import System
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares, newton_raphson
-from mjfim.identification.residuals import FitProblem
 from mjfim.records.recording import Recording
 
 # Length of the last step, in standard deviations, below which a trial has converged.

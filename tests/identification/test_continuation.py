@@ -11,8 +11,8 @@ import mjfim
 from mjfim.budget import StopToken
 from mjfim.experiment.system import System
 from mjfim.identification.continuation import MIN_ROWS, segment_lengths
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
-from mjfim.identification.residuals import FitProblem
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording

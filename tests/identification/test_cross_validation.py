@@ -8,8 +8,9 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.dense_residuals import dense_residuals
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
-from mjfim.identification.residuals import FitProblem
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.recording import Recording
 from tests.support.paths import ROOT
@@ -109,7 +110,7 @@ def test_every_recording_has_a_separate_bias(base: mjfim.Experiment) -> None:
     alone = identify_system(task.system, recordings[:1])
     assert alone.theta[j] == pytest.approx(found.theta[j], abs=0.01)
     fit = FitProblem.of(task.system, recordings)
-    H = fit.dense(fit.begin(found.theta)).J
+    H = dense_residuals(fit, fit.begin(found.theta)).J
     order = [*range(3), 3]  # m, l, c, the first recording's bias
     covariance = np.linalg.inv(H.T @ H)
     np.testing.assert_allclose(found.std, np.sqrt(np.diag(covariance))[order], rtol=0.02)

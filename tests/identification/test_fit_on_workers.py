@@ -13,8 +13,8 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import segment_simulation
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
-from mjfim.identification.residuals import FitProblem
 from mjfim.identification.task import FitTask
 from tests.support.executors import LosingThreads, move_to, processes
 from tests.support.paths import MODELS

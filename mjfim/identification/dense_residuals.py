@@ -1,0 +1,81 @@
+"""All rows of a linearised problem at once, for small problems and tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.optimize.levenberg_marquardt import UnknownValues
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Residuals:
+    """All rows of a linearised problem.
+
+    Whitened residuals of the recordings come first, then priors, then pins.
+
+    Attributes:
+        r: (n,) residuals [standard deviations].
+        J: (n, c + P n_private) derivatives by the common unknowns, then by the private ones of each
+            segment.
+    """
+
+    r: Array
+    J: Array
+
+
+def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
+    """All rows without a loss: recordings first, then priors and pins.
+
+    Args:
+        problem: The problem.
+        at: The unknowns.
+
+    Returns:
+        Residuals with their derivatives; None where a perturbed simulation diverges.
+    """
+    n = problem.simulation.private_count
+    residuals = []
+    jacobians = []
+
+    simulated = problem.simulation.rows(at, derivatives=True, step=problem.difference_step)
+    for rows in simulated:
+        if rows is None:
+            return None
+        found = problem.whitened.linearised(rows)
+        residuals.append(found.r)
+        jacobians.append(_wide_jacobian(problem, found.J[:, n:], found.J[:, :n], rows.segment))
+
+    common_rows = problem.prior_rows.common(at)
+    no_private = np.zeros((len(common_rows), n))
+    residuals.append(common_rows[:, -1])
+    jacobians.append(_wide_jacobian(problem, common_rows[:, :-1], no_private, 0))
+
+    for segment, private_rows in enumerate(problem.prior_rows.private(at)):
+        common, private = private_rows[:, n:-1], private_rows[:, :n]
+        residuals.append(private_rows[:, -1])
+        jacobians.append(_wide_jacobian(problem, common, private, segment))
+
+    return Residuals(r=np.concatenate(residuals), J=np.concatenate(jacobians))
+
+
+def _wide_jacobian(problem: FitProblem, common: Array, private: Array, segment: int) -> Array:
+    """(k, c + P n) derivatives by all unknowns, for rows of one segment.
+
+    Args:
+        problem: The problem.
+        common: (k, c) derivatives by the common unknowns.
+        private: (k, n) derivatives by the private unknowns of the segment.
+        segment: Index of the segment.
+    """
+    n = private.shape[1]
+    c = common.shape[1]
+    first = c + segment * n
+
+    wide = np.zeros((len(common), problem.unknown_count))
+    wide[:, :c] = common
+    wide[:, first : first + n] = private
+    return wide

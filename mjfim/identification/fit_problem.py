@@ -1,0 +1,518 @@
+"""The least-squares problem of an identification: whitened residuals and their linearisation.
+
+Predictions and measured values are compared at the times of the recordings. For the solver, the
+linearised rows are condensed block by block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import RecordingError
+from mjfim.experiment.system import System
+from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
+from mjfim.identification.batch_workers import BatchWork, BatchWorkers
+from mjfim.identification.fit_segments import has_free_starts, segments_of_fit
+from mjfim.identification.pins import Pins
+from mjfim.identification.prior_rows import PriorRows
+from mjfim.identification.residual_blocks import BlockDivision
+from mjfim.identification.segment_simulation import SegmentBatch, SegmentSimulation
+from mjfim.identification.segments import Segment, recorded_release
+from mjfim.identification.unknowns import UnknownLayout
+from mjfim.identification.whitened_rows import WhitenedRows
+from mjfim.information.null_space import NullSpace
+from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
+from mjfim.optimize.levenberg_marquardt import UnknownValues
+from mjfim.optimize.robust_losses import RobustLoss
+from mjfim.plant.noise import Noise
+from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
+from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
+
+T = TypeVar("T")
+
+# Number of stated samples of the longest recording along which difference steps are calibrated.
+CALIBRATION_SAMPLES = 1000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitProblem:
+    """Residuals of recordings as functions of the unknowns; a `levenberg_marquardt.Problem`.
+
+    Every segment has private unknowns: the deviations of its initial state, or its whole initial
+    state where that is measured. All other parameters are common unknowns.
+
+    Attributes:
+        simulation: Simulation of the segments.
+        masks: (M, ny) for every recording, True for the measured values that count.
+        noise: Noise of the outputs.
+        loss: Loss of a whitened residual.
+        pins: Combinations that no recording determines, and their values.
+        with_priors: Whether priors of the parameters count.
+        difference_step: Relative step of the two-sided differences of a linearisation.
+        workers: Does the work on batches of segments; None for this process.
+    """
+
+    simulation: SegmentSimulation
+    masks: tuple[np.ndarray, ...]
+    noise: Noise
+    loss: RobustLoss
+    pins: Pins
+    with_priors: bool
+    difference_step: float = SENSITIVITY_STEP
+    workers: BatchWorkers | None = None
+
+    @classmethod
+    def of(
+        cls, system: System, recordings: Sequence[Recording], *, data_only: bool = False
+    ) -> FitProblem:
+        """The problem that the `[fit]` table of a system's experiment states.
+
+        Args:
+            system: The system.
+            recordings: Recordings in SI units.
+            data_only: Whether to leave priors and bounds out.
+
+        Returns:
+            The problem.
+
+        Raises:
+            RecordingError: There is no recording, or one cannot be used.
+            ExperimentError: Parameters move the stated initial state, but the settings of the fit
+                take the initial state from the measured values.
+        """
+        if not recordings:
+            raise RecordingError("identify needs at least one recording")
+
+        settings = system.experiment.fit
+        parameters = system.parameters
+        stated_substeps = system.grid.substeps
+        system = on_grid_of(system, recordings)
+        aligned = tuple(align(system, recording) for recording in recordings)
+
+        # Difference steps depend on how strongly each parameter changes the recorded motion.
+        longest = max(aligned, key=lambda recording: len(recording.ctrl))
+        samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
+        system = _calibrated_along(system, longest, samples)
+
+        # The initial states of segments are not stated; they come from the measured values.
+        free_starts = has_free_starts(system)
+        segments, directions = segments_of_fit(system, aligned, free_starts)
+
+        masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
+        if not any(mask.any() for mask in masks):
+            raise RecordingError("the recordings contain no measured value after t = 0")
+
+        layout = UnknownLayout.of(
+            parameters, len(aligned), free_starts=free_starts, bounded=not data_only
+        )
+        simulation = SegmentSimulation(
+            system=system,
+            recordings=aligned,
+            segments=segments,
+            layout=layout,
+            start_directions=directions,
+        )
+        return cls(
+            simulation=simulation,
+            masks=masks,
+            noise=system.noise,
+            loss=RobustLoss(kind=settings.loss, scale=settings.loss_scale),
+            pins=Pins.none(parameters),
+            with_priors=not data_only,
+        )
+
+    # ---- variants
+
+    def on_workers(self, workers: BatchWorkers) -> FitProblem:
+        """This problem, the batches of which are simulated by workers.
+
+        Args:
+            workers: The workers.
+        """
+        return replace(self, workers=workers)
+
+    def unbounded(self) -> FitProblem:
+        """This problem without bounds."""
+        return replace(self, simulation=self.simulation.with_layout(self.layout.unbounded()))
+
+    def with_shared_held(self) -> FitProblem:
+        """This problem with all shared parameters held, so that it needs no pins."""
+        simulation = self.simulation.with_layout(self.layout.without_shared())
+        return replace(self, simulation=simulation, pins=self.pins.released())
+
+    def with_noise(self, noise: Noise) -> FitProblem:
+        """This problem with other noise.
+
+        Args:
+            noise: Noise of the outputs.
+
+        Returns:
+            The problem.
+        """
+        return replace(self, noise=noise)
+
+    def with_longer_differences(self, factor: float) -> FitProblem:
+        """This problem with longer steps of the differences that linearise it.
+
+        They give the slope of the trend where contacts, dry friction or chaos make the residuals
+        rough, and are less accurate where the residuals are smooth.
+
+        Args:
+            factor: Factor by which the steps are longer.
+
+        Returns:
+            The problem.
+        """
+        return replace(self, difference_step=factor * self.difference_step)
+
+    def of_segments(self, indices: np.ndarray) -> FitProblem:
+        """The problem of some segments only; only their rows count.
+
+        Args:
+            indices: Indices of the segments.
+
+        Returns:
+            The problem.
+        """
+        simulation = self.simulation.of_segments(indices)
+
+        masks = tuple(np.zeros_like(mask) for mask in self.masks)
+        for segment in simulation.segments:
+            rows = segment.rows
+            masks[segment.recording][rows] = self.masks[segment.recording][rows]
+
+        return replace(self, simulation=simulation, masks=masks)
+
+    def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
+        """This problem with some measured values only.
+
+        Args:
+            masks: (M, ny) for every recording, True for values that may count.
+
+        Returns:
+            The problem of the values that count in both.
+        """
+        both = tuple(mask & counted for mask, counted in zip(masks, self.masks, strict=True))
+        return replace(self, masks=both)
+
+    def pinned(self, theta: Array, null_space: NullSpace) -> FitProblem:
+        """This problem with the combinations of parameters held that no recording determines.
+
+        Args:
+            theta: (p,) parameters at which the combinations are held.
+            null_space: Directions of theta about which there is no information.
+
+        Returns:
+            The problem.
+        """
+        return replace(self, pins=Pins.of(self.system.parameters, theta, null_space))
+
+    # ---- sizes
+
+    @property
+    def system(self) -> System:
+        """The system, its difference steps calibrated along the longest recording."""
+        return self.simulation.system
+
+    @property
+    def recordings(self) -> tuple[AlignedRecording, ...]:
+        """The recordings on the sample grid."""
+        return self.simulation.recordings
+
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        """The segments."""
+        return self.simulation.segments
+
+    @property
+    def layout(self) -> UnknownLayout:
+        """Layout of the unknowns."""
+        return self.simulation.layout
+
+    @property
+    def sample_count(self) -> int:
+        """Number of samples of all segments together."""
+        return self.simulation.sample_count
+
+    @property
+    def row_count(self) -> int:
+        """Number of rows of all recordings."""
+        return sum(len(recording.t) for recording in self.recordings)
+
+    @property
+    def value_count(self) -> int:
+        """Number of measured values that count."""
+        return int(sum(mask.sum() for mask in self.masks))
+
+    @property
+    def unknown_count(self) -> int:
+        """Number of all unknowns."""
+        return self.layout.column_count + len(self.segments) * self.simulation.private_count
+
+    @property
+    def segments_with_values(self) -> np.ndarray:
+        """Indices of the segments that contain a measured value that counts."""
+        indices = []
+        for i, segment in enumerate(self.segments):
+            if self.masks[segment.recording][segment.rows].any():
+                indices.append(i)
+
+        return np.array(indices, dtype=np.intp)
+
+    @cached_property
+    def blocks(self) -> BlockDivision:
+        """Division of the rows into blocks."""
+        return BlockDivision(segments=self.segments, row_count=self.row_count)
+
+    @cached_property
+    def whitened(self) -> WhitenedRows:
+        """Comparison of simulated rows with the measured values that count."""
+        return WhitenedRows(simulation=self.simulation, masks=self.masks, noise=self.noise)
+
+    @cached_property
+    def prior_rows(self) -> PriorRows:
+        """Rows of priors and pins."""
+        return PriorRows(simulation=self.simulation, pins=self.pins, with_priors=self.with_priors)
+
+    # ---- unknowns
+
+    @property
+    def lower(self) -> Array:
+        """(c,) lower bounds of the common unknowns."""
+        return self.layout.lower
+
+    @property
+    def upper(self) -> Array:
+        """(c,) upper bounds of the common unknowns."""
+        return self.layout.upper
+
+    def begin(self, theta: Array) -> UnknownValues:
+        """Unknowns at given parameters, with every initial state as stated or measured.
+
+        Args:
+            theta: (p,) parameters.
+
+        Returns:
+            The unknowns.
+        """
+        return self.layout.begin(theta, len(self.segments), self.simulation.private_count)
+
+    def common_values(self, at: UnknownValues) -> Array:
+        """Values of the common unknowns.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (c,) values.
+        """
+        return self.layout.common_values(at)
+
+    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
+        """The unknowns after a fraction of a step, clipped to the bounds.
+
+        Args:
+            at: The unknowns.
+            step: Step of all unknowns.
+            fraction: Fraction of the step.
+
+        Returns:
+            The moved unknowns.
+        """
+        return self.layout.moved(at, step, fraction)
+
+    def theta(self, at: UnknownValues) -> Array:
+        """Parameters, with the values of the first recording.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (p,) parameters [theta-unit].
+        """
+        return self.layout.theta(at)
+
+    # ---- residuals
+
+    def predict(self, at: UnknownValues) -> list[Array] | None:
+        """Predicted outputs of every recording at its times.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (M, ny) outputs of every recording [y-unit]; None where a simulation diverges.
+        """
+        return self.simulation.predict(at)
+
+    def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
+        """The fitted motion of one recording.
+
+        Args:
+            at: The unknowns.
+            recording: Index of the recording.
+
+        Returns:
+            The motion; None where it diverges.
+        """
+        return self.simulation.motion(at, recording)
+
+    def errors(self, predicted: Sequence[Array]) -> list[Array]:
+        """Predicted minus measured values of every output, for all recordings in their order.
+
+        Args:
+            predicted: (M, ny) predicted outputs of every recording [y-unit].
+
+        Returns:
+            One array for each output [y-unit].
+        """
+        data = zip(predicted, self.recordings, self.masks, strict=True)
+        differences = [(y - recording.y, mask) for y, recording, mask in data]
+
+        errors = []
+        for j in range(len(self.system.outputs)):
+            parts = [difference[mask[:, j], j] for difference, mask in differences]
+            errors.append(np.concatenate(parts))
+        return errors
+
+    def cost(self, at: UnknownValues) -> float:
+        """Half of the sum of the residuals' loss and of the squared priors and pins.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            The cost; infinite where a simulation diverges.
+        """
+        total = 0.0
+        batches = self.simulation.batches(derivatives=False)
+        for losses in self._of_batches(FitProblem.losses_of_batch, batches, at):
+            if losses is None:
+                return np.inf
+            for loss in losses:
+                total += loss
+
+        common = self.prior_rows.common(at)[:, -1]
+        private = self.prior_rows.private(at)[:, :, -1]
+        return 0.5 * (total + float(common @ common) + float(np.sum(private**2)))
+
+    def condense(self, at: UnknownValues) -> Condensed | None:
+        """Linearise about the unknowns and condense block by block.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            The linearisation; None where a perturbed simulation diverges.
+        """
+        m = self.simulation.private_count + self.layout.column_count + 1
+        blocks = np.zeros((self.blocks.count, m, m))
+
+        batches = self.simulation.batches(derivatives=True, step=self.difference_step)
+        for found in self._of_batches(FitProblem.blocks_of_batch, batches, at):
+            if found is None:
+                return None
+            for index, block in found.items():
+                blocks[index] = block
+
+        return Condensed(
+            blocks=blocks,
+            segment_of_block=self.blocks.segment_of_block,
+            private_rows=self.prior_rows.private(at),
+            common_rows=self.prior_rows.common(at),
+        )
+
+    def losses_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[float] | None:
+        """Loss of the residuals of a batch, which the cost adds in this order.
+
+        Args:
+            at: The unknowns.
+            batch: The batch.
+
+        Returns:
+            The losses; None where a simulation diverges.
+        """
+        losses = []
+        for rows in self.simulation.rows_of_batch(at, batch):
+            if rows is None:
+                return None
+            losses.append(self.loss.value(self.whitened.residual(rows)))
+        return losses
+
+    def blocks_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> dict[int, Array] | None:
+        """Condensed blocks of a batch, all of whose rows are in it.
+
+        Args:
+            at: The unknowns.
+            batch: The batch, with derivatives.
+
+        Returns:
+            (m, m) triangle of each block by its index; None where a perturbed simulation diverges.
+        """
+        m = self.simulation.private_count + self.layout.column_count + 1
+        empty = np.zeros((m, m))
+        blocks: dict[int, Array] = {}
+        for rows in self.simulation.rows_of_batch(at, batch):
+            if rows is None:
+                return None
+
+            # A robust loss is linearised by weights (iteratively reweighted least squares).
+            found = self.whitened.linearised(rows)
+            weight = self.loss.weight(found.r)
+            weighted = np.concatenate([found.J, found.r[:, None]], axis=1) * weight[:, None]
+
+            # Values are added to the triangle of the block of their row.
+            block = self.blocks.of_rows(rows)[found.row]
+            edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
+            for first, last in pairwise(edges):
+                index = int(block[first])
+                joined = np.concatenate([blocks.get(index, empty), weighted[first:last]])
+                blocks[index] = triangle(joined)
+        return blocks
+
+    def _of_batches(
+        self, work: BatchWork[T], batches: Iterable[SegmentBatch], at: UnknownValues
+    ) -> Iterator[T | None]:
+        """Results of a work on batches, in the order of the batches.
+
+        Args:
+            work: `losses_of_batch` or `blocks_of_batch`.
+            batches: The batches.
+            at: The unknowns.
+        """
+        if self.workers is not None:
+            yield from self.workers.of_batches(self, work, list(batches), at)
+            return
+
+        for batch in batches:
+            yield work(self, at, batch)
+
+
+def _calibrated_along(system: System, recording: AlignedRecording, samples: int) -> System:
+    """The system with difference steps that suit the first samples of a recording."""
+    guess, control = system.parameters.guess, recording.ctrl[:samples]
+    nominal = system.plant.nominal_initial_state
+    begun = replace(
+        system, plant=system.plant.with_initial_state(recorded_release(system, recording))
+    )
+    calibrated = begun.calibrated(guess, control)
+    return replace(calibrated, plant=calibrated.plant.with_initial_state(nominal))
+
+
+def _counted_values(recording: AlignedRecording, free_starts: bool) -> np.ndarray:
+    """(M, ny) True for the measured values that count.
+
+    Those at a stated initial state do not count, because they contain no information.
+    """
+    mask = np.array(recording.measured)
+    if not free_starts:
+        mask[0] = False
+    return mask

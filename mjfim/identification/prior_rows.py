@@ -1,0 +1,99 @@
+"""Rows of priors and pins, which stand beside those of the recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.identification.pins import Pins
+from mjfim.identification.segment_simulation import SegmentSimulation
+from mjfim.optimize.levenberg_marquardt import UnknownValues
+
+# Standard deviation of the prior on a free initial state, relative to the natural sizes of the
+# state. This weak prior keeps components finite that no output determines.
+FREE_START_SIGMA = 1e3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PriorRows:
+    """Rows of priors and pins on the unknowns of a simulation.
+
+    Attributes:
+        simulation: Simulation of the segments.
+        pins: Combinations that no recording determines, and their values.
+        with_priors: Whether priors of the parameters count.
+    """
+
+    simulation: SegmentSimulation
+    pins: Pins
+    with_priors: bool
+
+    def common(self, at: UnknownValues) -> Array:
+        """Rows on the common unknowns.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (l, c+1) rows `[J, r]`.
+        """
+        layout = self.simulation.layout
+        rows = np.zeros((0, layout.column_count + 1))
+        if self.with_priors:
+            rows = layout.prior_rows(at)
+        if self._pins_involve_private:
+            return rows
+
+        residual = self.pins.residual(layout.theta(at))
+        columns = layout.to_columns(self.pins.rows, 0)
+        return np.concatenate([rows, np.column_stack([columns, residual])])
+
+    def private(self, at: UnknownValues) -> Array:
+        """Rows on the private unknowns of every segment.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (P, k, m) rows `[J_private, J_common, r]`.
+        """
+        system = self.simulation.system
+        layout = self.simulation.layout
+        n = self.simulation.private_count
+        m = n + layout.column_count + 1
+        count = len(self.simulation.segments)
+        diagonal = np.arange(n)
+
+        # A weak prior on a free initial state, for components that no output determines.
+        if layout.free_starts:
+            rows = np.zeros((count, n, m))
+            sigma = FREE_START_SIGMA * system.plant.sizes.state
+            rows[:, diagonal, diagonal] = 1.0 / sigma
+            rows[:, :, -1] = at.private / sigma
+            return rows
+        if not n:
+            return np.zeros((count, 0, m))
+
+        # Stated priors on the deviations of the initial state.
+        parameters = system.parameters
+        private = layout.private
+        weight = np.sqrt(np.diag(parameters.prior_information))[private] * self.with_priors
+        pin_count = len(self.pins.rows) if self._pins_involve_private else 0
+        rows = np.zeros((count, n + pin_count, m))
+        rows[:, diagonal, diagonal] = weight
+        rows[:, :n, -1] = weight * (at.private - parameters.guess[private])
+
+        # Pins that involve private unknowns belong to the first segment.
+        if pin_count:
+            rows[0, n:, :n] = self.pins.rows[:, private]
+            rows[0, n:, n:-1] = layout.to_columns(self.pins.rows, 0)
+            rows[0, n:, -1] = self.pins.residual(layout.theta(at))
+        return rows
+
+    @cached_property
+    def _pins_involve_private(self) -> bool:
+        """True where pins involve private unknowns."""
+        return bool(self.pins.rows[:, self.simulation.layout.private].any())

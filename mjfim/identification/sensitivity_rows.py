@@ -1,0 +1,81 @@
+"""Condensed rows of the whitened sensitivity of recordings by theta."""
+
+from __future__ import annotations
+
+from itertools import zip_longest
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import SimulationDivergedError
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.information.null_space import COARSER_STEP_FACTOR
+from mjfim.optimize.condensed_least_squares import triangle
+from mjfim.optimize.levenberg_marquardt import UnknownValues
+from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
+
+
+def sensitivity_rows(problem: FitProblem, at: UnknownValues) -> list[tuple[Array, Array]]:
+    """Condensed rows of the whitened sensitivity G, and their change with a longer step.
+
+    The longer difference step shows the error of the differences. Where the whole initial state is
+    free, rows are projected onto the complement of its derivatives.
+
+    Args:
+        problem: The problem.
+        at: The unknowns.
+
+    Returns:
+        (k, p) rows and (k, p) changes of every segment [standard deviations / theta-unit], k at
+        most 2p + 2n.
+
+    Raises:
+        SimulationDivergedError: A perturbed simulation diverges.
+    """
+    condensed = _condensed_sensitivity(problem, at)
+    n = problem.simulation.private_count if problem.layout.free_starts else 0
+
+    found = []
+    for segment in sorted(condensed):
+        J, change = np.split(condensed[segment], 2, axis=1)
+        by_theta = J[:, n:]
+        change_by_theta = change[:, n:]
+
+        # A free initial state explains everything in the span of its derivatives.
+        Q = np.linalg.qr(J[:, :n])[0]
+        remaining = by_theta - Q @ (Q.T @ by_theta)
+        remaining_change = change_by_theta - Q @ (Q.T @ change_by_theta)
+        found.append((remaining, remaining_change))
+    return found
+
+
+def _condensed_sensitivity(problem: FitProblem, at: UnknownValues) -> dict[int, Array]:
+    """Triangle of the whitened sensitivity and its change with a longer step, by segment.
+
+    Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes.
+    """
+    fine, coarse = (
+        problem.simulation.rows(
+            at, derivatives=True, central=True, step=step, by_all_parameters=True
+        )
+        for step in (SENSITIVITY_STEP, COARSER_STEP_FACTOR * SENSITIVITY_STEP)
+    )
+
+    condensed: dict[int, Array] = {}
+    for rows, coarse_rows in zip_longest(fine, coarse):
+        if rows is None:
+            name = problem.recordings[0].name
+            raise SimulationDivergedError(
+                f"{name}: the simulation diverges under the recorded control"
+            )
+
+        # Where the simulation with the longer step diverges, the change is unknown.
+        J = problem.whitened.sensitivity(rows)
+        change = np.zeros_like(J)
+        if coarse_rows is not None:
+            change = problem.whitened.sensitivity(coarse_rows) - J
+
+        both = np.concatenate([J, change], axis=1)
+        earlier = condensed.get(rows.segment, both[:0])
+        condensed[rows.segment] = triangle(np.concatenate([earlier, both]))
+    return condensed
