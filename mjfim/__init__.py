@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mjfim.output.live import live
     from mjfim.output.robot.export import export_design
     from mjfim.output.video.results import save_video
-    from mjfim.parallel import Pool, Workers
+    from mjfim.parallel import ExecutorLike, Pool, Workers
     from mjfim.records.campaign import Campaign
     from mjfim.records.check import Check
     from mjfim.records.comparison import Comparison
@@ -49,6 +49,7 @@ __all__ = [
     "Comparison",
     "Design",
     "Estimate",
+    "ExecutorLike",
     "Experiment",
     "MjfimError",
     "MonteCarloStudy",
@@ -93,6 +94,7 @@ MODULES = {
     "export_design": "mjfim.output.robot.export",
     "live": "mjfim.output.live",
     "save_video": "mjfim.output.video.results",
+    "ExecutorLike": "mjfim.parallel",
     "Pool": "mjfim.parallel",
     "Workers": "mjfim.parallel",
     "Campaign": "mjfim.records.campaign",

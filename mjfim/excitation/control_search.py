@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +29,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import verify
 from mjfim.information.smoothness import roughness
-from mjfim.parallel import LostWorkError
+from mjfim.parallel import ExecutorLike, LostWorkError
 from mjfim.records.design import Status
 
 # Largest number of searches, stopped on a coarse level, that are compared at the stated rate.
@@ -52,7 +51,7 @@ class ControlSearch:
 
     stage: DescentLevel
     first: DesignPoint
-    executor: Executor | None
+    executor: ExecutorLike | None
     budget: Budget
     limited: LimitedCost | None = None
     outside: OutsideStart | None = None

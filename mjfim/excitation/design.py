@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +22,7 @@ from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start
 from mjfim.experiment.schema import Experiment
-from mjfim.parallel import Workers, one_blas_thread
+from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.events import DesignCallback
@@ -37,7 +36,7 @@ def design(
     callback: DesignCallback | None = None,
     initial_control: Array | None = None,
     threads: int | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
 ) -> Design:
@@ -52,8 +51,9 @@ def design(
         initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's. The
             experiment's initial control remains the reference x_d of the tracking term.
         threads: Threads for simulations; default: one per core.
-        executor: Executor of the kind of `concurrent.futures` that runs several starts side by
-            side: under hard limits, and without them if there is a start for each worker.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
+            runs several starts side by side: under hard limits, and without them if there is a
+            start for each worker.
         stop: Token that ends the search early.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
@@ -99,7 +99,7 @@ def design_task(
     *,
     callback: DesignCallback | None = None,
     initial_control: Array | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     budget: Budget | None = None,
 ) -> Design:
     """Design the control of a task that is resolved already. See `design`.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,7 +20,7 @@ from mjfim.excitation.unconstrained import FreeState, UnconstrainedSearch
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import ModelVariant
-from mjfim.parallel import Workers, one_blas_thread
+from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.parallel.kept import KeptPerThread
 
 
@@ -92,7 +91,7 @@ def run_free_in_worker(order: FreeSlice) -> SearchSlice[FreeState]:
     return replace(found, result=replace(found.result, steps=search.steps))
 
 
-def has_a_start_for_each(executor: Executor, starts: Sequence[InitialControl]) -> bool:
+def has_a_start_for_each(executor: ExecutorLike, starts: Sequence[InitialControl]) -> bool:
     """Check whether starts side by side are quicker than one after the other with all threads.
 
     Args:
@@ -104,7 +103,7 @@ def has_a_start_for_each(executor: Executor, starts: Sequence[InitialControl]) -
 
 
 def run_free_starts(
-    executor: Executor,
+    executor: ExecutorLike,
     levels: Sequence[DescentLevel],
     starts: Sequence[InitialControl],
     budget: Budget,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +21,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
 from mjfim.information.marginal import shared
-from mjfim.parallel import Workers
+from mjfim.parallel import ExecutorLike, Workers
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.events import DesignCallback
@@ -37,7 +36,7 @@ def design_jointly(
     rounds: int = 5,
     tolerance: float = 1e-3,
     threads: int | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
 ) -> tuple[Design, ...]:
@@ -52,8 +51,8 @@ def design_jointly(
         rounds: Largest number of times that every experiment is designed.
         tolerance: Relative improvement of the criterion in one round below which the search ends.
         threads: Threads for simulations; default: one per core.
-        executor: Executor of `concurrent.futures` that runs several starts under hard limits side
-            by side.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. Each
+            design runs its starts side by side.
         stop: Token that ends the search with the best designs so far, as Ctrl-C does.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 

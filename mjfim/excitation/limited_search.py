@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +22,7 @@ from mjfim.excitation.merged_results import append_run
 from mjfim.excitation.random_search import LEAST_PROGRESS, PATIENCE, RandomSearch
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.task import DesignTask
+from mjfim.parallel import ExecutorLike
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 
@@ -52,7 +52,7 @@ class LimitedSearch:
 
     limited: LimitedCost
     is_rough: bool
-    executor: Executor | None
+    executor: ExecutorLike | None
     budget: Budget
 
     def run(self, starts: list[InitialControl], inside: InsideControl | None) -> Runs:

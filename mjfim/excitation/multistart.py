@@ -9,7 +9,7 @@ is evaluated; then it is optimised again within tighter limits.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
+from mjfim.parallel import ExecutorLike
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -61,7 +61,7 @@ class Multistart:
 
     fine: DescentLevel
     coarse: DescentLevel | None
-    executor: Executor | None = None
+    executor: ExecutorLike | None = None
     budget: Budget
     until_held_up: bool = False
     cost_to_beat: float = np.inf

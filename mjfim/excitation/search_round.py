@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
+from mjfim.parallel import ExecutorLike
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -50,7 +50,7 @@ class SearchRounds:
         cost_to_beat: Cost that random controls have reached, see `ConstrainedSearch`.
     """
 
-    executor: Executor | None
+    executor: ExecutorLike | None
     budget: Budget
     until_held_up: bool = False
     cost_to_beat: float = np.inf

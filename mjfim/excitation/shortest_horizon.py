@@ -8,7 +8,6 @@ that is shorter by the tolerance does not.
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
@@ -30,7 +29,7 @@ from mjfim.experiment.packing import opened
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
-from mjfim.parallel import Workers
+from mjfim.parallel import ExecutorLike, Workers
 from mjfim.recordings import formats
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
@@ -163,7 +162,7 @@ def shortest_experiment(
     tolerance: float | None = None,
     callback: Callback | None = None,
     threads: int | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
 ) -> ShortestExperiment:
@@ -181,8 +180,8 @@ def shortest_experiment(
         callback: Called with a `DesignEvent` for every iterate, and a `StudyEvent` for every
             duration that was tried.
         threads: Threads for simulations; default: one per core.
-        executor: Executor of `concurrent.futures` that runs several starts under hard limits side
-            by side.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. Each
+            design runs its starts side by side.
         stop: Token that ends the search with the shortest experiment so far, as Ctrl-C does.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
@@ -228,7 +227,7 @@ class _HorizonSearch:
         base: DesignTask,
         tolerance: float | None,
         callback: Callback | None,
-        executor: Executor | None,
+        executor: ExecutorLike | None,
         stop: StopToken,
     ) -> None:
         self.base = base

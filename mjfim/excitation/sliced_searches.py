@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 from mjfim.budget import Budget
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.search_slices import SearchSlice, SliceOrder
-from mjfim.parallel import Dispatch, Outcome, Workers
+from mjfim.parallel import Dispatch, ExecutorLike, Outcome, Workers
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 
@@ -19,7 +18,7 @@ Order = TypeVar("Order", bound=SliceOrder[Any])
 
 
 def run_in_slices(
-    executor: Executor,
+    executor: ExecutorLike,
     orders: Sequence[Order],
     function: Callable[[Order], SearchSlice[Any]],
     budget: Budget,

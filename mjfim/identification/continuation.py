@@ -25,7 +25,12 @@ from mjfim.identification.residual_tests import misfit_reasons
 from mjfim.identification.searches import FitSearch, quick_subset
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
-from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution, UnknownValues
+from mjfim.optimize.levenberg_marquardt import (
+    InterruptedPassError,
+    SearchSettings,
+    Solution,
+    UnknownValues,
+)
 from mjfim.records.estimate import Restart
 
 # Number of parts into which a recording is cut for the first fit, at most.
@@ -172,9 +177,12 @@ def _start_from_segments(
 
     all_lengths = segment_lengths(problem.recordings)
     for length in all_lengths:
+        if search.interrupted():
+            break
         part = _segment_problem(task, system, length)
         if part is None:
             continue
+        part = replace(part, workers=problem.workers)
         part = part.pinned(theta[places], _of_parameters(null_space, places))
         iterations = _iterations(problem, part, len(all_lengths))
         found = _fit_segments(search, part, theta[places], length, iterations)
@@ -184,11 +192,12 @@ def _start_from_segments(
         lengths.append(length)
         theta[places] = part.theta(found)
         unknowns = _of_whole(problem, theta, (part, found, places))
-        cost = problem.cost(unknowns)
+        try:
+            cost = problem.cost(unknowns)
+        except InterruptedPassError:
+            break
         if cost < best_cost:
             best, best_cost = unknowns, cost
-        if search.interrupted():
-            break
     return best, tuple(lengths)
 
 
@@ -276,9 +285,9 @@ def _iterations(problem: FitProblem, part: FitProblem, count: int) -> int:
 def _fit_segments(
     search: FitSearch, part: FitProblem, theta: Array, length: float, iterations: int
 ) -> UnknownValues | None:
-    """Unknowns of a fit over segments of a length [s]; None where it diverges at its start.
+    """Unknowns of a fit over segments of a length [s], with much data over some of them.
 
-    With much data, it uses some of the segments.
+    None where it diverges at its start, or is stopped there.
     """
     subset = quick_subset(part)
     some = part.of_segments(subset)
@@ -286,7 +295,10 @@ def _fit_segments(
         max_iterations=iterations, tolerance=SEGMENT_TOLERANCE, relinearise_at_end=False
     )
     phase = f"segments of {length:.2g} s"
-    found = search.minimise(some, some.begin(theta), settings, phase)
+    try:
+        found = search.minimise(some, some.begin(theta), settings, phase)
+    except InterruptedPassError:
+        return None
     return None if found is None else found.unknowns
 
 
@@ -314,7 +326,7 @@ def _of_whole(
 def _repeated(
     search: FitSearch, problem: FitProblem, start: UnknownValues, first: WholeFit
 ) -> WholeFit | None:
-    """A fit over whole recordings from a start; None where the simulation diverges.
+    """A fit over whole recordings from a start; None where it diverges, or is stopped at its begin.
 
     It goes on beyond some iterations only if its cost is lower than that of the first fit by then.
     """
@@ -326,7 +338,7 @@ def _repeated(
         if not ends_early and _cost(first, solution) < first.solution.cost:
             found = search.solve(problem, found[1].unknowns, "again all data")
         return WholeFit(problem=found[0], solution=found[1], quality=fit_quality(*found))
-    except SimulationDivergedError:
+    except (SimulationDivergedError, InterruptedPassError):
         return None
 
 

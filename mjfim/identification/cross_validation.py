@@ -7,6 +7,7 @@ the other parts. The initial state of a predicted part is estimated from that pa
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,12 @@ from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
+from mjfim.optimize.levenberg_marquardt import (
+    InterruptedPassError,
+    SearchSettings,
+    UnknownValues,
+    minimise,
+)
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.progress import begin_stage
@@ -88,17 +94,27 @@ def predict_unfitted(
     Returns:
         The predictions.
     """
-    if held_out is None:
-        return tuple(_cross_validate(problem, at, budget))
+    found = (
+        _cross_validate(problem, at, budget)
+        if held_out is None
+        else _predict_held_out(held_out, at, budget)
+    )
+    predictions: list[Prediction] = []
+    with suppress(InterruptedPassError):
+        predictions.extend(found)
+    return tuple(predictions)
 
-    predictions = []
+
+def _predict_held_out(
+    held_out: FitProblem, at: UnknownValues, budget: Budget
+) -> Iterator[Prediction]:
+    """Prediction of every held-out recording."""
     for i in range(len(held_out.recordings)):
         if budget.exhausted is not None:
-            break
+            return
         begin_stage("predicting held-out recordings", i, len(held_out.recordings))
         part = _Part(recordings=(i,), masks=_masks_of(held_out.masks, [i]))
-        predictions.append(_prediction(held_out, at.theta, part, True, budget))
-    return tuple(predictions)
+        yield _prediction(held_out, at.theta, part, True, budget)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -349,9 +349,17 @@ class FitProblem:
             at: The unknowns.
 
         Returns:
-            (M, ny) outputs of every recording [y-unit]; None where a simulation diverges.
+            (M, ny) outputs of every recording [y-unit], NaN in rows without a segment; None where a
+            simulation diverges.
         """
-        return self.simulation.predict(at)
+        outputs = [np.full(recording.y.shape, np.nan) for recording in self.recordings]
+        batches = self.simulation.batches(derivatives=False)
+        for found in self.of_batches(FitProblem.outputs_of_batch, batches, at):
+            if found is None:
+                return None
+            for part in found:
+                outputs[self.segments[part.segment].recording][part.rows] = part.y
+        return outputs
 
     def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
         """The fitted motion of one recording.
@@ -394,7 +402,7 @@ class FitProblem:
         """
         total = 0.0
         batches = self.simulation.batches(derivatives=False)
-        for losses in self._of_batches(FitProblem.losses_of_batch, batches, at):
+        for losses in self.of_batches(FitProblem.losses_of_batch, batches, at):
             if losses is None:
                 return np.inf
             for loss in losses:
@@ -417,7 +425,7 @@ class FitProblem:
         blocks = np.zeros((self.blocks.count, m, m))
 
         batches = self.simulation.batches(derivatives=True, step=self.difference_step)
-        for found in self._of_batches(FitProblem.blocks_of_batch, batches, at):
+        for found in self.of_batches(FitProblem.blocks_of_batch, batches, at):
             if found is None:
                 return None
             for index, block in found.items():
@@ -429,6 +437,23 @@ class FitProblem:
             private_rows=self.prior_rows.private(at),
             common_rows=self.prior_rows.common(at),
         )
+
+    def outputs_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[SegmentRows] | None:
+        """Predicted outputs of a batch.
+
+        Args:
+            at: The unknowns.
+            batch: The batch.
+
+        Returns:
+            The rows of its segments; None where a simulation diverges.
+        """
+        predicted = []
+        for rows in self.simulation.rows_of_batch(at, batch):
+            if rows is None:
+                return None
+            predicted.append(rows)
+        return predicted
 
     def losses_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[float] | None:
         """Loss of the residuals of a batch, which the cost adds in this order.
@@ -478,7 +503,7 @@ class FitProblem:
                 blocks[index] = triangle(joined)
         return blocks
 
-    def _of_batches(
+    def of_batches(
         self, work: BatchWork[T], batches: Iterable[SegmentBatch], at: UnknownValues
     ) -> Iterator[T | None]:
         """Results of a work on batches, in the order of the batches.

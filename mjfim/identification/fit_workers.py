@@ -10,115 +10,43 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.batch_workers import BatchWork
+from mjfim.identification.fit_orders import (
+    KEPT_PROBLEMS,
+    BatchOrder,
+    PartOrder,
+    ProblemOrder,
+    SearchOrder,
+)
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.pins import Pins
-from mjfim.identification.segment_simulation import SegmentBatch, SegmentSimulation
-from mjfim.identification.segments import Segment
-from mjfim.identification.unknowns import UnknownLayout
+from mjfim.identification.segment_simulation import SegmentBatch
 from mjfim.optimize.levenberg_marquardt import (
+    InterruptedPassError,
     SearchSettings,
     Solution,
     UnknownValues,
     minimise,
 )
-from mjfim.optimize.robust_losses import RobustLoss
-from mjfim.parallel import Workers, one_blas_thread, pool_stop_token, results_or_here
+from mjfim.parallel import (
+    ExecutorLike,
+    Workers,
+    one_blas_thread,
+    pool_stop_token,
+    results_or_here,
+)
 from mjfim.parallel.kept import KeptPerThread
-from mjfim.parallel.shared_value import SharedValue, require_values
-from mjfim.plant.noise import Noise
+from mjfim.parallel.shared_value import SharedValue
 
 T = TypeVar("T")
-
-# Number of problems that a worker keeps: a fit has variants with other noise or other segments.
-KEPT_PROBLEMS = 8
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _ProblemOrder:
-    """A problem for the segments of some of its recordings. It can be pickled.
-
-    Attributes:
-        system: The system.
-        recordings: Each of the recordings that are needed, by its index.
-        masks: (M, ny) measured values of these recordings that count.
-        row_counts: Number of rows M of every recording.
-        segments: All segments of the problem.
-        layout: Layout of the unknowns.
-        start_directions: (nx, n) directions of the initial state.
-        noise: Noise of the outputs.
-        loss: Loss of a whitened residual.
-        pins: Combinations that no recording determines.
-        with_priors: Whether priors count.
-        difference_step: Relative step of the differences.
-    """
-
-    system: SharedValue[SystemOrder]
-    recordings: dict[int, SharedValue[AlignedRecording]]
-    masks: dict[int, np.ndarray]
-    row_counts: tuple[int, ...]
-    segments: tuple[Segment, ...]
-    layout: UnknownLayout
-    start_directions: Array
-    noise: Noise
-    loss: RobustLoss
-    pins: Pins
-    with_priors: bool
-    difference_step: float
-
-    def problem(self) -> FitProblem:
-        """Make the problem; recordings that are not needed are empty."""
-        require_values([self.system, *self.recordings.values()])
-        system = _worker_systems.get(self.system.digest, lambda: self.system.value.system())
-
-        ny = len(system.outputs)
-        known = self.recordings
-        recordings = [
-            known[i].value if i in known else _without_values(count, ny)
-            for i, count in enumerate(self.row_counts)
-        ]
-        masks = [
-            self.masks[i] if i in known else np.broadcast_to(False, (count, ny))
-            for i, count in enumerate(self.row_counts)
-        ]
-        simulation = SegmentSimulation(
-            system=system,
-            recordings=tuple(recordings),
-            segments=self.segments,
-            layout=self.layout,
-            start_directions=self.start_directions,
-        )
-        return FitProblem(
-            simulation=simulation,
-            masks=tuple(masks),
-            noise=self.noise,
-            loss=self.loss,
-            pins=self.pins,
-            with_priors=self.with_priors,
-            difference_step=self.difference_step,
-        )
-
-
-def _without_values(rows: int, outputs: int) -> AlignedRecording:
-    """A recording of a length without contents, which takes no memory."""
-    return AlignedRecording(
-        name="",
-        t=np.broadcast_to(0.0, (rows,)),
-        y=np.broadcast_to(np.nan, (rows, outputs)),
-        ctrl=np.zeros((0, 0)),
-        dt=1.0,
-        on_grid=True,
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -137,65 +65,31 @@ class _Found(Generic[T]):
 # ---- in a worker
 
 
-# The latest systems of a worker, by the hash of their order.
-_worker_systems: KeptPerThread[System] = KeptPerThread(KEPT_PROBLEMS)
-
-# The latest problems of a worker, by the hash of their order.
+# The latest problems of a worker, by the hash of their part.
 _worker_problems: KeptPerThread[FitProblem] = KeptPerThread(KEPT_PROBLEMS)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _BatchOrder(Generic[T]):
-    """Work on one batch.
-
-    Attributes:
-        problem: The problem, with the recordings of the batch.
-        work: Method of the problem that does the work.
-        batch: The batch.
-        at: The unknowns.
-    """
-
-    problem: SharedValue[_ProblemOrder]
-    work: BatchWork[T]
-    batch: SegmentBatch
-    at: UnknownValues
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SearchOrder:
-    """Search from one start.
-
-    Attributes:
-        problem: The problem, with all its recordings.
-        begin: Unknowns at which the search begins.
-        settings: Tolerance and number of iterations.
-    """
-
-    problem: SharedValue[_ProblemOrder]
-    begin: UnknownValues
-    settings: SearchSettings
-
-
-def _problem_of(order: SharedValue[_ProblemOrder]) -> FitProblem:
+def _problem_of(order: SharedValue[PartOrder]) -> FitProblem:
     """The problem of an order in a worker, made at its first order."""
-    return _worker_problems.get(order.digest, lambda: order.value.problem())
+    return _worker_problems.get(order.digest, lambda: order.value.made())
 
 
 @one_blas_thread()
-def _work_on_batch(order: _BatchOrder[T]) -> _Found[T | None]:
+def _work_on_batch(order: BatchOrder[T]) -> _Found[T | None]:
     """Do the work on one batch in a worker process."""
-    problem = _problem_of(order.problem)
-    return _counted(problem, lambda: order.work(problem, order.at, order.batch))
+    problem = _problem_of(order.part)
+    at = order.unknowns(len(problem.segments))
+    return _counted(problem, lambda: order.work(problem, at, order.batch))
 
 
 @one_blas_thread()
-def _search_in_worker(order: _SearchOrder) -> _Found[Solution | None]:
+def _search_in_worker(order: SearchOrder) -> _Found[Solution | None]:
     """Search from one start in a worker process."""
-    problem = _problem_of(order.problem)
+    problem = _problem_of(order.part)
     return _counted(problem, lambda: _search(problem, order, pool_stop_token()))
 
 
-def _search(problem: FitProblem, order: _SearchOrder, stop: StopToken) -> Solution | None:
+def _search(problem: FitProblem, order: SearchOrder, stop: StopToken) -> Solution | None:
     """Search from one start; None where the simulation diverges there."""
     return minimise(problem, order.begin, order.settings, Budget(stop=stop))
 
@@ -215,11 +109,19 @@ class FitWorkers:
 
     Args:
         executor: Executor of the workers.
+        stop: Token whose request ends a pass over the data that is running.
     """
 
-    def __init__(self, executor: Any) -> None:
+    def __init__(self, executor: ExecutorLike, stop: StopToken | None = None) -> None:
         self._executor = Workers.of(executor)
-        self._orders: _Orders = WeakKeyDictionary()
+        self._stop = StopToken() if stop is None else stop
+
+        # Orders of each problem, by the threads of a worker, and the segments of a part.
+        self._orders: WeakKeyDictionary[FitProblem, dict[int, SharedValue[ProblemOrder]]]
+        self._orders = WeakKeyDictionary()
+        self._parts: WeakKeyDictionary[
+            FitProblem, dict[tuple[int, ...], SharedValue[PartOrder]]
+        ] = WeakKeyDictionary()
 
         # Variants of a problem have the same systems and recordings.
         self._systems: dict[tuple[int, int], tuple[System, SharedValue[SystemOrder]]] = {}
@@ -239,21 +141,24 @@ class FitWorkers:
             return [work(problem, at, batch) for batch in batches]
 
         threads = self._executor.threads_for(len(batches))
-        orders = []
-        for batch in batches:
-            needed = {problem.segments[i].recording for i in batch.segments}
-            shared = self._order_of(problem, sorted(needed), threads)
-            orders.append(_BatchOrder(problem=shared, work=work, batch=batch, at=at))
+        orders = [
+            BatchOrder.of(self._part_of(problem, batch.segments, threads), work, batch, at)
+            for batch in batches
+        ]
 
-        def here(order: _BatchOrder[T]) -> _Found[T | None]:
+        def here(order: BatchOrder[T]) -> _Found[T | None]:
             """Do the work of a lost worker; its steps are counted by the simulator."""
             return _Found(result=work(problem, at, order.batch), steps=0)
 
-        # A pass is completed, as in a single process: the search stops between two passes.
+        # A pass that begins after the request is one that the result needs.
+        stop = StopToken() if self._stop.requested else self._stop
         results: Iterator[_Found[T | None]] = results_or_here(
-            self._executor, _work_on_batch, orders, Budget(), here
+            self._executor, _work_on_batch, orders, Budget(stop=stop), here
         )
-        return [_counted_here(problem, found) for found in results]
+        found = [_counted_here(problem, each) for each in results]
+        if len(found) < len(orders):
+            raise InterruptedPassError
+        return found
 
     def solutions(
         self,
@@ -263,37 +168,44 @@ class FitWorkers:
         budget: Budget,
     ) -> Iterator[Solution | None]:
         """Search from several starts. See `batch_workers.BatchWorkers`."""
-        needed = {segment.recording for segment in problem.segments}
         threads = self._executor.threads_for(len(begins))
-        shared = self._order_of(problem, sorted(needed), threads)
-        orders = [_SearchOrder(problem=shared, begin=begin, settings=settings) for begin in begins]
+        part = self._part_of(problem, range(len(problem.segments)), threads)
+        orders = [SearchOrder(part=part, begin=begin, settings=settings) for begin in begins]
         alone = replace(problem, workers=None)
 
-        def here(order: _SearchOrder) -> _Found[Solution | None]:
+        def here(order: SearchOrder) -> _Found[Solution | None]:
             """Search from the start of a lost worker; its steps are counted by the simulator."""
             return _Found(result=_search(alone, order, budget.stop), steps=0)
 
         for found in results_or_here(self._executor, _search_in_worker, orders, budget, here):
             yield _counted_here(problem, found)
 
-    def _order_of(
-        self, problem: FitProblem, needed: Sequence[int], threads: int
-    ) -> SharedValue[_ProblemOrder]:
-        """The order for a problem with some of its recordings, made once."""
-        known = self._orders.setdefault(problem, {})
-        key = (threads, *needed)
+    def _part_of(
+        self, problem: FitProblem, segments: Sequence[int], threads: int
+    ) -> SharedValue[PartOrder]:
+        """The order for some segments of a problem, made once."""
+        known = self._parts.setdefault(problem, {})
+        key = (threads, *segments)
         if key not in known:
-            known[key] = SharedValue(uuid.uuid4().hex, self._made(problem, needed, threads))
+            shared = self._problem_order(problem, threads)
+            part = PartOrder.of(problem, segments, shared, self._shared_recording)
+            known[key] = SharedValue(uuid.uuid4().hex, part)
         return known[key]
 
-    def _made(self, problem: FitProblem, needed: Sequence[int], threads: int) -> _ProblemOrder:
-        """The order for a problem with some of its recordings."""
-        return _ProblemOrder(
+    def _problem_order(self, problem: FitProblem, threads: int) -> SharedValue[ProblemOrder]:
+        """What all parts of a problem have in common, made once."""
+        known = self._orders.setdefault(problem, {})
+        if threads not in known:
+            known[threads] = SharedValue(uuid.uuid4().hex, self._made(problem, threads))
+        return known[threads]
+
+    def _made(self, problem: FitProblem, threads: int) -> ProblemOrder:
+        """Describe what all parts of a problem have in common."""
+        rows = [segment.rows.stop - segment.rows.start for segment in problem.segments]
+        return ProblemOrder(
             system=self._shared_system(problem.system, threads),
-            recordings={i: self._shared_recording(problem.recordings[i]) for i in needed},
-            masks={i: problem.masks[i] for i in needed},
             row_counts=tuple(len(recording.t) for recording in problem.recordings),
-            segments=problem.segments,
+            segment_rows=np.array(rows),
             layout=problem.layout,
             start_directions=problem.simulation.start_directions,
             noise=problem.noise,
@@ -319,10 +231,6 @@ class FitWorkers:
             size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
             self._recordings[recording] = SharedValue(uuid.uuid4().hex, recording, size)
         return self._recordings[recording]
-
-
-# Orders of each problem, by the threads of a worker and the recordings that are needed.
-_Orders = WeakKeyDictionary[FitProblem, dict[tuple[int, ...], SharedValue[_ProblemOrder]]]
 
 
 def _counted_here(problem: FitProblem, found: _Found[T]) -> T:

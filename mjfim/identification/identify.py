@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -29,12 +29,14 @@ from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import FitTask, Method
 from mjfim.information.null_space import NullSpace, find_null_space
 from mjfim.optimize.levenberg_marquardt import (
+    InterruptedPassError,
     SearchSettings,
     Solution,
     UnknownValues,
+    completed,
     minimise,
 )
-from mjfim.parallel import one_blas_thread
+from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
@@ -56,7 +58,7 @@ def identify(
     threads: int | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
-    executor: Any = None,
+    executor: ExecutorLike | None = None,
 ) -> Estimate:
     """Estimate parameters from recordings, with the settings of the table `[fit]`.
 
@@ -75,8 +77,8 @@ def identify(
         threads: Threads for the engine; default: one per core.
         stop: Token that ends the search with the best result so far.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
-        executor: Executor that simulates parts of much data and searches from several starts side
-            by side, such as `mjfim.Pool` or a Dask `Client`; the estimate does not depend on it.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
+            simulates parts of much data and searches from several starts side by side.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -102,7 +104,7 @@ def identify_system(
     held_out: Sequence[Recording] = (),
     callback: Callback | None = None,
     stop: StopToken | None = None,
-    executor: Any = None,
+    executor: ExecutorLike | None = None,
 ) -> Estimate:
     """Estimate the parameters of a resolved system.
 
@@ -114,7 +116,7 @@ def identify_system(
         held_out: Recordings that are predicted, not fitted.
         callback: Called with every iterate.
         stop: Token that ends the search with the best result so far.
-        executor: Executor that simulates parts of much data side by side; None for this process.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -133,7 +135,7 @@ def identify_task(
     *,
     callback: Callback | None = None,
     stop: StopToken | None = None,
-    executor: Any = None,
+    executor: ExecutorLike | None = None,
 ) -> Estimate:
     """Estimate the parameters of a task. See `identify`.
 
@@ -141,7 +143,7 @@ def identify_task(
         task: System, recordings and settings.
         callback: Called with every iterate.
         stop: Token that ends the search with the best result so far.
-        executor: Executor that simulates parts of much data side by side; None for this process.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process.
 
     Returns:
         The estimate with its accuracy and warnings.
@@ -155,27 +157,29 @@ def identify_task(
 
     with one_blas_thread(), stop_on_interrupt(stop) as token:
         problem = task.problem()
-        if executor is not None:
-            problem = problem.on_workers(FitWorkers(executor))
         held_out = task.held_out_problem()
+        if executor is not None:
+            workers = FitWorkers(executor, token)
+            problem = problem.on_workers(workers)
+            held_out = None if held_out is None else held_out.on_workers(workers)
         search = FitSearch(task=task, budget=Budget(stop=token), callback=callback)
 
         # With much data, the search begins on a subset of the segments.
         begin_stage("simulating the segments from the initial guess")
         subset = quick_subset(problem)
         begin = problem.begin(task.start)
-        _require_finite_cost(task, problem, subset, begin)
+        completed(partial(_require_finite_cost, task, problem, subset, begin))
 
         begin_stage("testing what the recordings determine")
 
         # Combinations of parameters that no recording determines are held at their start values.
-        null_space = _unseen_directions(task, problem.of_segments(subset))
+        part = problem.of_segments(subset)
+        null_space = completed(partial(_unseen_directions, task, part))
         problem = problem.pinned(task.start, null_space)
 
         # Short searches from several starts avoid local minima. The best result continues over
         # all data.
-        begin = search.best_start(problem, subset, begin)
-        first = search.solve(problem, begin)
+        problem, subset, first = _first_fit(search, problem, subset, begin)
 
         # A result that does not explain the data may be a local minimum. Fits over short segments
         # then give another start, and the better one of the two results is kept.
@@ -244,6 +248,40 @@ def newton_raphson(problem: FitProblem, start: Array, budget: Budget | None = No
         SimulationDivergedError: The simulation diverges at the start.
     """
     return least_squares(problem.unbounded(), start, NEWTON, budget)
+
+
+def _first_fit(
+    search: FitSearch, problem: FitProblem, subset: np.ndarray, begin: UnknownValues
+) -> tuple[FitProblem, np.ndarray, tuple[FitProblem, Solution]]:
+    """The fit from the best start.
+
+    After a request to stop before the first pass over all data is complete, it is a fit to the
+    subset alone.
+
+    Args:
+        search: The searches of the identification.
+        problem: Problem of all segments.
+        subset: Indices of segments that are quick to simulate.
+        begin: Unknowns at the stated start.
+
+    Returns:
+        The problem that was solved, its segments that are quick to simulate, and the problem with
+        the noise of the fit and its solution.
+    """
+    count = len(problem.segments)
+    try:
+        begin = search.best_start(problem, subset, begin)
+        if not search.interrupted() or len(subset) == count:
+            return problem, subset, search.solve(problem, begin)
+    except InterruptedPassError:
+        pass
+
+    part = replace(problem.of_segments(subset), workers=None)
+    weighted, solution = search.solve(part, of_subset(begin, subset))
+    if len(subset) < count:
+        status = f"{solution.status}, from {len(subset)} of {count} segments"
+        solution = replace(solution, status=status)
+    return part, np.arange(len(subset)), (weighted, solution)
 
 
 def _require_finite_cost(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,7 +32,7 @@ from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_re
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
-from mjfim.optimize.levenberg_marquardt import Solution
+from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import Estimate, MissingTerm, Prediction, Restart
 from mjfim.records.progress import begin_stage
@@ -190,7 +191,9 @@ def _missing_terms(
     unknowns = result.solution.unknowns
     at = replace(unknowns, private=unknowns.private[result.subset])
     problem = result.problem.of_segments(result.subset)
-    missing = find_missing_terms(problem, result.task.recordings, result.subset, at)
+    missing: tuple[MissingTerm, ...] = ()
+    with suppress(InterruptedPassError):
+        missing = find_missing_terms(problem, result.task.recordings, result.subset, at)
     return () if budget.stop.requested else missing
 
 
@@ -204,11 +207,13 @@ def _flipped_signs(result: FitResult, quality: FitQuality, budget: Budget) -> tu
     unknowns = result.solution.unknowns
     at = replace(unknowns, private=unknowns.private[result.subset])
     problem = result.problem.of_segments(result.subset)
-    squares = 2.0 * problem.cost(at)
-    enough = sufficient_squares(squares, problem.value_count, noise_is_stated=noise_is_stated)
-    return flipped_signs(
-        result.task, result.problem, enough, result.subset, result.null_space, budget
-    )
+    with suppress(InterruptedPassError):
+        squares = 2.0 * problem.cost(at)
+        enough = sufficient_squares(squares, problem.value_count, noise_is_stated=noise_is_stated)
+        return flipped_signs(
+            result.task, result.problem, enough, result.subset, result.null_space, budget
+        )
+    return ()
 
 
 def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:

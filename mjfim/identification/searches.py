@@ -15,6 +15,7 @@ from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
 from mjfim.identification.task import FitTask
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.optimize.levenberg_marquardt import (
+    InterruptedPassError,
     IterationReport,
     SearchSettings,
     Solution,
@@ -197,10 +198,14 @@ class FitSearch:
             sigma = self._residual_sigma(problem, solution.unknowns)
             change = float(np.abs(sigma / problem.noise.sigma - 1.0).max())
             noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
-            problem = problem.with_noise(noise)
-            refined = self._minimise(
-                problem, solution.unknowns, settings, f"{phase}, noise estimated"
-            )
+            reweighted = problem.with_noise(noise)
+            try:
+                refined = self._minimise(
+                    reweighted, solution.unknowns, settings, f"{phase}, noise estimated"
+                )
+            except InterruptedPassError:
+                return problem, replace(solution, interrupted=True)
+            problem = reweighted
             solution = replace(refined, iterates=(*solution.iterates, *refined.iterates[1:]))
             if change < NOISE_TOLERANCE:
                 break
@@ -227,7 +232,10 @@ class FitSearch:
             longer = problem.with_longer_differences(factor)
             settings = self._final_settings(longer, ROUGH_ITERATIONS)
             phase = "all data, longer differences"
-            found = self.minimise(longer, solution.unknowns, settings, phase)
+            try:
+                found = self.minimise(longer, solution.unknowns, settings, phase)
+            except InterruptedPassError:
+                break
             if found is None:
                 break
             found = replace(found, iterates=(*solution.iterates, *found.iterates[1:]))
@@ -283,7 +291,10 @@ class FitSearch:
             relinearise_at_end=False,
         )
         held = problem.with_shared_held()
-        found = minimise(held, begin, settings, self.budget, self._reporter("initial states"))
+        try:
+            found = minimise(held, begin, settings, self.budget, self._reporter("initial states"))
+        except InterruptedPassError:
+            return begin
         return begin if found is None else found.unknowns
 
     def _from_random_starts(self, problem: FitProblem, starts: int) -> list[Solution]:

@@ -18,6 +18,10 @@ from mjfim.plant.delay import OutputDelay
 from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.trajectory import Trajectory
 
+# Largest number of engine steps of a batch, so that workers share also the batches of few data. On
+# small models it takes some 0.1 s, against some milliseconds for the way to a worker and back.
+STEPS_OF_BATCH = 50_000
+
 # Number of samples that one linearisation simulates, with two-sided differences, above which
 # differences are one-sided.
 SAMPLES_FOR_ONE_SIDED = 400_000
@@ -138,23 +142,6 @@ class SegmentSimulation:
             Indices of the segments.
         """
         return [i for i, segment in enumerate(self.segments) if segment.recording == recording]
-
-    def predict(self, at: UnknownValues) -> list[Array] | None:
-        """Predicted outputs of every recording at its times.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (M, ny) outputs of every recording [y-unit], NaN in rows without a segment; None where a
-            simulation diverges.
-        """
-        outputs = [np.full(recording.y.shape, np.nan) for recording in self.recordings]
-        for found in self.rows(at, derivatives=False):
-            if found is None:
-                return None
-            outputs[self.segments[found.segment].recording][found.rows] = found.y
-        return outputs
 
     def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
         """The fitted motion of one recording on the sample grid.
@@ -304,14 +291,15 @@ class SegmentSimulation:
                     yield found
 
     def _max_samples(self, simulations: int) -> int:
-        """Largest number of samples of a batch whose states fit into memory.
+        """Largest number of samples of a batch, whose states have to fit into memory.
 
         Args:
             simulations: Number of simulations of every segment.
         """
-        state_size = 1 + self.system.plant.nominal_initial_state.size
-        numbers_per_sample = simulations * self.system.grid.substeps * state_size
-        return max(MAX_NUMBERS_AT_ONCE // numbers_per_sample, 1)
+        steps_per_sample = simulations * self.system.grid.substeps
+        numbers_per_step = 1 + self.system.plant.nominal_initial_state.size
+        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, STEPS_OF_BATCH)
+        return max(most // steps_per_sample, 1)
 
     def _batches(self, max_samples: int) -> Iterator[tuple[int, list[int]]]:
         """Segments that are simulated together.

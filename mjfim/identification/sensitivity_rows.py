@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import zip_longest
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.segment_simulation import SegmentBatch
 from mjfim.information.null_space import COARSER_STEP_FACTOR
 from mjfim.optimize.condensed_least_squares import triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -54,20 +56,42 @@ def _condensed_sensitivity(problem: FitProblem, at: UnknownValues) -> dict[int, 
 
     Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes.
     """
-    fine, coarse = (
-        problem.simulation.rows(
-            at, derivatives=True, central=True, step=step, by_all_parameters=True
-        )
-        for step in (SENSITIVITY_STEP, COARSER_STEP_FACTOR * SENSITIVITY_STEP)
+    batches = problem.simulation.batches(
+        derivatives=True, central=True, step=SENSITIVITY_STEP, by_all_parameters=True
     )
-
     condensed: dict[int, Array] = {}
-    for rows, coarse_rows in zip_longest(fine, coarse):
-        if rows is None:
+    for found in problem.of_batches(sensitivities_of_batch, batches, at):
+        if found is None:
             name = problem.recordings[0].name
             raise SimulationDivergedError(
                 f"{name}: the simulation diverges under the recorded control"
             )
+        condensed.update(found)
+    return condensed
+
+
+def sensitivities_of_batch(
+    problem: FitProblem, at: UnknownValues, batch: SegmentBatch
+) -> dict[int, Array] | None:
+    """Condense the whitened sensitivity of a batch, and its change with a longer step.
+
+    Args:
+        problem: The problem.
+        at: The unknowns.
+        batch: The batch, with derivatives.
+
+    Returns:
+        (k, 2 (n+p)) triangle of each segment by its index; None where a perturbed simulation
+        diverges.
+    """
+    fine = problem.simulation.rows_of_batch(at, batch)
+    longer = replace(batch, step=COARSER_STEP_FACTOR * batch.step)
+    coarse = problem.simulation.rows_of_batch(at, longer)
+
+    condensed: dict[int, Array] = {}
+    for rows, coarse_rows in zip_longest(fine, coarse):
+        if rows is None:
+            return None
 
         # Where the simulation with the longer step diverges, the change is unknown.
         J = problem.whitened.sensitivity(rows)

@@ -86,11 +86,28 @@ class UnknownValues:
     per_recording: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
+class InterruptedPassError(Exception):
+    """A request to stop ended a pass over the data, so that its result is not known."""
+
+
+def completed(passes: Callable[[], T]) -> T:
+    """Do what the result needs in any case, also after a request to stop.
+
+    Args:
+        passes: Passes over the data; those that begin after the request are completed.
+    """
+    try:
+        return passes()
+    except InterruptedPassError:
+        return passes()
+
+
 class Problem(Protocol):
     """Least-squares cost as a function of the unknowns.
 
     The cost is half of the sum of squared residuals and priors; a robust loss may replace the
-    square.
+    square. Where workers do the passes over the data, `cost` and `condense` raise
+    `InterruptedPassError` after a request to stop.
     """
 
     @property
@@ -230,6 +247,9 @@ def minimise(
 
     Returns:
         The solution, or None where the initial guess or its neighbourhood diverges.
+
+    Raises:
+        InterruptedPassError: A request to stop ended the first pass over the data.
     """
     cost = problem.cost(start)
     condensed = problem.condense(start) if np.isfinite(cost) else None
@@ -295,7 +315,10 @@ class _Search:
         self._keep(start)
 
         while self.iteration < self.settings.max_iterations:
-            ended = self._iterate()
+            try:
+                ended = self._iterate()
+            except InterruptedPassError:
+                return self._stopped(StopReason.REQUESTED)
             if ended is not None:
                 return ended
 

@@ -3,11 +3,12 @@ from .dispatch import Dispatch, LostWorkError, Outcome
 from .pool import LOST_SENTENCE, Pool
 from .threads import cores, one_blas_thread, process_count, require_threads
 from .worker_process import offer_result, pool_stop_token
-from .workers import Workers
+from .workers import ExecutorLike, Workers
 
 __all__ = [
     "LOST_SENTENCE",
     "Dispatch",
+    "ExecutorLike",
     "LostWorkError",
     "Outcome",
     "Pool",

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from mjfim.budget import Budget
 from mjfim.parallel.dispatch import Dispatch, Outcome
-from mjfim.parallel.workers import Workers
+from mjfim.parallel.workers import ExecutorLike, Workers
 
 T = TypeVar("T")
 Order = TypeVar("Order")
 
 
 def carry_out(
-    executor: Any,
+    executor: ExecutorLike,
     function: Callable[[Order], T],
     orders: Sequence[Order],
     budget: Budget,
@@ -71,7 +71,7 @@ def carry_out(
 
 
 def results_or_here(
-    executor: Any,
+    executor: ExecutorLike,
     function: Callable[[Order], T],
     orders: Sequence[Order],
     budget: Budget,

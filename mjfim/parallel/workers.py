@@ -13,7 +13,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
 )
 from contextlib import AbstractContextManager, nullcontext, suppress
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from mjfim.errors import ExperimentError
 from mjfim.parallel.losses import renewed
@@ -30,6 +30,17 @@ COUNT_PERIOD = 2.0
 
 # Tasks that are submitted at once for each worker, so that it need not wait for the next one.
 TASKS_PER_WORKER = 2
+
+
+class ExecutorLike(Protocol):
+    """Where a verb does its work: an executor of `concurrent.futures`, a Dask client, or `Workers`.
+
+    Every argument `executor` of mjfim takes one. None means this process; a number of processes is
+    stated by `mjfim.Pool(4)`. A verb does not end the executor: its owner does.
+    """
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+        """Submit a task; see `concurrent.futures.Executor.submit`."""
 
 
 class Workers(Executor):
@@ -51,7 +62,9 @@ class Workers(Executor):
             positive.
     """
 
-    def __init__(self, executor: Any, count: int | None = None, threads: int | None = None) -> None:
+    def __init__(
+        self, executor: ExecutorLike, count: int | None = None, threads: int | None = None
+    ) -> None:
         for name, number in (("count", count), ("threads", threads)):
             if number is not None and number < 1:
                 raise ExperimentError(f"Workers: {name} is {number}; it must be at least 1")
@@ -60,29 +73,32 @@ class Workers(Executor):
                 "Workers: the executor is wrapped already; state count and threads where it is "
                 "wrapped first"
             )
-        if not hasattr(executor, "submit"):
+        if not callable(getattr(executor, "submit", None)):
+            is_count = isinstance(executor, int) and not isinstance(executor, bool)
             raise ExperimentError(
-                f"executor: {type(executor).__name__} has no method `submit`; pass an executor of "
-                "the kind of concurrent.futures, such as mjfim.Pool(), or a Dask Client"
+                f"executor: {executor!r} has no method `submit`; pass an executor of the kind of "
+                f"concurrent.futures, such as mjfim.Pool({executor if is_count else ''}), or a "
+                "Dask Client"
             )
 
         # A client of Dask has futures of its own; its executor has those of concurrent.futures.
-        if hasattr(executor, "get_executor"):
-            executor = executor.get_executor()
-        self._executor: Executor = executor
-        self._client: Any = getattr(executor, "_client", None)
+        made: Any = executor
+        if hasattr(made, "get_executor"):
+            made = made.get_executor()
+        self._executor: Executor = made
+        self._client: Any = getattr(made, "_client", None)
         self._stated_count = count
         self._stated_threads = threads
         self._known_count = 0
         self._count_until = 0.0
 
     @classmethod
-    def of(cls, executor: Any) -> Workers:
+    def of(cls, executor: ExecutorLike) -> Workers:
         """View an executor as workers; what is viewed so already remains as it is."""
         return executor if isinstance(executor, Workers) else cls(executor)
 
     @classmethod
-    def of_any(cls, executor: Any | None) -> Workers | None:
+    def of_any(cls, executor: ExecutorLike | None) -> Workers | None:
         """View an executor as workers; None remains None.
 
         A study of several parts does so once, so that an executor that is made anew in one part is

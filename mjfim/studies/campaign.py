@@ -8,7 +8,6 @@ estimate. Priors remain centred at the stated guess.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from mjfim.excitation.target_accuracy import (
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.identify import identify_system
-from mjfim.parallel import Workers
+from mjfim.parallel import ExecutorLike, Workers
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
@@ -60,7 +59,7 @@ def run_campaign(
     callback: Callback | None = None,
     threads: int | None = None,
     done: Sequence[EarlierRound] = (),
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
 ) -> Campaign:
@@ -79,8 +78,8 @@ def run_campaign(
             after every round, whose `result` is the `Round`.
         threads: Threads of MuJoCo; None for all cores.
         done: Rounds that are recorded already; their designs are not made again.
-        executor: Executor of `concurrent.futures`; under hard limits it runs several optimisations
-            at once.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
+            divides every design and every estimate.
         stop: Ends the campaign early, as Ctrl-C does, after the last complete round.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
@@ -124,7 +123,7 @@ class _CampaignRun:
         base: DesignTask,
         count: int,
         callback: Callback | None,
-        executor: Executor | None,
+        executor: ExecutorLike | None,
         stop: StopToken,
     ) -> None:
         self.base = base
@@ -365,7 +364,7 @@ def identify_all(
     *,
     callback: Callback | None = None,
     stop: StopToken | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
 ) -> Estimate | None:
     """Estimate the parameters from all recordings.
 
@@ -377,7 +376,7 @@ def identify_all(
         start: (p,) parameters at which the fit begins [theta-unit].
         callback: Called with a `FitEvent` for every iterate.
         stop: Ends the fit early.
-        executor: Simulates parts of much data side by side; None for this process.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process.
 
     Returns:
         The better of the estimates; None where a fit was interrupted, because an incomplete round

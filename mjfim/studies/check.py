@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest
 from mjfim.information.marginal import shared
-from mjfim.parallel import one_blas_thread
+from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
     CONFOUNDED_CORRELATION,
@@ -66,7 +65,7 @@ def check(
     threads: int | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
-    executor: Any = None,
+    executor: ExecutorLike | None = None,
 ) -> Check:
     """Check which parameters can be identified, at the parameter values that a design uses.
 
@@ -79,8 +78,8 @@ def check(
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the check early, as Ctrl-C does; the record then says what is missing.
         progress: False for no sign of progress in a notebook.
-        executor: Executor that differentiates random motions side by side, where these are needed,
-            such as `mjfim.Pool` or a Dask `Client`; the result does not depend on it.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
+            differentiates random motions side by side, where these are needed.
 
     Raises:
         RecordingError: Recordings are unusable, or given together with a trajectory.
@@ -103,7 +102,7 @@ def check_task(
     task: DesignTask,
     trajectory: Trajectory | None = None,
     stop: StopToken | None = None,
-    executor: Any = None,
+    executor: ExecutorLike | None = None,
 ) -> Check:
     """Check the initial control of a task, or the control of a trajectory.
 
@@ -150,7 +149,7 @@ def check_recordings(
     system: System,
     recordings: Sequence[Recording],
     stop: StopToken | None = None,
-    executor: Any = None,
+    executor: ExecutorLike | None = None,
 ) -> Check:
     """Check which parameters recordings identify; derivatives are tested along the longest one.
 
@@ -188,7 +187,9 @@ def check_recordings(
         ).check()
 
 
-def _identifiability_test(task: DesignTask, executor: Any, stop: StopToken) -> IdentifiabilityTest:
+def _identifiability_test(
+    task: DesignTask, executor: ExecutorLike | None, stop: StopToken
+) -> IdentifiabilityTest:
     """The test of a task; an executor differentiates its random motions."""
     test = task.identifiability_test
     if executor is None:

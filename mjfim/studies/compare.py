@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,7 +28,7 @@ from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.parallel import Workers, results_or_here
+from mjfim.parallel import ExecutorLike, Workers, results_or_here
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
@@ -64,7 +63,7 @@ def compare(
     steps: float | None = None,
     seed: int = 0,
     methods: Sequence[str] | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     callback: Callback | None = None,
     threads: int | None = None,
     stop: StopToken | None = None,
@@ -82,7 +81,8 @@ def compare(
         seed: Seed of the baselines.
         methods: Keys of the baselines (`mjfim.studies.baselines.methods.METHODS`); None for all
             that are applicable.
-        executor: Executor of `concurrent.futures`; each method is divided among its workers.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. Each
+            method is divided among its workers.
         callback: Called with a `StudyEvent` while a method runs, and with every `DesignEvent` of
             the design.
         threads: Threads of MuJoCo; None for all cores.
@@ -114,7 +114,7 @@ def compare_task(
     steps: float | None = None,
     seed: int = 0,
     methods: Sequence[str] | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     callback: Callback | None = None,
     stop: StopToken | None = None,
 ) -> Comparison:
@@ -241,7 +241,7 @@ class _MethodRun:
     index: int
     count: int
     callback: Callback | None
-    executor: Executor | None
+    executor: ExecutorLike | None
     stop: StopToken
 
     @property
@@ -281,7 +281,7 @@ class _MethodRun:
         note = INTERRUPTED_NOTE if interrupted else ""
         return evaluation.result(self.search.method, self.title, result, note)
 
-    def divided_baseline(self, executor: Executor, system: System) -> SearchResult | None:
+    def divided_baseline(self, executor: ExecutorLike, system: System) -> SearchResult | None:
         """Run a part of a baseline in every worker, each with its share of the steps.
 
         Args:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy
@@ -23,7 +22,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.information.identifiability import require_visible
 from mjfim.memory import NUMBER_BYTES, require_memory
-from mjfim.parallel import Workers, one_blas_thread
+from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.progress import shown_progress
@@ -69,7 +68,7 @@ def monte_carlo(
     threads: int | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
-    executor: Any = None,
+    executor: ExecutorLike | None = None,
 ) -> MonteCarloStudy:
     """Estimate the parameters from many noisy repetitions of one or several trajectories.
 
@@ -86,8 +85,8 @@ def monte_carlo(
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the study early, as Ctrl-C does; the trials that are finished are returned.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
-        executor: Executor that runs the trials side by side, such as `mjfim.Pool` or a Dask
-            `Client`; the estimates do not depend on it.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
+            runs the trials side by side; the estimates do not depend on it.
 
     Raises:
         ExperimentError: Fewer than two trials, or more than fit into memory.
@@ -119,7 +118,7 @@ def monte_carlo_system(
     seed: int = 0,
     callback: Callback | None = None,
     stop: StopToken | None = None,
-    executor: Any = None,
+    executor: ExecutorLike | None = None,
 ) -> MonteCarloStudy:
     """Study the estimator on a resolved system. See `monte_carlo`."""
     if trials < 2:
@@ -253,7 +252,7 @@ class _Plan:
     """
 
     trials: int
-    executor: Any
+    executor: ExecutorLike | None
     budget: Budget
 
     def estimates(

@@ -5,14 +5,13 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.information.identifiability import IdentifiabilityTest, RowsAndError
-from mjfim.parallel import Workers, one_blas_thread, results_or_here
+from mjfim.parallel import ExecutorLike, Workers, one_blas_thread, results_or_here
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.records.trajectory import Trajectory
 
@@ -68,7 +67,7 @@ class ProbeWorkers:
         stop: Leaves out motions that have not begun.
     """
 
-    executor: Any
+    executor: ExecutorLike
     task: DesignTask
     stop: StopToken
 

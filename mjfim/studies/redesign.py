@@ -11,7 +11,6 @@ effort than the one before, and a round at values below the guess less than the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +23,7 @@ from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.evaluation import criterion_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.parallel import ExecutorLike
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback
@@ -66,7 +66,7 @@ def redesign(
     theta: Array,
     *,
     callback: Callback | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     stop: StopToken | None = None,
 ) -> Design:
     """Design again with the information of the recordings so far.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,7 +26,7 @@ from mjfim.excitation.limits import Limit
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.parallel import pool_stop_token, results_or_here
+from mjfim.parallel import ExecutorLike, pool_stop_token, results_or_here
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.progress import shown_progress
@@ -50,7 +49,7 @@ def assess_robustness(
     conditions: RobotConditions | None = None,
     runs: int = 100,
     callback: Callback | None = None,
-    executor: Executor | None = None,
+    executor: ExecutorLike | None = None,
     stop: StopToken | None = None,
     progress: bool = True,
 ) -> Robustness:
@@ -68,8 +67,8 @@ def assess_robustness(
             latency of 5 ms.
         runs: Number of robots.
         callback: Called with a `StudyEvent` after every robot.
-        executor: Executor of `concurrent.futures` that runs several robots at once, such as
-            `mjfim.Pool`; None for one robot after another.
+        executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
+            plays several robots side by side.
         stop: Ends the study early; the robots that are finished count.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
@@ -263,7 +262,7 @@ def _play_all(
     bench: RobotBench,
     study: Callable[[], _RobotStudy],
     count: int,
-    executor: Executor | None,
+    executor: ExecutorLike | None,
     stop: StopToken,
 ) -> Iterator[RobotRun]:
     """Play all robots until a stop is requested, and yield the results in their order.

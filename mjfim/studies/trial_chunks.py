@@ -19,7 +19,7 @@ from mjfim.budget import Budget, StopToken
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
-from mjfim.parallel import Workers, one_blas_thread, pool_stop_token, results_or_here
+from mjfim.parallel import ExecutorLike, Workers, one_blas_thread, pool_stop_token, results_or_here
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.studies.trials import Trials, estimated
 
@@ -184,7 +184,7 @@ def _estimate_in_worker(study: _TrialStudy, chunk: _Chunk) -> Array | None:
 
 
 def estimates_on_workers(
-    executor: Any,
+    executor: ExecutorLike,
     trials: TrialSet,
     counts: Sequence[int],
     rng: np.random.Generator,

@@ -1,0 +1,219 @@
+"""Orders of a fit for workers: which part of a problem each of them needs.
+
+An order holds the segments of its batch, the values that count in them, and their private unknowns.
+What all parts of a problem have in common, and the recordings, are sent to each worker once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.experiment.system import System
+from mjfim.experiment.system_order import SystemOrder
+from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.identification.batch_workers import BatchWork
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.pins import Pins
+from mjfim.identification.segment_simulation import SegmentBatch, SegmentSimulation
+from mjfim.identification.segments import Segment
+from mjfim.identification.unknowns import UnknownLayout
+from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
+from mjfim.optimize.robust_losses import RobustLoss
+from mjfim.parallel.kept import KeptPerThread
+from mjfim.parallel.shared_value import SharedValue, require_values
+from mjfim.plant.noise import Noise
+
+T = TypeVar("T")
+
+# Number of problems that a worker keeps: a fit has variants with other noise or other segments.
+KEPT_PROBLEMS = 8
+
+# The latest systems of a worker, by the hash of their order.
+_worker_systems: KeptPerThread[System] = KeptPerThread(KEPT_PROBLEMS)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ProblemOrder:
+    """What all parts of a problem have in common. It can be pickled.
+
+    Attributes:
+        system: The system.
+        row_counts: Number of rows M of every recording.
+        segment_rows: (P,) number of rows of every segment.
+        layout: Layout of the unknowns.
+        start_directions: (nx, n) directions of the initial state.
+        noise: Noise of the outputs.
+        loss: Loss of a whitened residual.
+        pins: Combinations that no recording determines.
+        with_priors: Whether priors count.
+        difference_step: Relative step of the differences.
+    """
+
+    system: SharedValue[SystemOrder]
+    row_counts: tuple[int, ...]
+    segment_rows: np.ndarray
+    layout: UnknownLayout
+    start_directions: Array
+    noise: Noise
+    loss: RobustLoss
+    pins: Pins
+    with_priors: bool
+    difference_step: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PartOrder:
+    """Some segments of a problem, and what only they need. It can be pickled.
+
+    Attributes:
+        problem: The problem.
+        recordings: Each of the recordings that are needed, by its index.
+        segments: The segments, by their index in the problem.
+        masks: (k, ny) measured values that count among the rows of each of these segments.
+    """
+
+    problem: SharedValue[ProblemOrder]
+    recordings: dict[int, SharedValue[AlignedRecording]]
+    segments: dict[int, Segment]
+    masks: dict[int, np.ndarray]
+
+    @classmethod
+    def of(
+        cls,
+        problem: FitProblem,
+        indices: Sequence[int],
+        shared: SharedValue[ProblemOrder],
+        recording_of: Callable[[AlignedRecording], SharedValue[AlignedRecording]],
+    ) -> PartOrder:
+        """Describe some segments of a problem.
+
+        Args:
+            problem: The problem.
+            indices: Indices of the segments.
+            shared: What all parts of the problem have in common.
+            recording_of: Shares a recording.
+        """
+        segments = {i: problem.segments[i] for i in indices}
+        needed = sorted({segment.recording for segment in segments.values()})
+        return cls(
+            problem=shared,
+            recordings={i: recording_of(problem.recordings[i]) for i in needed},
+            segments=segments,
+            masks={i: problem.masks[each.recording][each.rows] for i, each in segments.items()},
+        )
+
+    def made(self) -> FitProblem:
+        """Make the problem; recordings and segments that are not needed are empty."""
+        require_values([self.problem, *self.recordings.values()])
+        order = self.problem.value
+        require_values([order.system])
+        system = _worker_systems.get(order.system.digest, lambda: order.system.value.system())
+
+        ny = len(system.outputs)
+        known = self.recordings
+        recordings = [
+            known[i].value if i in known else _without_values(count, ny)
+            for i, count in enumerate(order.row_counts)
+        ]
+        simulation = SegmentSimulation(
+            system=system,
+            recordings=tuple(recordings),
+            segments=self._all_segments(order.segment_rows.tolist()),
+            layout=order.layout,
+            start_directions=order.start_directions,
+        )
+        return FitProblem(
+            simulation=simulation,
+            masks=tuple(self._all_masks(order.row_counts, ny)),
+            noise=order.noise,
+            loss=order.loss,
+            pins=order.pins,
+            with_priors=order.with_priors,
+            difference_step=order.difference_step,
+        )
+
+    def _all_segments(self, rows: Sequence[int]) -> tuple[Segment, ...]:
+        """Segments of the whole problem; those of other parts have nothing but their size."""
+        nothing = np.zeros(0)
+        return tuple(
+            self.segments[i]
+            if i in self.segments
+            else Segment(recording=0, begin=0, samples=0, rows=slice(0, count), start=nothing)
+            for i, count in enumerate(rows)
+        )
+
+    def _all_masks(self, row_counts: Sequence[int], ny: int) -> Iterator[np.ndarray]:
+        """(M, ny) for every recording, True for the values of these segments that count."""
+        masks = {i: np.zeros((row_counts[i], ny), dtype=bool) for i in self.recordings}
+        for i, segment in self.segments.items():
+            masks[segment.recording][segment.rows] |= self.masks[i]
+
+        for i, count in enumerate(row_counts):
+            yield masks[i] if i in masks else np.broadcast_to(False, (count, ny))
+
+
+def _without_values(rows: int, outputs: int) -> AlignedRecording:
+    """A recording of a length without contents, which takes no memory."""
+    return AlignedRecording(
+        name="",
+        t=np.broadcast_to(0.0, (rows,)),
+        y=np.broadcast_to(np.nan, (rows, outputs)),
+        ctrl=np.zeros((0, 0)),
+        dt=1.0,
+        on_grid=True,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BatchOrder(Generic[T]):
+    """Work on one batch.
+
+    Attributes:
+        part: The problem, with the segments of the batch.
+        work: Method of the problem that does the work.
+        batch: The batch.
+        at: The unknowns, with the private ones of the segments of the batch only.
+    """
+
+    part: SharedValue[PartOrder]
+    work: BatchWork[T]
+    batch: SegmentBatch
+    at: UnknownValues
+
+    @classmethod
+    def of(
+        cls,
+        part: SharedValue[PartOrder],
+        work: BatchWork[T],
+        batch: SegmentBatch,
+        at: UnknownValues,
+    ) -> BatchOrder[T]:
+        """Order the work on a batch at values of all unknowns."""
+        private = at.private[list(batch.segments)]
+        return cls(part=part, work=work, batch=batch, at=replace(at, private=private))
+
+    def unknowns(self, segments: int) -> UnknownValues:
+        """Unknowns of a problem with some number of segments; zero for those of other batches."""
+        private = np.zeros((segments, self.at.private.shape[1]))
+        private[list(self.batch.segments)] = self.at.private
+        return replace(self.at, private=private)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SearchOrder:
+    """Search from one start.
+
+    Attributes:
+        part: The problem, with all its segments.
+        begin: Unknowns at which the search begins.
+        settings: Tolerance and number of iterations.
+    """
+
+    part: SharedValue[PartOrder]
+    begin: UnknownValues
+    settings: SearchSettings
