@@ -9,7 +9,6 @@ is evaluated; then it is optimised again within tighter limits.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from mjfim.parallel import ExecutorLike
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -27,6 +26,7 @@ from mjfim.excitation.search_round import RoundTerms, SearchRounds
 from mjfim.excitation.survivors import HALVING_RATE, choose_survivors, discard_others
 from mjfim.excitation.tightened_runs import run_within_tighter_limits
 from mjfim.excitation.winner_repair import WinnerRepair
+from mjfim.parallel import ExecutorLike
 
 # Last barrier weight mu of the first round.
 FIRST_ROUND_MU = 0.01

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Mapping, Sequence
-from mjfim.parallel import ExecutorLike
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.experiment.packing import for_workers
-from mjfim.parallel import Workers
+from mjfim.parallel import ExecutorLike, Workers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -23,7 +23,11 @@ from mjfim.identification.fit_segments import has_free_starts, segments_of_fit
 from mjfim.identification.pins import Pins
 from mjfim.identification.prior_rows import PriorRows
 from mjfim.identification.residual_blocks import BlockDivision
-from mjfim.identification.segment_simulation import SegmentBatch, SegmentSimulation
+from mjfim.identification.segment_simulation import (
+    SegmentBatch,
+    SegmentRows,
+    SegmentSimulation,
+)
 from mjfim.identification.segments import Segment, recorded_release
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.identification.whitened_rows import WhitenedRows

@@ -142,7 +142,7 @@ class FitWorkers:
 
         threads = self._executor.threads_for(len(batches))
         orders = [
-            BatchOrder.of(self._part_of(problem, batch.segments, threads), work, batch, at)
+            BatchOrder.of(self.part_of(problem, batch.segments, threads), work, batch, at)
             for batch in batches
         ]
 
@@ -169,7 +169,7 @@ class FitWorkers:
     ) -> Iterator[Solution | None]:
         """Search from several starts. See `batch_workers.BatchWorkers`."""
         threads = self._executor.threads_for(len(begins))
-        part = self._part_of(problem, range(len(problem.segments)), threads)
+        part = self.part_of(problem, range(len(problem.segments)), threads)
         orders = [SearchOrder(part=part, begin=begin, settings=settings) for begin in begins]
         alone = replace(problem, workers=None)
 
@@ -180,10 +180,16 @@ class FitWorkers:
         for found in results_or_here(self._executor, _search_in_worker, orders, budget, here):
             yield _counted_here(problem, found)
 
-    def _part_of(
+    def part_of(
         self, problem: FitProblem, segments: Sequence[int], threads: int
     ) -> SharedValue[PartOrder]:
-        """The order for some segments of a problem, made once."""
+        """Share some segments of a problem, described once.
+
+        Args:
+            problem: The problem.
+            segments: Indices of the segments.
+            threads: Threads of a worker.
+        """
         known = self._parts.setdefault(problem, {})
         key = (threads, *segments)
         if key not in known:

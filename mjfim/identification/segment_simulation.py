@@ -19,8 +19,8 @@ from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STE
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of engine steps of a batch, so that workers share also the batches of few data. On
-# small models it takes some 0.1 s, against some milliseconds for the way to a worker and back.
-STEPS_OF_BATCH = 50_000
+# small models it takes about 0.2 s, against some milliseconds for the way to a worker and back.
+STEPS_OF_BATCH = 100_000
 
 # Number of samples that one linearisation simulates, with two-sided differences, above which
 # differences are one-sided.

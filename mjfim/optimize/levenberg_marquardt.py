@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopReason
 from mjfim.optimize.condensed_least_squares import Condensed, Step
+
+T = TypeVar("T")
 
 # Damping of the first step, relative to the squared column norms of the Jacobian.
 INITIAL_DAMPING = 1e-3

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,15 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import segment_simulation
+from mjfim.identification import searches, segment_simulation
+from mjfim.identification.fit_orders import BatchOrder
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.task import FitTask
+from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from tests.support.executors import LosingThreads, move_to, processes
 from tests.support.paths import MODELS
 
@@ -87,6 +91,86 @@ def test_a_fit_that_diverges_on_workers_has_no_cost(
 
         assert divided.cost(at) == np.inf
         assert divided.condense(at) is None
+
+
+class StoppingThreads(ThreadPoolExecutor):
+    """Threads that ask for a stop when some number of tasks was submitted, and lose no task."""
+
+    def __init__(self, stop: StopToken, after: int) -> None:
+        super().__init__(1)
+        self._stop = stop
+        self._left = after
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self._left -= 1
+        if self._left == 0:
+            self._stop.request()
+        return super().submit(fn, *args, **kwargs)
+
+
+def stopped_fit(
+    experiment: mjfim.Experiment, recordings: list[mjfim.Recording], after: int
+) -> mjfim.Estimate:
+    """Estimate of a fit that is asked to stop when some number of tasks was submitted."""
+    stop = StopToken()
+    with StoppingThreads(stop, after) as threads:
+        return mjfim.identify(
+            experiment.replace(fit=SEGMENTS), recordings, threads=1, executor=threads, stop=stop
+        )
+
+
+def test_a_request_to_stop_ends_the_pass_that_runs_and_keeps_the_values_of_before(
+    experiment: mjfim.Experiment,
+    recordings: list[mjfim.Recording],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
+    problem = problem_of(experiment, recordings, SEGMENTS)
+    begin = problem.begin(1.05 * problem.system.parameters.guess)
+    stop = StopToken()
+
+    # The first pass for the cost and the first linearisation are complete by then.
+    passes = len(list(problem.simulation.batches(derivatives=False)))
+    passes += len(list(problem.simulation.batches(derivatives=True)))
+    with StoppingThreads(stop, passes + 1) as threads:
+        divided = problem.on_workers(FitWorkers(threads, stop))
+        found = minimise(divided, begin, SearchSettings(), Budget(stop=stop))
+
+    assert found is not None
+    assert found.interrupted
+    assert np.array_equal(found.unknowns.theta, begin.theta)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after", [1, 20, 60, 100, 140, 200, 300, 500])
+def test_a_request_to_stop_in_any_pass_leaves_an_estimate(
+    experiment: mjfim.Experiment,
+    recordings: list[mjfim.Recording],
+    after: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(searches, "SUBSET_SAMPLES", 60)
+    found = stopped_fit(experiment, recordings, after)
+
+    assert np.isfinite(found.theta).all()
+    assert found.interrupted
+
+
+def test_an_order_holds_the_segments_of_its_batch_alone(
+    experiment: mjfim.Experiment, recordings: list[mjfim.Recording]
+) -> None:
+    problem = problem_of(experiment, recordings, SEGMENTS)
+    at = problem.begin(problem.system.parameters.guess)
+    batch = next(problem.simulation.batches(derivatives=True))
+    assert len(batch.segments) < len(problem.segments)
+
+    with ThreadPoolExecutor(1) as threads:
+        part = FitWorkers(threads).part_of(problem, batch.segments, 1)
+    order = BatchOrder.of(part, FitProblem.blocks_of_batch, batch, at)
+
+    assert set(part.value.segments) == set(batch.segments)
+    assert len(order.at.private) == len(batch.segments)
+    assert len(part.value.made().segments) == len(problem.segments)
 
 
 @pytest.mark.slow
