@@ -17,7 +17,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification.fit_memory import recordings_bytes, require_memory_for_recordings
 from mjfim.studies.monte_carlo import (
-    chunk_size,
+    chunk_sizes,
     monte_carlo_system,
     require_memory_for_trials,
 )
@@ -83,21 +83,31 @@ def test_the_jacobians_of_all_trials_count(tmp_path: Path) -> None:
         require_memory_for_trials(task.system, curve, 64, available=1e6)
 
 
-def test_long_trials_are_stepped_in_smaller_blocks(tmp_path: Path) -> None:
-    """However long the trajectory is, a block of trials needs at most 1 GB."""
-    system = System.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
-    assert chunk_size(system, 200, 1500) == 150
-    assert chunk_size(system, 200, 10) == 10
-    assert 1 < chunk_size(system, 100_000, 1500) < 64
-    assert chunk_size(system, 10_000_000, 1500) == 1
+def test_chunks_that_run_side_by_side_count_together(tmp_path: Path) -> None:
+    task = DesignTask.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
+    curve = {"final": task.initial}
+    require_memory_for_trials(task.system, curve, 4000, available=3e9)
+    require_memory_for_trials(task.system, curve, 100, side_by_side=32, available=1e9)
+    with pytest.raises(ExperimentError, match=r"trials: 4000, on 32 workers of this computer"):
+        require_memory_for_trials(task.system, curve, 4000, side_by_side=32, available=1e8)
 
 
-def test_trials_that_take_long_are_stepped_in_smaller_blocks(tmp_path: Path) -> None:
-    """A study that is stopped loses the block that is stepped, which would take minutes."""
+def test_long_trials_are_stepped_in_smaller_chunks(tmp_path: Path) -> None:
+    """However long the trajectory is, a chunk of trials needs at most 1 GB, and a limited time."""
     system = System.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
-    assert chunk_size(system, 400, 3000) == 300
-    assert chunk_size(system, 2500, 3000) == 100
-    assert chunk_size(system, 5000, 3000) == 64
+    assert chunk_sizes(system, 200, 1500) == (250,) * 6
+    assert chunk_sizes(system, 200, 600) == (300, 300)
+    assert chunk_sizes(system, 200, 10) == (10,)
+    assert max(chunk_sizes(system, 100_000, 1500)) < 250
+    assert set(chunk_sizes(system, 10_000_000, 1500)) == {1}
+
+
+def test_a_study_has_chunks_of_at_least_250_trials(tmp_path: Path) -> None:
+    system = System.resolve(mjfim.Experiment.from_file(write_experiment(tmp_path)))
+    for trials in (250, 499, 1501, 100_000):
+        sizes = chunk_sizes(system, 400, trials)
+        assert sum(sizes) == trials
+        assert min(sizes) >= 250
 
 
 def test_recordings_are_compared_with_the_memory_that_is_there(tmp_path: Path) -> None:

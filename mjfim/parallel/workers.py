@@ -127,6 +127,11 @@ class Workers(Executor):
         return max(self._stated_count or self._found_count(), 1)
 
     @property
+    def local_count(self) -> int:
+        """Number of tasks that run at once and are known to be on this computer, at least 1."""
+        return self.count if self._is_local else 1
+
+    @property
     def window(self) -> float:
         """Number of tasks that are submitted at once; infinite where the count is not known."""
         known = self._stated_count or self._found_count() or self.is_cluster

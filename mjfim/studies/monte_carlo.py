@@ -1,8 +1,8 @@
 """Monte-Carlo studies that compare the estimator with the Cramér-Rao bound.
 
-The trials are divided into chunks, whose size depends on the study alone. The trials of a chunk are
-stepped together (`mjfim/studies/trials.py`), in this process or by a worker; every chunk has its
-part of one sequence of random numbers. So the estimates depend on the seed alone.
+The trials are divided into chunks. The trials of a chunk are stepped together
+(`mjfim/studies/trials.py`), in this process or by a worker; every chunk has its part of one
+sequence of random numbers. The estimates depend on the seed alone, not on chunks and workers.
 """
 
 from __future__ import annotations
@@ -41,8 +41,13 @@ CHUNK_BYTES = 1e8
 # and for the files.
 ESTIMATE_COPIES = 6
 
-# Smallest number of trials that are stepped together, where their memory permits it.
-MIN_CHUNK = 64
+# Smallest number of trials that are stepped together, where their memory and their time permit it.
+# With fewer of them, sending and receiving them takes a considerable part of the time.
+MIN_CHUNK = 250
+
+# Largest number of engine steps for one Jacobian of all trials that are stepped together. With
+# more, the first chunk would take minutes, which a stop would lose.
+LARGEST_CHUNK_STEPS = 5e6
 
 # Largest memory of all trials that are stepped together [bytes], for long trajectories and for
 # models with large meshes, of which each trial has a copy.
@@ -51,8 +56,7 @@ LARGEST_CHUNK_BYTES = 1e9
 # Number of chunks of many trials. A study that is stopped keeps the chunks that are finished.
 CHUNKS = 10
 
-# Largest number of engine steps for one Jacobian of all trials that are stepped together, beyond
-# the smallest chunk. With more, the first chunk would take minutes, which a stop would lose.
+# The same beyond the smallest chunk, so that there are enough chunks for many workers.
 CHUNK_STEPS = 1e6
 
 
@@ -124,7 +128,9 @@ def monte_carlo_system(
     if trials < 2:
         raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
-    require_memory_for_trials(system, named, trials)
+    workers = Workers.of_any(executor)
+    beside = 1 if workers is None else workers.local_count
+    require_memory_for_trials(system, named, trials, side_by_side=beside)
 
     # Fail before the first trial where a trajectory cannot be simulated.
     for curve in named.values():
@@ -136,7 +142,6 @@ def monte_carlo_system(
     sets: dict[str, TrialStatistics] = {}
     information: dict[str, Array] = {}
     with stop_on_interrupt(stop) as token:
-        workers = Workers.of_any(executor)
         plan = _Plan(trials=trials, executor=workers, budget=Budget(stop=token))
         for i, (name, curve) in enumerate(named.items()):
             progress = _Progress(callback=callback, part=name, index=i, count=len(named))
@@ -177,6 +182,8 @@ def require_memory_for_trials(
     system: System,
     trajectories: Mapping[str, Trajectory],
     trials: int,
+    *,
+    side_by_side: int = 1,
     available: float | None = None,
 ) -> None:
     """Refuse trials that do not fit into memory.
@@ -185,6 +192,7 @@ def require_memory_for_trials(
         system: The system whose parameters are estimated.
         trajectories: Trajectories by name.
         trials: Number of repetitions of each.
+        side_by_side: Number of chunks that run at the same time on this computer.
         available: Memory that is there [bytes]; None for that of this machine.
 
     Raises:
@@ -193,16 +201,25 @@ def require_memory_for_trials(
     p = len(system.parameters)
     needed = NUMBER_BYTES * ESTIMATE_COPIES * float(trials) * p
     needed += max(
-        chunk_size(system, len(curve.ctrl), trials) * _trial_bytes(system, len(curve.ctrl))
+        _trials_at_once(chunk_sizes(system, len(curve.ctrl), trials), side_by_side)
+        * _trial_bytes(system, len(curve.ctrl))
         for curve in trajectories.values()
     )
-    require_memory(needed / NUMBER_BYTES, f"trials: {trials}", available=available)
+    cause = f"trials: {trials}"
+    if side_by_side > 1:
+        cause += f", on {side_by_side} workers of this computer"
+    require_memory(needed / NUMBER_BYTES, cause, available=available)
 
 
-def chunk_size(system: System, samples: int, trials: int) -> int:
-    """Number of trials that are stepped together.
+def _trials_at_once(sizes: Sequence[int], count: int) -> int:
+    """Number of trials of some chunks that run at the same time."""
+    return sum(sorted(sizes)[-count:])
 
-    It depends on the study only, not on the machine, because the results depend on it.
+
+def chunk_sizes(system: System, samples: int, trials: int) -> tuple[int, ...]:
+    """Numbers of trials that are stepped together.
+
+    They depend on the study only, not on the machine.
 
     Args:
         system: The system.
@@ -210,13 +227,19 @@ def chunk_size(system: System, samples: int, trials: int) -> int:
         trials: Number of all trials.
 
     Returns:
-        The number, at least 1.
+        The numbers, which differ by 1 at most.
     """
     jacobian = NUMBER_BYTES * _measurements(system, samples) * len(system.parameters)
     steps = samples * system.grid.substeps * (len(system.parameters) + 1)
-    most = min(int(CHUNK_BYTES / jacobian), int(CHUNK_STEPS / steps), -(-trials // CHUNKS))
+    most = min(int(CHUNK_BYTES / jacobian), int(CHUNK_STEPS / steps), trials // CHUNKS)
+    count = max(trials // max(MIN_CHUNK, most), 1)
+
+    # Memory and time decide where they do not permit so many.
     fitting = int(LARGEST_CHUNK_BYTES / _trial_bytes(system, samples))
-    return min(max(MIN_CHUNK, most), max(fitting, 1), trials)
+    fitting = max(min(fitting, int(LARGEST_CHUNK_STEPS / steps)), 1)
+    count = max(count, -(-trials // fitting))
+    smaller, larger = divmod(trials, count)
+    return (smaller + 1,) * larger + (smaller,) * (count - larger)
 
 
 def _measurements(system: System, samples: int) -> int:
@@ -326,8 +349,7 @@ def _trial_set(
     require_visible(system.parameters, system.parameters.prior_information, J)
 
     # Those of a finished chunk are kept after a request to stop.
-    size = chunk_size(system, len(curve.ctrl), plan.trials)
-    counts = [min(size, plan.trials - first) for first in range(0, plan.trials, size)]
+    counts = chunk_sizes(system, len(curve.ctrl), plan.trials)
     estimates = list(plan.estimates(trials, counts, rng, progress.report))
     if not estimates:
         return None

@@ -1,7 +1,7 @@
 """The trials of one trajectory in chunks, in this process or on the workers of an executor.
 
 A chunk is an order: its number of trials, and where its part of the random numbers begins. A worker
-makes the system once, and sends back the estimates.
+makes the system once, and sends back the estimates. They do not depend on the division into chunks.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread, pool_stop_token, results_or_here
 from mjfim.parallel.kept import KeptPerThread
-from mjfim.studies.trials import Trials, estimated
+from mjfim.studies.trials import SharedFit, Trials, estimated, fit_without_noise
 
 # Called with the share of the trials that is done.
 Report = Callable[[float], None]
@@ -70,7 +70,13 @@ class TrialSet:
         """
         measured = self.exact + rng.standard_normal((count, len(self.exact)))
         trials = Trials(system=self.system, ctrl=self.ctrl, measured=measured)
-        return estimated(trials, report, budget)
+        return estimated(trials, self.shared, report, budget)
+
+    @cached_property
+    def shared(self) -> SharedFit:
+        """Fit of the measurement without noise, made once for all chunks."""
+        exact = Trials(system=self.system, ctrl=self.ctrl, measured=self.exact[None])
+        return fit_without_noise(exact)
 
 
 def exact_outputs(system: System, ctrl: Array) -> tuple[Array, Array]:

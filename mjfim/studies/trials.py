@@ -2,13 +2,16 @@
 
 Each trial minimises its squared residual, in four steps:
 
-1. A fit of the mean measurement leads from the guess to a point near the minima of all trials.
+1. A fit of the measurement without noise leads from the guess to a point near the minima of all
+   trials.
 2. Gauss-Newton steps with a shared Jacobian, which is expanded to second order about that fit,
    bring each trial close to its minimum.
 3. Gauss-Newton steps with the Jacobian of each trial finish it. A trial has converged when its last
    step is small compared with its standard deviation.
 4. The few trials that have not converged are solved one by one with the least-squares solver of
    `identify`. A trial that this does not solve has failed.
+
+The estimate of a trial does not depend on the trials that are stepped together with it.
 """
 
 from __future__ import annotations
@@ -44,8 +47,8 @@ CURVATURE_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _SharedFit:
-    """Fit of the mean measurement, from which all trials start.
+class SharedFit:
+    """Fit of the measurement without noise, from which all trials start.
 
     Attributes:
         theta: (p,) estimate [theta-unit].
@@ -61,7 +64,8 @@ class _SharedFit:
 
     def jacobian(self, theta: Array) -> Array:
         """(m, n, p) second-order expansion of the Jacobian at theta: (m, p) [theta-unit]."""
-        change = np.tensordot(theta - self.theta, self.curvature, axes=(1, 0))
+        flat = self.curvature.reshape(len(self.curvature), -1)
+        change = _times_each(theta - self.theta, flat).reshape(len(theta), *self.J.shape)
         return np.asarray(self.J + change)
 
 
@@ -137,18 +141,25 @@ class Trials:
         )
 
 
-def _fit_mean(trials: Trials) -> _SharedFit:
-    """Fit the mean measurement from the guess, and differentiate its Jacobian."""
-    system = trials.system
-    fit = trials.fit_problem(trials.measured.mean(axis=0))
+def fit_without_noise(exact: Trials) -> SharedFit:
+    """Fit the measurement without noise from the guess, and differentiate its Jacobian.
+
+    Args:
+        exact: One trial whose measurement has no noise.
+
+    Raises:
+        SimulationDivergedError: The simulation diverges near the fit.
+    """
+    system = exact.system
+    fit = exact.fit_problem(exact.measured[0])
     theta = newton_raphson(fit, system.parameters.guess).unknowns.theta
 
     def jacobian(at: Array) -> Array:
         """(n, p) whitened Jacobian at (p,) parameters."""
-        predicted = system.plant.derivatives.predict(at, trials.ctrl)
+        predicted = system.plant.derivatives.predict(at, exact.ctrl)
         if predicted is None:
             raise SimulationDivergedError(
-                "the simulation diverges near the fit of the mean measurement"
+                "the simulation diverges near the fit of the measurement without noise"
             )
         return system.noise.whitened_rows(predicted[1])
 
@@ -158,7 +169,7 @@ def _fit_mean(trials: Trials) -> _SharedFit:
         change = jacobian(theta + step) - jacobian(theta - step)
         curvature.append(change / (2 * step.max()))
 
-    return _SharedFit(
+    return SharedFit(
         theta=theta,
         J=J,
         curvature=np.stack(curvature),
@@ -166,21 +177,20 @@ def _fit_mean(trials: Trials) -> _SharedFit:
     )
 
 
-def estimated(trials: Trials, report: Callable[[float], None], budget: Budget) -> Array | None:
+def estimated(
+    trials: Trials, shared: SharedFit, report: Callable[[float], None], budget: Budget
+) -> Array | None:
     """Estimate the parameters of all trials.
 
     Args:
         trials: The m trials.
+        shared: Fit of the measurement without noise.
         report: Called with the share that is done.
         budget: Ends the work early.
 
     Returns:
         (m, p) estimates [theta-unit], NaN where a trial failed; None after a request to stop.
-
-    Raises:
-        SimulationDivergedError: The simulation diverges near the fit of the mean measurement.
     """
-    shared = _fit_mean(trials)
     theta = _shared_steps(trials, shared, report, budget)
     if theta is None:
         return None
@@ -197,11 +207,13 @@ def estimated(trials: Trials, report: Callable[[float], None], budget: Budget) -
 
 
 def _shared_steps(
-    trials: Trials, shared: _SharedFit, report: Callable[[float], None], budget: Budget
+    trials: Trials, shared: SharedFit, report: Callable[[float], None], budget: Budget
 ) -> Array | None:
     """(m, p) estimates after the steps with the shared Jacobian; None after an interruption."""
     predicted, _ = trials.outputs(shared.theta[None])
-    theta = shared.theta + (trials.measured - predicted) @ np.linalg.pinv(shared.J).T
+    theta = shared.theta + _times_each(
+        trials.measured - predicted, np.asarray(np.linalg.pinv(shared.J).T, dtype=np.float64)
+    )
 
     for k in range(SHARED_STEPS - 1):
         if budget.exhausted:
@@ -218,7 +230,7 @@ def _shared_steps(
 
 def _individual_steps(
     trials: Trials,
-    shared: _SharedFit,
+    shared: SharedFit,
     theta: Array,
     report: Callable[[float], None],
     budget: Budget,
@@ -258,6 +270,16 @@ def _individual_steps(
     return active
 
 
+def _times_each(rows: Array, matrix: Array) -> Array:
+    """Multiply each of m rows, (m, k), by a (k, l) matrix.
+
+    A product of all rows would round a row differently if there are other rows beside it, and so
+    would rows that are not contiguous.
+    """
+    each = np.ascontiguousarray(rows)[:, None, :]
+    return np.asarray((each @ matrix)[:, 0], dtype=np.float64)
+
+
 def _gauss_newton(J: Array, residual: Array) -> Array:
     """Gauss-Newton steps `(J'J)^-1 J'r` of all trials.
 
@@ -268,6 +290,8 @@ def _gauss_newton(J: Array, residual: Array) -> Array:
     Returns:
         (m, p) steps [theta-unit]; NaN where a Jacobian or a residual is not finite.
     """
+    # Products of contiguous arrays do not depend on the number of trials.
+    J, residual = np.ascontiguousarray(J), np.ascontiguousarray(residual)
     JT = np.swapaxes(J, 1, 2)
     gram = JT @ J
     projected = JT @ residual[:, :, None]

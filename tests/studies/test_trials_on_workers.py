@@ -42,7 +42,7 @@ def curves(experiment: mjfim.Experiment) -> dict[str, mjfim.Trajectory]:
 @pytest.fixture(autouse=True)
 def several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few trials in a chunk."""
-    monkeypatch.setattr(studies, "MIN_CHUNK", 4)
+    monkeypatch.setattr(studies, "MIN_CHUNK", 3)
 
 
 def estimates(
@@ -69,6 +69,20 @@ def test_the_estimates_do_not_depend_on_the_executor_nor_on_lost_tasks(
     assert threads.submitted == 3
 
 
+@pytest.mark.parametrize("smallest", [1, 6])
+def test_the_estimates_do_not_depend_on_the_division_into_chunks(
+    smallest: int,
+    experiment: mjfim.Experiment,
+    curves: dict[str, mjfim.Trajectory],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    final = {"final": curves["final"]}
+    expected = estimates(experiment, final)
+    monkeypatch.setattr(studies, "MIN_CHUNK", smallest)
+
+    assert same(estimates(experiment, final), expected)
+
+
 def test_a_request_to_stop_keeps_the_trials_of_finished_workers(
     experiment: mjfim.Experiment, curves: dict[str, mjfim.Trajectory]
 ) -> None:
@@ -88,7 +102,7 @@ def test_a_request_to_stop_keeps_the_trials_of_finished_workers(
             stop=token,
         )
 
-    assert 4 <= study.sets["final"].trials <= TRIALS
+    assert 3 <= study.sets["final"].trials <= TRIALS
 
 
 @pytest.mark.slow
