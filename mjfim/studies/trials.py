@@ -33,7 +33,7 @@ from mjfim.records.recording import Recording
 CONVERGED_STEP = 0.03
 
 # Number of Gauss-Newton steps with the shared Jacobian, including the first one from the fit of the
-# mean measurement.
+# measurement without noise.
 SHARED_STEPS = 3
 
 # Largest number of Gauss-Newton steps with the Jacobian of each trial.
@@ -239,7 +239,7 @@ def _individual_steps(
 
     Args:
         trials: The m trials.
-        shared: Fit of the mean measurement.
+        shared: Fit of the measurement without noise.
         theta: (m, p) estimates [theta-unit], improved in place.
         report: Called with the share that is done.
         budget: Ends the study early.
