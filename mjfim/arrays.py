@@ -14,14 +14,25 @@ SMALLEST_DIAGONAL = 1e-300
 def freeze(record: object, *names: str) -> None:
     """Replace named fields of a frozen record by read-only float64 arrays.
 
+    Records share arrays that nobody can change; all other arrays are copied.
+
     Args:
         record: Instance of a frozen dataclass.
         *names: Fields to replace.
     """
     for name in names:
-        array = np.array(getattr(record, name), dtype=np.float64)
-        array.setflags(write=False)
-        object.__setattr__(record, name, array)
+        given = getattr(record, name)
+        if not _is_frozen(given):
+            given = np.array(given, dtype=np.float64)
+            given.setflags(write=False)
+        object.__setattr__(record, name, given)
+
+
+def _is_frozen(array: object) -> bool:
+    """Whether this is a read-only float64 array of its own, not a view of another one."""
+    if type(array) is not np.ndarray or array.dtype != np.float64:
+        return False
+    return bool(array.flags.owndata and not array.flags.writeable)
 
 
 def evenly_spread_indices(count: int, limit: int) -> NDArray[np.intp]:

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjfim.arrays import evenly_spread_indices, scaled_pseudo_inverse, scaled_to_unit_diagonal
+from mjfim.arrays import (
+    evenly_spread_indices,
+    freeze,
+    scaled_pseudo_inverse,
+    scaled_to_unit_diagonal,
+)
 
 # Changes of the units of three parameters.
 UNITS = np.array([1e-8, 1.0, 1e6])
@@ -52,3 +57,24 @@ def test_spread_indices_reach_from_the_first_to_the_last_row(count: int, limit: 
     assert indices[0] == 0
     assert indices[-1] == (count - 1 if len(indices) > 1 else 0)
     assert (np.diff(indices) > 0).all()
+
+
+def test_records_share_arrays_that_nobody_can_change() -> None:
+    """Views and arrays that can be written are copied."""
+
+    class Holder:
+        """A record with one array."""
+
+        def __init__(self, array: np.ndarray) -> None:
+            self.array = array
+
+    own = np.arange(6.0)
+    view = own[:3]
+    view.setflags(write=False)
+    frozen = np.arange(6.0)
+    frozen.setflags(write=False)
+    for given, is_shared in ((own, False), (view, False), (frozen, True), (frozen[:3], False)):
+        holder = Holder(given)
+        freeze(holder, "array")
+        assert np.array_equal(holder.array, given) and not holder.array.flags.writeable
+        assert np.shares_memory(holder.array, given) == is_shared

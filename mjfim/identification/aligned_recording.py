@@ -67,10 +67,30 @@ class AlignedRecording:
         """(M, ny) True where there is a measured value."""
         return np.isfinite(self.y)
 
-    @cached_property
-    def measured_rows(self) -> tuple[np.ndarray, ...]:
-        """Indices of the rows with a measured value, for every output."""
-        return tuple(np.flatnonzero(column) for column in self.measured.T)
+    def measured_rows_near(self, output: int, row: int, count: int) -> np.ndarray:
+        """Rows near a place that have a measured value of an output.
+
+        Args:
+            output: Index of the output.
+            row: The place: rows before it, and this row and those after it.
+            count: Largest number of rows on either side.
+
+        Returns:
+            (n,) ascending indices of rows.
+        """
+        column = self.measured[:, output]
+        reach = count
+        while True:
+            first, last = max(row - reach, 0), min(row + reach, len(column))
+            rows = first + np.flatnonzero(column[first:last])
+            middle = int(np.searchsorted(rows, row))
+
+            # The search goes on where values are missing.
+            has_before = middle >= count or first == 0
+            has_after = len(rows) - middle >= count or last == len(column)
+            if has_before and has_after:
+                return np.asarray(rows[max(middle - count, 0) : middle + count])
+            reach *= 4
 
 
 def on_grid_of(system: System, recordings: Sequence[Recording]) -> System:
@@ -209,6 +229,10 @@ def _outputs(system: System, recording: Recording) -> Array:
             f"{unknown('column', listed(recording.outputs), names)}"
         )
 
+    # An array in the order of the outputs is shared.
+    if recording.outputs == tuple(names):
+        return recording.y
+
     y = np.full((len(recording.t), len(names)), np.nan)
     for name in recorded:
         y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
@@ -280,12 +304,13 @@ def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array
     """(M, ny) outputs in which the signs of measured quaternions are continuous.
 
     The quaternions q and -q describe one orientation. The first sign is that of the model at the
-    guess. The array y: (M, ny) is changed in place.
+    guess. The array y: (M, ny) is not changed.
     """
     quaternions = _quaternion_outputs(system)
     if not quaternions:
         return y
 
+    y = np.array(y)
     guess = system.parameters.guess[None]
     predicted, _ = system.plant.measure(guess, ctrl[:SAMPLES_FOR_SIGN])
 

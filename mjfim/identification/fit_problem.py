@@ -195,6 +195,23 @@ class FitProblem:
 
         return replace(self, simulation=simulation, masks=masks)
 
+    def of_first_parts(self, share: float) -> FitProblem:
+        """The problem of the first part of every segment only.
+
+        It shows the initial states nearly as well, at less cost.
+
+        Args:
+            share: Share of the rows of a segment that count.
+
+        Returns:
+            The problem, with as many segments.
+        """
+        segments = []
+        for segment in self.segments:
+            recording = self.recordings[segment.recording]
+            segments.append(segment.first_part(recording.t, recording.dt, share))
+        return replace(self, simulation=replace(self.simulation, segments=tuple(segments)))
+
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
         """This problem with some measured values only.
 
@@ -365,17 +382,20 @@ class FitProblem:
                 outputs[self.segments[part.segment].recording][part.rows] = part.y
         return outputs
 
-    def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
+    def motion(
+        self, at: UnknownValues, recording: int, max_samples: int | None = None
+    ) -> Trajectory | None:
         """The fitted motion of one recording.
 
         Args:
             at: The unknowns.
             recording: Index of the recording.
+            max_samples: Number of samples after which the motion ends, if it lasts longer.
 
         Returns:
             The motion; None where it diverges.
         """
-        return self.simulation.motion(at, recording)
+        return self.simulation.motion(at, recording, max_samples)
 
     def errors(self, predicted: Sequence[Array]) -> list[Array]:
         """Predicted minus measured values of every output, for all recordings in their order.
@@ -386,14 +406,23 @@ class FitProblem:
         Returns:
             One array for each output [y-unit].
         """
-        data = zip(predicted, self.recordings, self.masks, strict=True)
-        differences = [(y - recording.y, mask) for y, recording, mask in data]
+        return [self.errors_of(j, predicted) for j in range(len(self.system.outputs))]
 
-        errors = []
-        for j in range(len(self.system.outputs)):
-            parts = [difference[mask[:, j], j] for difference, mask in differences]
-            errors.append(np.concatenate(parts))
-        return errors
+    def errors_of(self, output: int, predicted: Sequence[Array]) -> Array:
+        """Predicted minus measured values of one output, for all recordings in their order.
+
+        Args:
+            output: Index of the output.
+            predicted: (M, ny) predicted outputs of every recording [y-unit].
+
+        Returns:
+            (n,) differences of the values that count [y-unit].
+        """
+        parts = []
+        for y, recording, mask in zip(predicted, self.recordings, self.masks, strict=True):
+            counted = mask[:, output]
+            parts.append(y[counted, output] - recording.y[counted, output])
+        return np.concatenate(parts)
 
     def cost(self, at: UnknownValues) -> float:
         """Half of the sum of the residuals' loss and of the squared priors and pins.

@@ -19,6 +19,9 @@ from mjfim.records.estimate import Whiteness, WorstResidual
 # which the fit does not explain a motion.
 UNEXPLAINED_SHARE = 0.5
 
+# Number of rows that are whitened at once.
+ROWS_AT_ONCE = 100_000
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitQuality:
@@ -76,14 +79,14 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
     whitened = _whitened_residuals(problem, predicted)
     by_output = [[z[:, j] for z in whitened] for j in range(len(names))]
 
-    # Outliers do not count, because they do not have the distribution of the noise.
-    inliers = _without_outliers(problem, whitened)
-    chi2 = float(np.nansum(inliers**2)) / problem.loss.inlier_mean_square
-    dof = max(int(np.isfinite(inliers).sum()) - solution.condensed.rank, 1)
+    squares, count = _inliers(problem, by_output)
+    chi2 = squares / problem.loss.inlier_mean_square
+    dof = max(count - solution.condensed.rank, 1)
 
     rms = {}
     unexplained = []
-    for j, (name, errors) in enumerate(zip(names, problem.errors(predicted), strict=True)):
+    for j, name in enumerate(names):
+        errors = problem.errors_of(j, predicted)
         if not len(errors):
             continue
 
@@ -132,16 +135,28 @@ def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> list
     whitened = []
     for y, recording, mask in data:
         z = np.full(y.shape, np.nan)
-        difference = np.where(mask, recording.y - y, 0.0)
-        z[mask] = problem.noise.whiten_present(difference, mask)
+
+        # Long recordings are whitened in parts, so that no further copy of them is made.
+        for first in range(0, len(y), ROWS_AT_ONCE):
+            rows = slice(first, first + ROWS_AT_ONCE)
+            counted = mask[rows]
+            difference = np.where(counted, recording.y[rows] - y[rows], 0.0)
+            z[rows][counted] = problem.noise.whiten_present(difference, counted)
         whitened.append(z)
     return whitened
 
 
-def _without_outliers(problem: FitProblem, whitened: Sequence[Array]) -> Array:
-    """(n,) all whitened residuals; NaN for the outliers of a robust loss."""
-    columns = [z.ravel() for z in whitened]
-    residuals = np.concatenate(columns)
+def _inliers(problem: FitProblem, by_output: Sequence[Sequence[Array]]) -> tuple[float, int]:
+    """Sum of squares and number of the whitened residuals that are no outliers.
 
-    is_inlier = np.abs(residuals) <= problem.loss.outlier_threshold
-    return np.where(is_inlier, residuals, np.nan)
+    Outliers do not count, because they do not have the distribution of the noise.
+    """
+    squares = 0.0
+    count = 0
+    for parts in by_output:
+        for z in parts:
+            # A comparison with NaN is False.
+            inliers = z[np.abs(z) <= problem.loss.outlier_threshold]
+            squares += float(inliers @ inliers)
+            count += len(inliers)
+    return squares, count

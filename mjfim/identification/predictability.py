@@ -78,11 +78,12 @@ def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> Unpredictabl
         The amplification, and a better length; None if the segments suit the motion.
     """
     longest = max(problem.segments, key=lambda segment: segment.samples)
-    motion = problem.motion(at, longest.recording)
+    samples = min(longest.samples, MAX_SAMPLES)
+    motion = problem.motion(at, longest.recording, longest.begin + samples)
     if motion is None:
         return None
 
-    motion = _begin_of(motion, longest.begin, min(longest.samples, MAX_SAMPLES))
+    motion = _begin_of(motion, longest.begin, samples)
     plant = problem.system.plant
     try:
         A, _, _, _ = plant.derivatives.jacobians(problem.theta(at), motion)

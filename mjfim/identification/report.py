@@ -50,6 +50,13 @@ BOUND_TOLERANCE = 1e-6
 # engine steps of the model.
 MIN_SHARE_WITHIN_SAMPLES = 0.05
 
+# Number of samples after which the motion that an estimate holds for animations ends.
+MAX_MOTION_SAMPLES = 200_000
+
+# Number of rows of all recordings above which an estimate does not hold the outputs of the model at
+# the initial guess.
+MAX_NOMINAL_ROWS = 1_000_000
+
 # Relative rounding of the ratio of two periods.
 ROUNDING = 1e-6
 
@@ -298,7 +305,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         worst_residual=quality.worst_residual if findings.reasons else None,
         predictions=predictions,
         robust_uncertainty=accuracy.robust,
-        motion=problem.motion(solution.unknowns, 0),
+        motion=problem.motion(solution.unknowns, 0, MAX_MOTION_SAMPLES),
         interrupted=findings.interrupted,
         labels=labels_of_system(system),
         trace=_trace(result),
@@ -318,9 +325,11 @@ def _trace(result: FitResult) -> Array:
 def _nominal_outputs(result: FitResult) -> tuple[Array, ...]:
     """(M, ny) outputs of the model at the initial guess, from the fitted initial states.
 
-    There are none where the model diverges.
+    There are none where the model diverges, and none of much data, whose figures do without them.
     """
     problem, at = result.problem, result.solution.unknowns
+    if problem.row_count > MAX_NOMINAL_ROWS:
+        return ()
     guess = problem.begin(result.task.start)
     if problem.layout.free_starts:
         guess = replace(guess, private=at.private)

@@ -51,6 +51,14 @@ RUN_RATIO = 4
 # Autocorrelation below which it counts as zero.
 NO_AUTOCORRELATION = 0.05
 
+# Number of lags up to which autocorrelation is computed first, and the factor by which there are
+# more where it does not vanish.
+FIRST_LAGS = 1000
+LAG_GROWTH = 8
+
+# Number of values whose lagged products are computed at once.
+VALUES_AT_ONCE = 100_000
+
 # Smallest sum of squares in a denominator.
 SMALLEST_SQUARES = 1e-300
 
@@ -287,7 +295,7 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
     # Ljung & Box (1978).
     lags = min(LAGS, count // 5)
     longest_lag = max(max(len(part) for part in series) // 4, 1)
-    rho = _autocorrelation(series, max(lags, longest_lag))
+    rho = _autocorrelation(series, lags, max(lags, longest_lag))
     terms = rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))
     statistic = count * (count + 2) * float(np.sum(terms))
 
@@ -308,20 +316,40 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
     )
 
 
-def _autocorrelation(series: Sequence[Array], longest_lag: int) -> Array:
-    """(longest_lag+1,) autocorrelation of all series together.
+def _autocorrelation(series: Sequence[Array], least_lag: int, longest_lag: int) -> Array:
+    """(lags+1,) autocorrelation of all series together, up to a lag where it has vanished.
 
     The mean is not subtracted, because a constant offset is not noise either.
-    """
-    total = np.zeros(longest_lag + 1)
-    for part in series:
-        # The correlation has lags of both signs; lag zero is in the middle.
-        products = scipy.signal.correlate(part, part, method="fft")
-        zero_lag = len(part) - 1
-        at_lags = products[zero_lag : zero_lag + longest_lag + 1]
-        total[: len(at_lags)] += at_lags
 
-    return np.asarray(total / total[0])
+    Args:
+        series: Residuals of every recording.
+        least_lag: Lag up to which it is needed in any case.
+        longest_lag: Lag up to which it is computed where it does not vanish before.
+    """
+    lag = min(max(least_lag, FIRST_LAGS), longest_lag)
+    while True:
+        products = np.zeros(lag + 1)
+        for part in series:
+            products += _lagged_products(part, lag)
+
+        rho = products / products[0]
+        if lag >= longest_lag or (rho[least_lag:] < NO_AUTOCORRELATION).any():
+            return np.asarray(rho)
+        lag = min(LAG_GROWTH * lag, longest_lag)
+
+
+def _lagged_products(x: Array, lag: int) -> Array:
+    """(lag+1,) sums `sum_i x_i x_(i+k)` of a series x: (M,), for k up to a lag."""
+    total = np.zeros(lag + 1)
+    length = max(LAG_GROWTH * lag, VALUES_AT_ONCE)
+    for first in range(0, len(x), length):
+        # A part and the values after it, by a circular convolution that is longer than both.
+        part = x[first : first + length]
+        with_following = x[first : first + length + lag]
+        size = scipy.fft.next_fast_len(len(part) + lag, real=True)
+        spectrum = scipy.fft.rfft(with_following, size) * scipy.fft.rfft(part, size).conj()
+        total += scipy.fft.irfft(spectrum, size)[: lag + 1]
+    return total
 
 
 def _autocorrelation_time(rho: Array) -> float:

@@ -11,6 +11,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.next_step import next_step_on_part
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
 from mjfim.identification.task import FitTask
 from mjfim.model.parameter_samples import sample_parameters
@@ -50,6 +51,9 @@ SHORT_SEARCH_TOLERANCE = 1e-2
 
 # Iterations of the initial states of all segments, after theta was found on a subset of them.
 INITIAL_STATE_ITERATIONS = 2
+
+# Share of each segment, at its begin, on which these initial states are improved.
+INITIAL_STATE_SHARE = 0.2
 
 # Length of a step [standard deviations] at which initial states count as found.
 INITIAL_STATE_TOLERANCE = 0.1
@@ -147,7 +151,9 @@ class FitSearch:
         if is_whole and starts == 1:
             return placed
 
-        settings = replace(self._final_settings(problem), relinearise_at_end=False)
+        settings = replace(
+            self._final_settings(problem), relinearise_at_end=False, next_step_length=None
+        )
         found = [self._minimise(part, placed, settings, "part of the data")]
         found += self._from_random_starts(part, starts)
         best = min(found, key=lambda solution: solution.cost).unknowns
@@ -155,11 +161,12 @@ class FitSearch:
             return best
 
         # The initial states of the other segments are the measured ones, improved for the theta
-        # that was found.
+        # that was found. The first part of a segment is enough for that.
         private = np.array(begin.private)
         private[subset] = best.private
         whole = replace(best, private=private)
-        return self.with_initial_states(problem, whole, INITIAL_STATE_ITERATIONS)
+        first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
+        return self.with_initial_states(first_parts, whole, INITIAL_STATE_ITERATIONS)
 
     def solve(
         self,
@@ -199,6 +206,7 @@ class FitSearch:
             change = float(np.abs(sigma / problem.noise.sigma - 1.0).max())
             noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
             reweighted = problem.with_noise(noise)
+            settings = self._final_settings(reweighted, max_iterations)
             try:
                 refined = self._minimise(
                     reweighted, solution.unknowns, settings, f"{phase}, noise estimated"
@@ -262,7 +270,12 @@ class FitSearch:
         samples = problem.sample_count * 2 * len(self.task.system.parameters)
         if samples < SAMPLES_OF_MUCH_DATA:
             return settings
-        return replace(settings, tolerance=FINAL_TOLERANCE_OF_MUCH_DATA, relinearise_at_end=False)
+        return replace(
+            settings,
+            tolerance=FINAL_TOLERANCE_OF_MUCH_DATA,
+            relinearise_at_end=False,
+            next_step_length=next_step_on_part(problem),
+        )
 
     def with_initial_states(
         self,

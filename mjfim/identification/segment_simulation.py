@@ -143,7 +143,9 @@ class SegmentSimulation:
         """
         return [i for i, segment in enumerate(self.segments) if segment.recording == recording]
 
-    def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
+    def motion(
+        self, at: UnknownValues, recording: int, max_samples: int | None = None
+    ) -> Trajectory | None:
         """The fitted motion of one recording on the sample grid.
 
         It may jump from one segment to the next.
@@ -151,25 +153,29 @@ class SegmentSimulation:
         Args:
             at: The unknowns.
             recording: Index of the recording.
+            max_samples: Number of samples after which the motion ends, if it lasts longer.
 
         Returns:
             The motion; None where it diverges.
         """
         plant = self.system.plant
-        ctrl = self.recordings[recording].ctrl
+        ctrl = self.recordings[recording].ctrl[:max_samples]
         model = plant.model(self.layout.theta_of_recording(at, recording))
 
         states = np.full((len(ctrl) + 1, plant.nominal_initial_state.size), np.nan)
         for i in self.segments_of(recording):
             segment = self.segments[i]
+            samples = min(segment.samples, len(ctrl) - segment.begin)
+            if samples <= 0:
+                continue
             start = self._initial_state(at, i)
-            held = self._control(i, segment.samples)
+            held = self._control(i, samples)
             simulated = plant.simulator.rollout([model], start[None], held[None])
             if not simulated.finite[0]:
                 return None
 
             # Segments overlap where outputs are delayed; there, the earlier segment counts.
-            part = states[segment.begin : segment.begin + segment.samples + 1]
+            part = states[segment.begin : segment.begin + samples + 1]
             missing = np.isnan(part[:, 0])
             part[missing] = simulated.states[0][missing]
 

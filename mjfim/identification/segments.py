@@ -8,7 +8,7 @@ from one segment to the next.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,23 @@ class Segment:
     samples: int
     rows: slice
     start: Array
+
+    def first_part(self, t: Array, dt: float, share: float) -> Segment:
+        """The first rows of this segment, and the samples that they need.
+
+        Args:
+            t: (M,) times of the rows of the recording [s].
+            dt: Sample period [s].
+            share: Share of the rows.
+        """
+        count = self.rows.stop - self.rows.start
+        last = self.rows.start + max(int(np.ceil(share * count)), min(count, MIN_SAMPLES))
+        samples = int(np.ceil(t[last - 1] / dt - EDGE_TOLERANCE)) - self.begin
+        return replace(
+            self,
+            samples=min(max(samples, MIN_SAMPLES), self.samples),
+            rows=slice(self.rows.start, last),
+        )
 
 
 def whole_recordings(system: System, recordings: Sequence[AlignedRecording]) -> tuple[Segment, ...]:
@@ -213,11 +230,8 @@ def _local_fit(
     recording: AlignedRecording, column: int, t0: float, degree: int
 ) -> tuple[float, float]:
     """Value and slope of an output at time t0 [s], from a polynomial fit to nearby values."""
-    measured = recording.measured_rows[column]
-    row_after = np.searchsorted(recording.t, t0)
-    middle = int(np.searchsorted(measured, row_after))
-    first = max(middle - ROWS_PER_SIDE, 0)
-    rows = measured[first : middle + ROWS_PER_SIDE]
+    row_after = int(np.searchsorted(recording.t, t0))
+    rows = recording.measured_rows_near(column, row_after, ROWS_PER_SIDE)
 
     times = recording.t[rows] - t0
     y = recording.y[rows, column]
@@ -233,13 +247,8 @@ def _local_fit(
 def _nearest_values(recording: AlignedRecording, columns: Sequence[int], t0: float) -> Array:
     """Measured values of some outputs in the row nearest to time t0 [s]."""
     # Components of one quaternion are measured together.
-    measured = recording.measured_rows[columns[0]]
-    row_after = np.searchsorted(recording.t, t0)
-    after = int(np.searchsorted(measured, row_after))
-    after = min(after, len(measured) - 1)
-    before = max(after - 1, 0)
-
-    candidates = (measured[before], measured[after])
+    row_after = int(np.searchsorted(recording.t, t0))
+    candidates = recording.measured_rows_near(columns[0], row_after, 1)
     nearest = min(candidates, key=lambda row: abs(recording.t[row] - t0))
     return np.asarray(recording.y[nearest, list(columns)])
 
@@ -270,8 +279,8 @@ def _measured_states(system: System, recording: AlignedRecording) -> dict[int, i
     Outputs without any value in the recording are left out.
     """
     outputs = outputs_by_state(system.model, system.outputs)
-    values = recording.measured_rows
-    return {state: output for state, output in outputs.items() if len(values[output])}
+    has_values = np.asarray(recording.measured.any(axis=0))
+    return {state: output for state, output in outputs.items() if has_values[output]}
 
 
 def batches(segments: Sequence[Segment], max_samples: int) -> Iterator[list[int]]:

@@ -8,7 +8,7 @@ unknowns, and its solution is exact.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -159,6 +159,43 @@ class Condensed:
 
         rows = np.concatenate([remaining, R[:, n:, n:]], axis=1)
         return np.asarray(rows.reshape(-1, rows.shape[2]))
+
+    def gradients_after(self, common: Array) -> Array:
+        """Gradient of every segment after a step of the common unknowns, by the linearisation.
+
+        The private unknowns follow at their optimum.
+
+        Args:
+            common: (c,) step of the common unknowns.
+
+        Returns:
+            (P, c) gradients of half of the squares of each segment, without the `common_rows`.
+        """
+        rows = self.reduced_rows()
+        J, residual = rows[:, :-1], rows[:, :-1] @ common + rows[:, -1]
+        each = (J * residual[:, None]).reshape(self.segment_count, -1, J.shape[1])
+        return np.asarray(each.sum(axis=1))
+
+    def after(self, step: Step) -> Condensed:
+        """The linearised residuals at the end of a step.
+
+        Args:
+            step: Step of all unknowns.
+
+        Returns:
+            Rows with equal derivatives, and with the residuals that the linearisation predicts.
+        """
+        n = self.private_count
+        everywhere = np.broadcast_to(step.common, (self.segment_count, len(step.common)))
+        moves = np.concatenate([step.private, everywhere], axis=1)[..., None]
+
+        blocks = np.array(self.blocks)
+        blocks[..., -1:] += blocks[..., :-1] @ moves[self.segment_of_block]
+        private_rows = np.array(self.private_rows)
+        private_rows[..., -1:] += private_rows[..., :-1] @ moves
+        common_rows = np.array(self.common_rows)
+        common_rows[:, -1] += common_rows[:, :-1] @ moves[0, n:, 0]
+        return replace(self, blocks=blocks, private_rows=private_rows, common_rows=common_rows)
 
     @property
     def rank(self) -> int:

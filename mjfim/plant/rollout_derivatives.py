@@ -24,7 +24,7 @@ MIN_PARAMETER_EFFECT = 1e-2
 MAX_STEP_FACTOR = 100.0
 
 # Largest number of state values that are in memory at once.
-MAX_NUMBERS_AT_ONCE = 8_000_000
+MAX_NUMBERS_AT_ONCE = 2_000_000
 
 # Largest effect of the parameters on an output, relative to the output, that may be round-off.
 ROUND_OFF_EFFECT = 1e-9

@@ -110,18 +110,46 @@ def read_log(path: Path, channels: Channels) -> Log:
     except RecordingError as error:
         raise RecordingError(f"{error}. {table.unit_hint}" if table.unit_hint else error) from None
 
-    # The control of the last row is left out, because it would act after the end of the recording.
-    # A model without actuators has none.
-    constant = {name: np.full(len(t), value) for name, value in spec.constants.items()}
-    controls = [(columns | constant)[name][:-1] for name in channels.control_columns]
-    ctrl = np.column_stack(controls) if controls else np.zeros((len(t) - 1, 0))
-    y = np.column_stack([columns[name] for name in measured])
     column_names = {name: source.column for name, source in sources.items()}
+    summary = summarize(str(path), t, columns, column_names, dropped=len(stamps) - len(t))
 
-    return Log(
-        recording=Recording(t=t, ctrl=ctrl, y=y, outputs=measured, name=str(path)),
-        summary=summarize(str(path), t, columns, column_names, dropped=len(stamps) - len(t)),
+    # Columns are dropped as soon as the recording holds them, since logs may be long.
+    table.columns.clear()
+    recording = Recording(
+        t=_frozen(t),
+        ctrl=_controls(columns, channels, len(t) - 1),
+        y=_joined(columns, measured, len(t)),
+        outputs=measured,
+        name=str(path),
     )
+    return Log(recording=recording, summary=summary)
+
+
+def _controls(columns: dict[str, Array], channels: Channels, rows: int) -> Array:
+    """(M-1, nu) controls of all rows but the last one, whose control would act after the end.
+
+    A model without actuators has none. The columns of controls are taken out of `columns`.
+    """
+    constants = channels.spec.constants
+    for name in channels.control_columns:
+        if name in constants:
+            columns[name] = np.full(rows, constants[name])
+    return _joined(columns, channels.control_columns, rows)
+
+
+def _joined(columns: dict[str, Array], names: Sequence[str], rows: int) -> Array:
+    """(rows, n) read-only matrix of the first rows of n columns, taken out of `columns`."""
+    matrix = np.empty((rows, len(names)))
+    for j, name in enumerate(names):
+        matrix[:, j] = columns.pop(name)[:rows]
+    return _frozen(matrix)
+
+
+def _frozen(array: Array) -> Array:
+    """This array, read-only from now on, so that records share it."""
+    own = array if array.flags.owndata else np.array(array)
+    own.setflags(write=False)
+    return own
 
 
 def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:

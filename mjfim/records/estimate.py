@@ -62,7 +62,8 @@ class Estimate(ShownRecord):
         per_recording: Values for each recording of the parameters that differ between recordings;
             `theta` holds their values for the first recording.
         robust_uncertainty: Robust uncertainty of the common unknowns, or None.
-        motion: Motion of the fitted model for the first recording, or None.
+        motion: Motion of the fitted model for the first recording, at most its first 200 000
+            samples; None where it diverges.
         interrupted: True if the user interrupted the fit.
         seconds: Wall time [s].
         steps: MuJoCo steps taken.
@@ -73,7 +74,8 @@ class Estimate(ShownRecord):
         trace: (n, p) the initial guess, and the parameters at the begin and at each iteration of
             the search over all data [theta-unit]; empty in records of earlier versions.
         nominal: Outputs of the model at the initial guess, with the fitted initial states, for each
-            recording, (M, ny) [unit of the output]; empty where it diverges.
+            recording, (M, ny) [unit of the output]; empty where it diverges, and for recordings of
+            more than 1 000 000 rows together.
         segments: Times at which the segments of each recording begin [s].
         sizes: (p,) sizes of which relative numbers are a share: magnitudes of the values, or of the
             whole vector or tensor of an entry [theta-unit].

@@ -304,3 +304,21 @@ def test_an_aligned_recording_does_not_change(task: DesignTask) -> None:
     with pytest.raises(ValueError, match="read-only"):
         aligned.y[0, 0] = 1.0
     np.testing.assert_array_equal(plain.y, before)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 1.0])
+def test_measured_rows_near_a_place(share: float) -> None:
+    """They are those of a search in all rows, however many values are missing."""
+    rng = np.random.default_rng(0)
+    measured = rng.random(400) < share
+    y = np.where(measured, 1.0, np.nan)[:, None]
+    recording = AlignedRecording(
+        name="log", t=np.arange(400.0), y=y, ctrl=np.zeros((399, 1)), dt=1.0, on_grid=True
+    )
+    rows = np.flatnonzero(measured)
+    for row in (0, 1, 57, 200, 398, 400):
+        for count in (1, 12):
+            middle = int(np.searchsorted(rows, row))
+            expected = rows[max(middle - count, 0) : middle + count]
+            found = recording.measured_rows_near(0, row, count)
+            np.testing.assert_array_equal(found, expected)

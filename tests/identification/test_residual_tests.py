@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom, chi2
 
+from mjfim.identification import residual_tests
 from mjfim.identification.residual_tests import LAGS, whiteness_of
 from mjfim.records.estimate import Whiteness
 from tests.support.numerics import Array
@@ -165,3 +166,19 @@ def test_too_few_residuals_pass(parts: list[Array]) -> None:
     """There are no values, few values, or only zeros."""
     found = whiteness_of("y", parts)
     assert (found.p, found.inflation, found.time) == (1.0, 1.0, 1.0)
+
+
+def test_lagged_products_do_not_depend_on_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few lags are computed first, part by part; slow residuals need more of them."""
+    rng = np.random.default_rng(3)
+    slow, quick = autoregressive(0.98, 3000, rng), rng.standard_normal(3000)
+    whole = [whiteness_of("y", [series]) for series in (slow, quick)]
+
+    monkeypatch.setattr(residual_tests, "FIRST_LAGS", 5)
+    monkeypatch.setattr(residual_tests, "VALUES_AT_ONCE", 100)
+    for expected, series in zip(whole, (slow, quick), strict=True):
+        found = whiteness_of("y", [series])
+        assert found.time == pytest.approx(expected.time, rel=1e-9)
+        assert found.p == pytest.approx(expected.p, rel=1e-6)
+        direct = float(series[1:] @ series[:-1] / (series @ series))
+        assert found.correlation == pytest.approx(direct, rel=1e-9)

@@ -381,3 +381,31 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
         close(two.private * unit[:2], one.private, rtol=1e-6)
         assert two.common_length == pytest.approx(one.common_length, rel=1e-6)
     close(other.information(), C.information() * np.outer(unit[2:-1], unit[2:-1]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_linearisation_after_a_step_has_its_residuals(shape: tuple[int, int, int]) -> None:
+    """Residuals are those of the dense rows, and gradients those of the reduced ones."""
+    dense = problem(2, *shape, inner=shape[1] + 1)
+    C, n = dense.condensed, dense.n
+    free = np.full(dense.c, np.inf)
+    step = C.step(1e-3, C.column_norms, -free, free)
+    moved = C.after(step)
+
+    # Squares of all rows at the end of the step.
+    private = moved.triangles[..., -1]
+    squares = float(np.sum(private**2)) + float(np.sum(moved.common_rows[:, -1] ** 2))
+    assert 0.5 * squares == pytest.approx(dense.halves(step), rel=1e-9)
+    close(moved.information(), C.information())
+
+    # The private unknowns follow, so that only the step of the common ones counts.
+    before = C.gradients_after(step.common)
+    after = moved.gradients_after(np.zeros(dense.c))
+    scale = np.abs(before).max(initial=1e-300)
+    np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-7 * scale)
+    scores = np.zeros((dense.P, dense.c))
+    np.add.at(scores, moved.segment_of_block, moved.block_scores)
+    if not n:
+        of_private = moved.reduced_private_rows
+        scores += np.einsum("pkc,pk->pc", of_private[..., :-1], of_private[..., -1])
+        np.testing.assert_allclose(after, scores, rtol=1e-6, atol=1e-7 * scale)

@@ -118,14 +118,15 @@ def _read_csv(path: Path, spec: RecordingSpec) -> Table:
         check_names(path, names)
 
         needed = columns_to_read(names, spec)
-        table = _parse_csv(path, needed)
+        unread = tuple(name for name in names if name not in needed)
+
+        # Only the conversion holds the table, so that it can drop the columns one by one.
+        return _from_arrow(path, _parse_csv(path, needed), unread)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file") from None
     except DAMAGED as error:
         fault = LONG_LINE if "straddling object" in str(error) else one_line(error)
         raise RecordingError(f"{path}: not a readable CSV table: {fault}") from None
-
-    return _from_arrow(path, table, tuple(name for name in names if name not in needed))
 
 
 def _parse_csv(path: Path, names: list[str]) -> Any:
@@ -134,19 +135,22 @@ def _parse_csv(path: Path, names: list[str]) -> Any:
     If a column holds text, the type of every column is inferred from its content.
     """
     try:
-        return _parse_csv_as(path, names, {name: pyarrow.float64() for name in names})
+        return _parse_numbers(path, names)
     except pyarrow.ArrowInvalid as error:
         if "conversion error" not in str(error):
             raise
 
     # This is slower, but it shows which columns hold text.
-    return _parse_csv_as(path, names, {})
-
-
-def _parse_csv_as(path: Path, names: list[str], types: dict[str, Any]) -> Any:
-    """Parse columns; the type of a column without a stated type is inferred from its content."""
-    options = pyarrow.csv.ConvertOptions(include_columns=names, column_types=types)
+    options = pyarrow.csv.ConvertOptions(include_columns=names)
     return pyarrow.csv.read_csv(_source(path), convert_options=options)
+
+
+def _parse_numbers(path: Path, names: list[str]) -> Any:
+    """Parse columns of numbers block by block; the text of the file is never held in memory."""
+    types = {name: pyarrow.float64() for name in names}
+    options = pyarrow.csv.ConvertOptions(include_columns=names, column_types=types)
+    with pyarrow.csv.open_csv(_source(path), convert_options=options) as blocks:
+        return blocks.read_all()
 
 
 def _is_packed(path: Path) -> bool:
@@ -187,13 +191,12 @@ def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
 
             needed = columns_to_read(names, spec)
             check_column_size(path, file.metadata.num_rows, len(needed))
-            table = file.read(columns=needed)
+            unread = tuple(name for name in names if name not in needed)
+            return _from_arrow(path, file.read(columns=needed), unread)
     except DAMAGED as error:
         raise RecordingError(
             f"{path}: not a readable Parquet file (damaged or truncated?): {one_line(error)}"
         ) from None
-
-    return _from_arrow(path, table, tuple(name for name in names if name not in needed))
 
 
 def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
@@ -217,9 +220,14 @@ def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
         fault = _fault_of_type(kind)
         if fault is None:
             numbers = column.cast(pyarrow.float64(), safe=False)
-            columns[name] = np.asarray(numbers.to_numpy(zero_copy_only=False))
+            columns[name] = np.array(numbers.to_numpy(zero_copy_only=False))
+            del numbers
         else:
             faults[name] = fault
+
+        # Arrow keeps freed memory for later tables, unless it is asked to give it back.
+        del column
+        pyarrow.default_memory_pool().release_unused()
 
     return Table(
         source=path,
