@@ -254,7 +254,7 @@ def _score_test(
 
     # A share above 1 means that the fit is too far from its minimum for a linear test.
     is_impossible = candidate.positive and candidate.value + value < 0.0
-    is_significant = sigmas > scipy.stats.norm.isf(0.5 * SIGNIFICANCE / count)
+    is_significant = sigmas > -scipy.special.ndtri(0.5 * SIGNIFICANCE / count)
     if is_impossible or not is_significant or not MIN_EXPLAINED_SHARE < share < 1.0:
         return None
 

@@ -73,7 +73,7 @@ def is_larger_than_noise(chi2: float, dof: int) -> bool:
     Returns:
         True where the difference is significant and relevant.
     """
-    significant = scipy.stats.chi2.sf(chi2, dof) < SIGNIFICANCE
+    significant = scipy.special.chdtrc(dof, chi2) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) > RELEVANT_SIZE_RATIO)
 
 
@@ -87,7 +87,7 @@ def is_smaller_than_noise(chi2: float, dof: int) -> bool:
     Returns:
         True where the difference is significant and relevant.
     """
-    significant = scipy.stats.chi2.cdf(chi2, dof) < SIGNIFICANCE
+    significant = scipy.special.chdtr(dof, chi2) < SIGNIFICANCE
     return bool(significant and np.sqrt(chi2 / dof) < 1.0 / RELEVANT_SIZE_RATIO)
 
 
@@ -303,7 +303,7 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
     # by the number of tests (Bonferroni).
     variance = squares / count
     runs = list(_run_tests(series, variance))
-    probabilities = [float(scipy.stats.chi2.sf(statistic, lags)), *(p for _, p in runs)]
+    probabilities = [float(scipy.special.chdtrc(lags, statistic)), *(p for _, p in runs)]
     inflation = max((ratio for ratio, _ in runs), default=1.0)
     return Whiteness(
         output=output,
@@ -387,5 +387,5 @@ def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float
             return
 
         statistic = length * float(joined @ joined) / variance
-        yield statistic / len(joined), float(scipy.stats.chi2.sf(statistic, len(joined)))
+        yield statistic / len(joined), float(scipy.special.chdtrc(len(joined), statistic))
         length *= RUN_RATIO

@@ -177,8 +177,8 @@ def _interval(
         count: Number of blocks from which the sandwich covariance was computed.
     """
     upper_tail = 0.5 + LEVEL / 2.0
-    student_quantile = float(scipy.stats.t.ppf(upper_tail, max(count - 1, 1)))
-    normal_quantile = float(scipy.stats.t.ppf(upper_tail, 1e9))
+    student_quantile = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail))
+    normal_quantile = float(scipy.special.stdtrit(1e9, upper_tail))
 
     half_width = np.maximum(
         normal_quantile * np.hypot(formal, between),
@@ -336,7 +336,7 @@ def _compare_recordings(
         mean = np.sum(w * y) / w.sum()
         scatter = float(np.sum(w * (y - mean) ** 2))
         others = int(estimated.sum()) - 1
-        if scipy.stats.f.sf(scatter / others, others, freedom) < SIGNIFICANCE:
+        if scipy.special.fdtrc(others, freedom, scatter / others) < SIGNIFICANCE:
             apart.append(j)
             excess = max(scatter - others, 0.0)
             between[j] = np.sqrt(excess / (w.sum() - np.sum(w**2) / w.sum()))
