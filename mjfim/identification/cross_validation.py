@@ -72,7 +72,7 @@ def predict(
     problem = FitProblem.of(system, recordings)
     values = np.asarray(theta)
     return tuple(
-        _predicted(problem, values, _masks_of(problem.masks, [i]), recording.name, Budget())[0]
+        _errors(problem, values, _masks_of(problem.masks, [i]), recording.name, Budget())
         for i, recording in enumerate(problem.recordings)
     )
 
@@ -192,64 +192,88 @@ def _prediction(
         name = f"last {100 * PREDICTED_SHARE:.0f} % of {name}"
 
     guess = problem.system.parameters.guess
-    errors, outputs = _predicted(problem, theta, part.masks, name, budget)
-    nominal_errors, nominal_outputs = _predicted(problem, guess, part.masks, name, budget)
-    prediction = Prediction(name=name, identified=errors, nominal=nominal_errors, held_out=held_out)
 
     # The fitted recordings are in the estimate anyway.
     if not held_out:
-        return prediction
+        return Prediction(
+            name=name,
+            identified=_errors(problem, theta, part.masks, name, budget),
+            nominal=_errors(problem, guess, part.masks, name, budget),
+            held_out=False,
+        )
+
+    errors, outputs = _predicted(problem, theta, part.masks, name, budget)
+    nominal_errors, nominal_outputs = _predicted(problem, guess, part.masks, name, budget)
     i = part.recordings[0]
-    return replace(
-        prediction,
+    return Prediction(
+        name=name,
+        identified=errors,
+        nominal=nominal_errors,
+        held_out=True,
         identified_outputs=outputs[i],
         nominal_outputs=nominal_outputs[i],
     )
 
 
+def _errors(
+    problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], name: str, budget: Budget
+) -> PredictionErrors:
+    """Errors of the values in some masks: (M, ny) for every recording, at theta: (p,)."""
+    part, at = _begun(problem, theta, masks, budget)
+    return _errors_of(problem, part.masked(masks).errors_at(at), name)
+
+
 def _predicted(
-    problem: FitProblem,
-    theta: Array,
-    masks: Sequence[np.ndarray],
-    name: str,
-    budget: Budget,
+    problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], name: str, budget: Budget
 ) -> tuple[PredictionErrors, list[Array]]:
     """Predict the values in some masks: (M, ny) for every recording, at theta: (p,).
-
-    Unknown initial states are estimated from the other values of a segment, or from the predicted
-    ones where it has no others.
 
     Returns:
         The errors, and for every recording the (M, ny) outputs, NaN where the model diverges.
     """
-    diverged = [np.full(mask.shape, np.nan) for mask in masks]
+    part, at = _begun(problem, theta, masks, budget)
+    predicted = part.predict(at)
+    if predicted is None:
+        diverged = [np.full(mask.shape, np.nan) for mask in masks]
+        return _errors_of(problem, None, name), diverged
+    return _errors_of(problem, part.masked(masks).errors(predicted), name), predicted
+
+
+def _begun(
+    problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], budget: Budget
+) -> tuple[FitProblem, UnknownValues]:
+    """The segments with values in some masks: (M, ny) for every recording, and their unknowns.
+
+    Unknown initial states are estimated from the other values of a segment, or from the predicted
+    ones where it has no others. theta: (p,).
+    """
     problem = problem.of_segments(problem.masked(masks).segments_with_values)
     at = problem.begin(theta)
+    if problem.unknown_count <= len(problem.layout.shared):
+        return problem, at
 
-    if problem.unknown_count > len(problem.layout.shared):
-        # Deviations of the initial state that were fitted belong to other recordings.
-        private = np.zeros_like(at.private)
-        if not problem.layout.free_starts:
-            guess = problem.system.parameters.guess[problem.layout.private]
-            private = np.tile(guess, (len(problem.segments), 1))
+    # Deviations of the initial state that were fitted belong to other recordings.
+    private = np.zeros_like(at.private)
+    if not problem.layout.free_starts:
+        guess = problem.system.parameters.guess[problem.layout.private]
+        private = np.tile(guess, (len(problem.segments), 1))
 
-        known = problem.masked(_masks_for_initial_states(problem, masks))
-        begin = replace(at, private=private)
-        found = minimise(known.with_shared_held(), begin, SEARCH, budget)
-        at = at if found is None else found.unknowns
+    known = problem.masked(_masks_for_initial_states(problem, masks))
+    begin = replace(at, private=private)
+    found = minimise(known.with_shared_held(), begin, SEARCH, budget)
+    return problem, at if found is None else found.unknowns
 
+
+def _errors_of(problem: FitProblem, errors: Sequence[Array] | None, name: str) -> PredictionErrors:
+    """Sizes of the errors of every output; NaN without any, or where the model diverges."""
     outputs = problem.system.outputs.names
     rms = np.full(len(outputs), np.nan)
     mae = np.full(len(outputs), np.nan)
-    predicted = problem.predict(at)
-    if predicted is not None:
-        for j, errors in enumerate(problem.masked(masks).errors(predicted)):
-            if len(errors):
-                rms[j] = np.sqrt(np.mean(errors**2))
-                mae[j] = np.mean(np.abs(errors))
-
-    errors_of_all = PredictionErrors(name=name, outputs=outputs, rms=rms, mae=mae)
-    return errors_of_all, diverged if predicted is None else predicted
+    for j, of_output in enumerate(errors or []):
+        if len(of_output):
+            rms[j] = np.sqrt(np.mean(of_output**2))
+            mae[j] = np.mean(np.abs(of_output))
+    return PredictionErrors(name=name, outputs=outputs, rms=rms, mae=mae)
 
 
 def _masks_for_initial_states(

@@ -397,6 +397,23 @@ class FitProblem:
         """
         return self.simulation.motion(at, recording, max_samples)
 
+    def errors_at(self, at: UnknownValues) -> list[Array] | None:
+        """Predicted minus measured values of every output, without the predictions themselves.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            One array for each output [y-unit]; None where a simulation diverges.
+        """
+        parts: list[list[Array]] = [[np.zeros(0)] for _ in self.system.outputs.names]
+        for rows in self.simulation.rows(at, derivatives=False):
+            if rows is None:
+                return None
+            for found, errors in zip(parts, self.whitened.errors(rows), strict=True):
+                found.append(errors)
+        return [np.concatenate(found) for found in parts]
+
     def errors(self, predicted: Sequence[Array]) -> list[Array]:
         """Predicted minus measured values of every output, for all recordings in their order.
 

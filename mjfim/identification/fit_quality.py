@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,16 +11,13 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.residual_tests import find_worst_residual, whiteness_of
+from mjfim.identification.residual_tests import LargestResidual, whiteness_of
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Whiteness, WorstResidual
 
 # Ratio of the root mean square residual to the standard deviation of the measured values, above
 # which the fit does not explain a motion.
 UNEXPLAINED_SHARE = 0.5
-
-# Number of rows that are whitened at once.
-ROWS_AT_ONCE = 100_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,46 +71,49 @@ def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
     if predicted is None:
         raise SimulationDivergedError("the simulation diverges near the estimate")
 
-    names = problem.system.outputs.names
-    recordings = problem.recordings
-    whitened = _whitened_residuals(problem, predicted)
-    by_output = [[z[:, j] for z in whitened] for j in range(len(names))]
-
-    squares, count = _inliers(problem, by_output)
-    chi2 = squares / problem.loss.inlier_mean_square
-    dof = max(count - solution.condensed.rank, 1)
-
+    recordings = [Path(recording.name).name for recording in problem.recordings]
+    times = [recording.t for recording in problem.recordings]
+    squares = 0.0
+    count = 0
     rms = {}
     unexplained = []
-    for j, name in enumerate(names):
+    whiteness = []
+    largest = LargestResidual()
+
+    names = problem.system.outputs.names
+    for j, (name, series) in enumerate(
+        zip(names, _whitened_residuals(problem, predicted), strict=True)
+    ):
+        squares_of_output, count_of_output = _inliers(problem, series)
+        squares += squares_of_output
+        count += count_of_output
+        whiteness.append(whiteness_of(name, series))
+        largest = largest.with_output(name, recordings, times, series)
+
         errors = problem.errors_of(j, predicted)
         if not len(errors):
             continue
 
-        rms[name] = float(np.sqrt(np.mean(errors**2)))
-        mean_square = float(np.nanmean(np.concatenate(by_output[j]) ** 2))
-
         # Residuals that are nearly as large as the motion, and larger than the noise.
+        rms[name] = float(np.sqrt(np.mean(errors**2)))
         large = rms[name] > UNEXPLAINED_SHARE * _measured_deviation(problem, j)
-        if large and mean_square > 1.0 / UNEXPLAINED_SHARE**2:
+        if large and _mean_square(series) > 1.0 / UNEXPLAINED_SHARE**2:
             unexplained.append(name)
 
     return FitQuality(
         predicted=tuple(predicted),
-        chi2=chi2,
-        dof=dof,
+        chi2=squares / problem.loss.inlier_mean_square,
+        dof=max(count - solution.condensed.rank, 1),
         rms=rms,
-        whiteness=tuple(
-            whiteness_of(name, series) for name, series in zip(names, by_output, strict=True)
-        ),
-        worst_residual=find_worst_residual(
-            names,
-            [Path(recording.name).name for recording in recordings],
-            [recording.t for recording in recordings],
-            whitened,
-        ),
+        whiteness=tuple(whiteness),
+        worst_residual=largest.interval,
         unexplained=tuple(unexplained),
     )
+
+
+def _mean_square(series: Sequence[Array]) -> float:
+    """Mean square of the residuals of an output, NaN where not measured."""
+    return float(np.nanmean(np.concatenate(series) ** 2))
 
 
 def _measured_deviation(problem: FitProblem, output: int) -> float:
@@ -125,38 +125,49 @@ def _measured_deviation(problem: FitProblem, output: int) -> float:
     return float(np.std(np.concatenate(values)))
 
 
-def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> list[Array]:
-    """(M, ny) whitened measured minus predicted values of every recording.
+def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> Iterator[list[Array]]:
+    """Whitened measured minus predicted values, output by output, so that memory holds one of them.
 
-    They are NaN where there is no measured value that counts.
+    Yields:
+        (M,) residuals of an output for every recording, NaN where no measured value counts.
     """
-    data = zip(predicted, problem.recordings, problem.masks, strict=True)
+    noise = problem.noise
+    if noise.correlated:
+        yield from _correlated_residuals(problem, predicted)
+        return
 
+    data = list(zip(predicted, problem.recordings, problem.masks, strict=True))
+    for j, sigma in enumerate(noise.sigma):
+        series = []
+        for y, recording, mask in data:
+            z = recording.y[:, j] - y[:, j]
+            z /= sigma
+            z[~mask[:, j]] = np.nan
+            series.append(z)
+        yield series
+
+
+def _correlated_residuals(problem: FitProblem, predicted: Sequence[Array]) -> Iterator[list[Array]]:
+    """Whitened residuals, output by output, where the noise of the outputs is correlated."""
     whitened = []
-    for y, recording, mask in data:
+    for y, recording, mask in zip(predicted, problem.recordings, problem.masks, strict=True):
         z = np.full(y.shape, np.nan)
-
-        # Long recordings are whitened in parts, so that no further copy of them is made.
-        for first in range(0, len(y), ROWS_AT_ONCE):
-            rows = slice(first, first + ROWS_AT_ONCE)
-            counted = mask[rows]
-            difference = np.where(counted, recording.y[rows] - y[rows], 0.0)
-            z[rows][counted] = problem.noise.whiten_present(difference, counted)
+        difference = np.where(mask, recording.y - y, 0.0)
+        z[mask] = problem.noise.whiten_present(difference, mask)
         whitened.append(z)
-    return whitened
+    yield from ([z[:, j] for z in whitened] for j in range(len(problem.noise.sigma)))
 
 
-def _inliers(problem: FitProblem, by_output: Sequence[Sequence[Array]]) -> tuple[float, int]:
-    """Sum of squares and number of the whitened residuals that are no outliers.
+def _inliers(problem: FitProblem, series: Sequence[Array]) -> tuple[float, int]:
+    """Sum of squares and number of the whitened residuals of an output that are no outliers.
 
     Outliers do not count, because they do not have the distribution of the noise.
     """
     squares = 0.0
     count = 0
-    for parts in by_output:
-        for z in parts:
-            # A comparison with NaN is False.
-            inliers = z[np.abs(z) <= problem.loss.outlier_threshold]
-            squares += float(inliers @ inliers)
-            count += len(inliers)
+    for z in series:
+        # A comparison with NaN is False.
+        inliers = z[np.abs(z) <= problem.loss.outlier_threshold]
+        squares += float(inliers @ inliers)
+        count += len(inliers)
     return squares, count

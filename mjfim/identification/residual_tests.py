@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -191,28 +192,73 @@ def find_worst_residual(
     Returns:
         The interval; None without residuals.
     """
-    total = sum(float(np.nansum(z**2)) for z in whitened)
+    found = LargestResidual()
+    for j, output in enumerate(outputs):
+        found = found.with_output(output, recordings, times, [z[:, j] for z in whitened])
+    return found.interval
+
+
+@dataclass(frozen=True, kw_only=True)
+class LargestResidual:
+    """The interval in which residuals are largest, among those of some outputs.
+
+    Attributes:
+        total: Sum of the squares of all residuals.
+        squares: Sum of the squares in the interval.
+        worst: The interval, whose share is not known yet; None without residuals.
+    """
+
+    total: float = 0.0
+    squares: float = 0.0
     worst: WorstResidual | None = None
-    for name, t, z in zip(recordings, times, whitened, strict=True):
-        for j, output in enumerate(outputs):
-            windows = _windows(t, z[:, j])
+
+    @property
+    def interval(self) -> WorstResidual | None:
+        """The interval with its share of the sum of squares; None without residuals."""
+        if self.worst is None:
+            return None
+        return replace(self.worst, share=self.squares / max(self.total, SMALLEST_SQUARES))
+
+    def with_output(
+        self,
+        output: str,
+        recordings: Sequence[str],
+        times: Sequence[Array],
+        whitened: Sequence[Array],
+    ) -> LargestResidual:
+        """The interval among those of one more output.
+
+        Args:
+            output: Name of the output.
+            recordings: Names of the recordings.
+            times: (M,) times of the rows of every recording [s].
+            whitened: (M,) whitened residuals of every recording, NaN where not measured.
+
+        Returns:
+            The larger one of the two intervals.
+        """
+        total, squares, worst = self.total, self.squares, self.worst
+        for name, t, z in zip(recordings, times, whitened, strict=True):
+            windows = _windows(t, z)
             if windows is None:
                 continue
 
+            total += float(windows.squares.sum())
             inside = _largest_windows(windows)
-            squares = float(windows.squares[inside].sum())
+            within = float(windows.squares[inside].sum())
             count = max(windows.counts[inside].sum(), 1)
-            found = WorstResidual(
-                output=output,
-                recording=name,
-                begin=windows.edges[inside.start],
-                end=windows.edges[inside.stop],
-                size=float(np.sqrt(squares / count)),
-                share=squares / max(total, SMALLEST_SQUARES),
-            )
-            if worst is None or found.size > worst.size:
-                worst = found
-    return worst
+            size = float(np.sqrt(within / count))
+            if worst is None or size > worst.size:
+                squares = within
+                worst = WorstResidual(
+                    output=output,
+                    recording=name,
+                    begin=windows.edges[inside.start],
+                    end=windows.edges[inside.stop],
+                    size=size,
+                    share=0.0,
+                )
+        return LargestResidual(total=total, squares=squares, worst=worst)
 
 
 def _windows(t: Array, z: Array) -> _Windows | None:
@@ -232,14 +278,14 @@ def _windows(t: Array, z: Array) -> _Windows | None:
     # Windows of equal duration; round-off must not exclude the last row.
     count = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
     edges = np.linspace(t[0], t[-1] * (1 + 1e-12), count + 1)
+    rows = np.searchsorted(t, edges)
+    rows[0], rows[-1] = 0, len(t)
 
-    window_of_row = np.searchsorted(edges, t, side="right") - 1
-    window = np.clip(window_of_row, 0, count - 1)[measured]
-    squares = np.bincount(window, weights=z[measured] ** 2, minlength=count)
+    parts = [z[first:last][measured[first:last]] for first, last in pairwise(rows)]
     return _Windows(
         edges=edges,
-        counts=np.bincount(window, minlength=count),
-        squares=squares.astype(np.float64),
+        counts=np.array([len(part) for part in parts]),
+        squares=np.array([float(part @ part) for part in parts]),
     )
 
 
