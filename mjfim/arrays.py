@@ -29,10 +29,15 @@ def freeze(record: object, *names: str) -> None:
 
 
 def _is_frozen(array: object) -> bool:
-    """Whether this is a read-only float64 array of its own, not a view of another one."""
+    """Whether this is a read-only float64 array, and no view of an array that can be written."""
     if type(array) is not np.ndarray or array.dtype != np.float64:
         return False
-    return bool(array.flags.owndata and not array.flags.writeable)
+    owner: object = array
+    while type(owner) is np.ndarray and not owner.flags.writeable:
+        if owner.base is None:
+            return True
+        owner = owner.base
+    return False
 
 
 def evenly_spread_indices(count: int, limit: int) -> NDArray[np.intp]:

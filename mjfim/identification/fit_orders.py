@@ -159,10 +159,12 @@ class PartOrder:
 
 def _without_values(rows: int, outputs: int) -> AlignedRecording:
     """A recording of a length without contents, which takes no memory."""
+    nothing = np.array(np.nan)
+    nothing.setflags(write=False)
     return AlignedRecording(
         name="",
-        t=np.broadcast_to(0.0, (rows,)),
-        y=np.broadcast_to(np.nan, (rows, outputs)),
+        t=np.broadcast_to(nothing, (rows,)),
+        y=np.broadcast_to(nothing, (rows, outputs)),
         ctrl=np.zeros((0, 0)),
         dt=1.0,
         on_grid=True,

@@ -407,11 +407,13 @@ class FitProblem:
             One array for each output [y-unit]; None where a simulation diverges.
         """
         parts: list[list[Array]] = [[np.zeros(0)] for _ in self.system.outputs.names]
-        for rows in self.simulation.rows(at, derivatives=False):
-            if rows is None:
+        batches = self.simulation.batches(derivatives=False)
+        for batch in self.of_batches(FitProblem.outputs_of_batch, batches, at):
+            if batch is None:
                 return None
-            for found, errors in zip(parts, self.whitened.errors(rows), strict=True):
-                found.append(errors)
+            for rows in batch:
+                for found, errors in zip(parts, self.whitened.errors(rows), strict=True):
+                    found.append(errors)
         return [np.concatenate(found) for found in parts]
 
     def errors(self, predicted: Sequence[Array]) -> list[Array]:
