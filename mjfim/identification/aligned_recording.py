@@ -18,6 +18,7 @@ from mjfim.errors import RecordingError, listed, unknown
 from mjfim.experiment.system import System
 from mjfim.model.variants import STATED
 from mjfim.plant.outputs import outputs_by_state
+from mjfim.recordings.log_file import LogFile, file_of
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
@@ -50,6 +51,7 @@ class AlignedRecording:
         ctrl: (N, nu) control held over each sample of the grid, which covers all rows [u-unit].
         dt: Sample period of the grid [s].
         on_grid: True where every time stamp lies on the grid.
+        file: The file from which it was read; None where it was not read from one.
     """
 
     name: str
@@ -58,6 +60,7 @@ class AlignedRecording:
     ctrl: Array
     dt: float
     on_grid: bool
+    file: LogFile | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "t", "y", "ctrl")
@@ -170,6 +173,7 @@ def align(system: System, recording: Recording) -> AlignedRecording:
         ctrl=ctrl,
         dt=dt,
         on_grid=on_grid,
+        file=file_of(recording),
     )
 
 

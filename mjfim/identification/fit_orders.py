@@ -6,6 +6,7 @@ What all parts of a problem have in common, and the recordings, are sent to each
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
@@ -15,7 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
-from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.identification.aligned_recording import AlignedRecording, align
 from mjfim.identification.batch_workers import BatchWork
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.pins import Pins
@@ -25,8 +26,11 @@ from mjfim.identification.unknowns import UnknownLayout
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.parallel.kept import KeptPerThread
-from mjfim.parallel.shared_value import SharedValue, require_values
+from mjfim.parallel.shared_value import SharedValue, keep_value, require_values
 from mjfim.plant.noise import Noise
+from mjfim.recordings.channels import Channels
+from mjfim.recordings.log_file import FileContent
+from mjfim.recordings.read import read_recording
 
 T = TypeVar("T")
 
@@ -66,6 +70,69 @@ class ProblemOrder:
     difference_step: float
 
 
+class SharedRecording(SharedValue[AlignedRecording]):
+    """A recording that is sent only to workers that cannot read its file."""
+
+    def to_send(self) -> AlignedRecording:
+        """The recording. Raises RecordingError if its file has changed since it was read."""
+        recording = self.value
+        if recording.file is not None:
+            recording.file.require_unchanged()
+        return recording
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordingOrder:
+    """A recording that a worker reads from its file, or else receives. It can be pickled.
+
+    Attributes:
+        value: The recording, sent once.
+        file: The file that it was read from; None where a worker cannot read it in the same way.
+    """
+
+    value: SharedValue[AlignedRecording]
+    file: FileContent | None
+
+    @classmethod
+    def of(cls, recording: AlignedRecording, channels: Channels) -> RecordingOrder:
+        """Order a recording.
+
+        Args:
+            recording: The recording.
+            channels: How workers read logs.
+
+        Raises:
+            RecordingError: Its file has changed since it was read.
+        """
+        size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
+        file = recording.file
+        is_read_alike = file is not None and file.is_read_by(channels)
+        return cls(
+            value=SharedRecording(uuid.uuid4().hex, recording, size),
+            file=file.content if file is not None and is_read_alike else None,
+        )
+
+    @property
+    def is_here(self) -> bool:
+        """True where this process has the recording, or finds its file."""
+        return self.value.is_here or (self.file is not None and self.file.is_here)
+
+    def made(self, system: System) -> AlignedRecording:
+        """The recording, read and aligned where this process has not received it.
+
+        Args:
+            system: The system of the fit.
+
+        Raises:
+            AbsentValueError: It was not received, and cannot be read here.
+        """
+        if self.value.is_here or self.file is None:
+            return self.value.value
+        recording = align(system, read_recording(self.file.path, system.channels))
+        keep_value(self.value, recording)
+        return recording
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PartOrder:
     """Some segments of a problem, and what only they need. It can be pickled.
@@ -78,7 +145,7 @@ class PartOrder:
     """
 
     problem: SharedValue[ProblemOrder]
-    recordings: dict[int, SharedValue[AlignedRecording]]
+    recordings: dict[int, RecordingOrder]
     segments: dict[int, Segment]
     masks: dict[int, np.ndarray]
 
@@ -88,7 +155,7 @@ class PartOrder:
         problem: FitProblem,
         indices: Sequence[int],
         shared: SharedValue[ProblemOrder],
-        recording_of: Callable[[AlignedRecording], SharedValue[AlignedRecording]],
+        recording_of: Callable[[AlignedRecording], RecordingOrder],
     ) -> PartOrder:
         """Describe some segments of a problem.
 
@@ -109,7 +176,8 @@ class PartOrder:
 
     def made(self) -> FitProblem:
         """Make the problem; recordings and segments that are not needed are empty."""
-        require_values([self.problem, *self.recordings.values()])
+        absent = [each.value for each in self.recordings.values() if not each.is_here]
+        require_values([self.problem, *absent])
         order = self.problem.value
         require_values([order.system])
         system = _worker_systems.get(order.system.digest, lambda: order.system.value.system())
@@ -117,7 +185,7 @@ class PartOrder:
         ny = len(system.outputs)
         known = self.recordings
         recordings = [
-            known[i].value if i in known else _without_values(count, ny)
+            known[i].made(system) if i in known else _without_values(count, ny)
             for i, count in enumerate(order.row_counts)
         ]
         simulation = SegmentSimulation(

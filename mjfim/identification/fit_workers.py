@@ -25,6 +25,7 @@ from mjfim.identification.fit_orders import (
     BatchOrder,
     PartOrder,
     ProblemOrder,
+    RecordingOrder,
     SearchOrder,
 )
 from mjfim.identification.fit_problem import FitProblem
@@ -45,6 +46,7 @@ from mjfim.parallel import (
 )
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.shared_value import SharedValue
+from mjfim.recordings.channels import Channels
 
 T = TypeVar("T")
 
@@ -125,7 +127,7 @@ class FitWorkers:
 
         # Variants of a problem have the same systems and recordings.
         self._systems: dict[tuple[int, int], tuple[System, SharedValue[SystemOrder]]] = {}
-        self._recordings: WeakKeyDictionary[AlignedRecording, SharedValue[AlignedRecording]]
+        self._recordings: WeakKeyDictionary[AlignedRecording, RecordingOrder]
         self._recordings = WeakKeyDictionary()
 
     def of_batches(
@@ -194,7 +196,10 @@ class FitWorkers:
         key = (threads, *segments)
         if key not in known:
             shared = self._problem_order(problem, threads)
-            part = PartOrder.of(problem, segments, shared, self._shared_recording)
+            channels = problem.system.channels
+            part = PartOrder.of(
+                problem, segments, shared, lambda each: self._recording_order(each, channels)
+            )
             known[key] = SharedValue(uuid.uuid4().hex, part)
         return known[key]
 
@@ -231,11 +236,10 @@ class FitWorkers:
             self._systems[key] = (system, order)
         return self._systems[key][1]
 
-    def _shared_recording(self, recording: AlignedRecording) -> SharedValue[AlignedRecording]:
-        """A recording, sent once."""
+    def _recording_order(self, recording: AlignedRecording, channels: Channels) -> RecordingOrder:
+        """A recording, which each worker reads or receives once."""
         if recording not in self._recordings:
-            size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
-            self._recordings[recording] = SharedValue(uuid.uuid4().hex, recording, size)
+            self._recordings[recording] = RecordingOrder.of(recording, channels)
         return self._recordings[recording]
 
 

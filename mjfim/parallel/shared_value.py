@@ -81,6 +81,10 @@ class SharedValue(Generic[T]):
         found: T = _received.get(self.digest)
         return found
 
+    def to_send(self) -> T:
+        """The value on its way to a worker, which does not have it."""
+        return self.value
+
     @property
     def is_here(self) -> bool:
         """True where this process has the value."""
@@ -186,6 +190,16 @@ def require_values(values: Iterable[SharedValue[Any]]) -> None:
         raise AbsentValueError(*absent)
 
 
+def keep_value(shared: SharedValue[T], value: T) -> None:
+    """Keep a value in a worker that has made it itself instead of receiving it.
+
+    Args:
+        shared: The reference to the value.
+        value: The value.
+    """
+    _received.put({shared.digest: SentValue(value=value, size=shared.size)})
+
+
 def owned_value(digest: str) -> SentValue:
     """Return a value that this process has made, to send it to a worker.
 
@@ -198,7 +212,7 @@ def owned_value(digest: str) -> SentValue:
     shared = _owned.get(digest)
     if shared is None:
         raise AbsentValueError(digest)
-    return SentValue(value=shared.value, size=shared.size)
+    return SentValue(value=shared.to_send(), size=shared.size)
 
 
 @dataclass(frozen=True, kw_only=True)

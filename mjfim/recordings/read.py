@@ -20,6 +20,7 @@ from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.column_units import check_unit, convert, units_of
 from mjfim.recordings.formats.table import Table
+from mjfim.recordings.log_file import FileState, remember_file
 from mjfim.recordings.spec import ColumnSpec, RecordingSpec
 from mjfim.recordings.summary import LogSummary, summarize
 from mjfim.recordings.validity import (
@@ -88,6 +89,7 @@ def read_log(path: Path, channels: Channels) -> Log:
     check_spec(channels)
     spec = channels.spec
 
+    before = FileState.of(path)
     table = formats.read_columns(path, spec)
     if "time" not in spec.model_fields_set:
         _require_default(table, "time", spec.time, key="[recording] time")
@@ -122,6 +124,7 @@ def read_log(path: Path, channels: Channels) -> Log:
         outputs=measured,
         name=str(path),
     )
+    remember_file(recording, before, channels)
     return Log(recording=recording, summary=summary)
 
 

@@ -1,0 +1,143 @@
+"""Recordings that workers read from their files, and that are sent where they cannot."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+from weakref import WeakValueDictionary
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import RecordingError
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
+from mjfim.identification import segment_simulation
+from mjfim.identification.aligned_recording import align
+from mjfim.identification.fit_orders import RecordingOrder, SharedRecording
+from mjfim.output.archive import write_recording
+from mjfim.parallel import shared_value
+from mjfim.parallel.shared_value import AbsentValueError, require_values
+from mjfim.recordings.read import read_recording
+from tests.support.executors import processes
+from tests.support.paths import MODELS
+
+# Segments whose initial states are unknown.
+FIT: dict[str, Any] = {"segments": 0.25, "start": "measured"}
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    """The cart-pendulum for a short time."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return DesignTask.resolve(experiment.replace(horizon=0.5, fit=FIT), threads=1).system
+
+
+@pytest.fixture
+def logs(system: System, tmp_path: Path) -> list[Path]:
+    """Two logs."""
+    task = DesignTask.resolve(system.experiment, threads=1)
+    paths = [tmp_path / f"log{seed}.csv" for seed in range(2)]
+    for seed, path in enumerate(paths):
+        write_recording(path, simulate_system(system, task.initial, seed), system)
+    return paths
+
+
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No value is found that this process has made, as in a worker process."""
+    nothing: WeakValueDictionary[str, Any] = WeakValueDictionary()
+    monkeypatch.setattr(shared_value, "_owned", nothing)
+
+
+def in_a_worker(order: RecordingOrder) -> RecordingOrder:
+    """The order as it arrives there."""
+    pickled = pickle.dumps(order)
+    shared_value._owned.clear()
+    arrived = pickle.loads(pickled)
+    assert isinstance(arrived, RecordingOrder)
+    assert not arrived.value.is_here
+    return arrived
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_worker_reads_the_file_and_keeps_the_recording(system: System, logs: list[Path]) -> None:
+    recording = align(system, read_recording(logs[0], system.channels))
+    order = in_a_worker(RecordingOrder.of(recording, system.channels))
+    assert order.is_here
+
+    found = order.made(system)
+    for name in ("t", "y", "ctrl"):
+        assert np.array_equal(getattr(found, name), getattr(recording, name))
+    logs[0].unlink()
+    assert order.is_here
+    assert order.made(system) is found
+
+
+@pytest.mark.usefixtures("elsewhere")
+@pytest.mark.parametrize("change", ["gone", "changed"])
+def test_a_file_that_a_worker_does_not_find(system: System, logs: list[Path], change: str) -> None:
+    recording = align(system, read_recording(logs[0], system.channels))
+    order = RecordingOrder.of(recording, system.channels)
+    text = logs[0].read_text(encoding="utf-8")
+    logs[0].unlink()
+    if change == "changed":
+        logs[0].write_text(text[: len(text) // 2].rpartition("\n")[0] + "\n", encoding="utf-8")
+
+    arrived = in_a_worker(order)
+    assert not arrived.is_here
+    with pytest.raises(AbsentValueError):
+        require_values([arrived.value])
+
+    # The caller sends what it has read, unless something has written to the file since.
+    if change == "gone":
+        assert order.value.to_send() is recording
+        return
+    with pytest.raises(RecordingError, match=r"log0\.csv: the file has changed since it was read"):
+        order.value.to_send()
+    anew = align(system, read_recording(logs[0], system.channels))
+    assert RecordingOrder.of(anew, system.channels).file != order.file
+
+
+def test_a_file_that_workers_would_read_otherwise_is_sent(system: System, logs: list[Path]) -> None:
+    recording = align(system, read_recording(logs[0], system.channels))
+    other = system.experiment.replace(recording={"window": [0.0, 0.2]})
+    channels = System.resolve(other, threads=1).channels
+    assert RecordingOrder.of(recording, system.channels).file is not None
+    assert RecordingOrder.of(recording, channels).file is None
+
+    simulated = simulate_system(system, DesignTask.resolve(system.experiment).initial, 0)
+    assert RecordingOrder.of(align(system, simulated), system.channels).file is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [False, True], ids=["read", "sent"])
+def test_processes_that_read_the_files_find_the_same_estimate(
+    system: System, logs: list[Path], sent: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(segment_simulation, "MAX_NUMBERS_AT_ONCE", 2000)
+    recordings = [read_recording(path, system.channels) for path in logs]
+    alone = mjfim.identify(system.experiment, recordings, threads=1)
+
+    count = 0
+    to_send = SharedRecording.to_send
+
+    def counted(shared: SharedRecording) -> Any:
+        nonlocal count
+        count += 1
+        return to_send(shared)
+
+    monkeypatch.setattr(SharedRecording, "to_send", counted)
+    with processes("pool") as executor:
+        if sent:
+            for path in logs:
+                path.rename(path.with_suffix(".moved"))
+        found = mjfim.identify(system.experiment, recordings, threads=1, executor=executor)
+
+    assert (count > 0) == sent
+    assert np.array_equal(found.theta, alone.theta)
+    assert np.array_equal(found.covariance, alone.covariance)
+    assert found.chi2 == alone.chi2
