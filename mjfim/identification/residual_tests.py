@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
+from mjfim.identification.lagged_products import lagged_products
 from mjfim.records.estimate import Whiteness, WorstResidual
 
 # Probability below which a test rejects that residuals are the expected noise.
@@ -56,9 +57,6 @@ NO_AUTOCORRELATION = 0.05
 # more where it does not vanish.
 FIRST_LAGS = 1000
 LAG_GROWTH = 8
-
-# Number of values whose lagged products are computed at once.
-VALUES_AT_ONCE = 100_000
 
 # Smallest sum of squares in a denominator.
 SMALLEST_SQUARES = 1e-300
@@ -376,26 +374,12 @@ def _autocorrelation(series: Sequence[Array], least_lag: int, longest_lag: int) 
     while True:
         products = np.zeros(lag + 1)
         for part in series:
-            products += _lagged_products(part, lag)
+            products += lagged_products(part, lag)
 
         rho = products / products[0]
         if lag >= longest_lag or (rho[least_lag:] < NO_AUTOCORRELATION).any():
             return np.asarray(rho)
         lag = min(LAG_GROWTH * lag, longest_lag)
-
-
-def _lagged_products(x: Array, lag: int) -> Array:
-    """(lag+1,) sums `sum_i x_i x_(i+k)` of a series x: (M,), for k up to a lag."""
-    total = np.zeros(lag + 1)
-    length = max(LAG_GROWTH * lag, VALUES_AT_ONCE)
-    for first in range(0, len(x), length):
-        # A part and the values after it, by a circular convolution that is longer than both.
-        part = x[first : first + length]
-        with_following = x[first : first + length + lag]
-        size = scipy.fft.next_fast_len(len(part) + lag, real=True)
-        spectrum = scipy.fft.rfft(with_following, size) * scipy.fft.rfft(part, size).conj()
-        total += scipy.fft.irfft(spectrum, size)[: lag + 1]
-    return total
 
 
 def _autocorrelation_time(rho: Array) -> float:

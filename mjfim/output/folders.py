@@ -329,7 +329,7 @@ def write_estimate_folder(
     except ModelError as error:
         remarks.append(str(error))
 
-    write_optional(REPORT, lambda: write_report(folder, Estimate))
+    write_optional(REPORT, lambda: write_report(folder, Estimate, made=estimate))
     _write_figures(folder, estimate, picture_format)
     write_optional("estimate.rrd", lambda: _write_estimate_log(folder, estimate, system))
     write_optional("the video", lambda: _add_video(folder, estimate, system))

@@ -41,6 +41,9 @@ from mjfim.records.unpacked_size import (
 # Name of the text array in an npz file that holds all fields of a record that are not arrays.
 RECORD = "record"
 
+# Size of all arrays of a file above which they are not compressed [bytes].
+MAX_COMPRESSED_BYTES = 64 * 2**20
+
 # Words for numbers that JSON does not have.
 NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
@@ -157,14 +160,19 @@ def _refuse_pickles(path: Path, kind: str, headers: Mapping[str, Header]) -> Non
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays as a compressed npz file; an incomplete file never remains.
+    """Write arrays as an npz file; an incomplete file never remains.
+
+    Large arrays hold measured values, whose noise can hardly be compressed; that would take longer
+    than anything else.
 
     Args:
         path: File to write; its folder is created if it does not exist.
         arrays: Arrays of numbers or text by name.
     """
     with replacing(path) as temporary, temporary.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **arrays)
+        size = sum(array.nbytes for array in arrays.values())
+        save = np.savez if size > MAX_COMPRESSED_BYTES else np.savez_compressed
+        save(stream, allow_pickle=False, **arrays)
 
 
 # ---- records to plain values, and back
@@ -426,13 +434,25 @@ class SavedRecord(RenamedFields):
         Args:
             folder: Folder for `<file_stem>.npz`; it is created if it does not exist.
         """
+        write_arrays(Path(folder) / f"{self.file_stem}.npz", self._archived())
+
+    def as_saved(self) -> Self:
+        """The record as `load` builds it from its files, which are not read.
+
+        Its arrays are those of this record, as far as nobody can change them.
+        """
+        arrays = self._archived()
+        values = json.loads(str(arrays[RECORD]))["fields"]
+        record: Self = _decode_record(type(self), values, arrays, "")
+        return record
+
+    def _archived(self) -> dict[str, np.ndarray]:
+        """The arrays of the npz file."""
         encoder = _Encoder(self.array_names)
         kind = type(self)
         values = encoder.encode(kind, self, "")
-
         text = json.dumps({"type": kind.__name__, "fields": values}, allow_nan=False)
-        arrays = {**encoder.arrays, RECORD: np.array(text)}
-        write_arrays(Path(folder) / f"{self.file_stem}.npz", arrays)
+        return {**encoder.arrays, RECORD: np.array(text)}
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -450,6 +470,10 @@ class SavedRecord(RenamedFields):
         """
         archive = cls._archive_of(Path(path))
         arrays = read_arrays(archive, cls.file_stem)
+
+        # Records share arrays that nobody can change.
+        for array in arrays.values():
+            array.setflags(write=False)
         values = cls._fields_in(archive, arrays)
 
         try:

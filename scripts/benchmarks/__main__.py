@@ -21,6 +21,7 @@ BENCHMARKS = {
     "arms": "which experiments do the robot arms get, and do their designs keep the limits?",
     "arms_table": "is the design of two arms better than Fourier series in equal time?",
     "mjx_oracle": "do the derivatives agree with those of MJX by automatic differentiation?",
+    "scale_recordings": "how much memory and time do workers need that read many logs?",
     "scale": "do the verbs give the same on a cluster, and how well do they scale?",
     "prove_identification": "do the 95 % intervals hold the true values?",
 }

@@ -114,9 +114,14 @@ def report_files(folder: Path) -> dict[str, Path]:
 
 
 def write_report(
-    folder: Path, kind: type[ShownRecord], video: Video | None = None, no_video: str = ""
+    folder: Path,
+    kind: type[ShownRecord],
+    video: Video | None = None,
+    no_video: str = "",
+    *,
+    made: ShownRecord | None = None,
 ) -> Path:
-    """Write the report of a result, from the files in its folder alone.
+    """Write the report of a result, as the files in its folder give it.
 
     Pages of other results in the folder are written again, because they name this result, or give
     it their place.
@@ -126,6 +131,7 @@ def write_report(
         kind: Kind of the result.
         video: A video of the robot, or None.
         no_video: Sentence that says why there is no video; may be empty.
+        made: The result, where this process has just written it; its files are not read then.
 
     Returns:
         The file.
@@ -138,7 +144,10 @@ def write_report(
     for other in verbs_in(folder):
         # A result of an earlier version, which cannot be read, keeps the page that it has.
         try:
-            records[other] = KINDS[other].load(folder)
+            if other == verb and made is not None:
+                records[other] = made.as_saved()
+            else:
+                records[other] = KINDS[other].load(folder)
         except RecordingError:
             if other == verb:
                 raise

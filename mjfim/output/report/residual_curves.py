@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.identification.lagged_products import lagged_products
 from mjfim.records.estimate import Estimate
 
 # Largest number of lags of an autocorrelation.
@@ -63,14 +64,11 @@ class Residuals:
 
     def autocorrelation(self) -> tuple[Array, Array, float]:
         """Return lags (l,) [rows], autocorrelations (l,), and the bound of 95 % of white noise."""
-        from scipy.signal import correlate
-
         shortest = min(len(part) for part in self.parts)
         lags = min(MAX_LAGS, shortest // 2)
         products = np.zeros(lags + 1)
         for part in self.parts:
-            full = correlate(part, part, mode="full", method="fft")
-            products += full[len(part) - 1 : len(part) + lags]
+            products += lagged_products(part, lags)
 
         bound = NORMAL_95 / np.sqrt(self.count)
         values = products[1:] / max(float(products[0]), np.finfo(float).tiny)
