@@ -225,7 +225,7 @@ def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
 
     begin_stage("drawing the video of the report")
     found, sentence = video.video_for_report(system, result)
-    write_report(folder, type(result), found, sentence)
+    write_report(folder, type(result), found, sentence, made=result)
 
 
 def _write_design_log(folder: Path, design: Design, system: System) -> None:

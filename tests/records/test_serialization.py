@@ -25,7 +25,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.output import archive
-from mjfim.records import unpacked_size
+from mjfim.records import serialization, unpacked_size
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison, MethodResult
@@ -192,6 +192,7 @@ def round_trip(record: SavedRecord, folder: Path) -> None:
     for path in (folder, str(folder), folder / f"{stem}.json", folder / f"{stem}.npz"):
         assert_same(type(record).load(path), record)
     loaded = type(record).load(folder)
+    assert_same(record.as_saved(), loaded)
     assert as_json(loaded.summary()) == as_json(record.summary())
     assert (folder / f"{stem}.json").read_text(encoding="utf-8") == as_json(record.summary())
 
@@ -235,6 +236,16 @@ def test_an_estimate_is_loaded_as_it_was(estimate: Estimate, tmp_path: Path) -> 
     """With recordings, predictions, tests of residuals, units and priors."""
     assert estimate.predictions and estimate.whiteness and estimate.motion is not None
     round_trip(estimate, tmp_path)
+
+
+def test_large_arrays_are_not_compressed(
+    estimate: Estimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise can hardly be compressed, and the record is the same."""
+    monkeypatch.setattr(serialization, "MAX_COMPRESSED_BYTES", 1000)
+    round_trip(estimate, tmp_path)
+    with zipfile.ZipFile(next(tmp_path.rglob("estimate.npz"))) as stored:
+        assert all(member.compress_type == zipfile.ZIP_STORED for member in stored.infolist())
 
 
 def test_a_check_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
