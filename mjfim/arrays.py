@@ -37,7 +37,9 @@ def _is_frozen(array: object) -> bool:
         if owner.base is None:
             return True
         owner = owner.base
-    return False
+
+    # A file that is mapped for reading only cannot be changed through the array.
+    return isinstance(owner, np.memmap) and owner.mode == "r"
 
 
 def evenly_spread_indices(count: int, limit: int) -> NDArray[np.intp]:

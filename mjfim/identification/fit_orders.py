@@ -20,6 +20,7 @@ from mjfim.identification.aligned_recording import AlignedRecording, align
 from mjfim.identification.batch_workers import BatchWork
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.pins import Pins
+from mjfim.identification.recording_files import RecordingFiles
 from mjfim.identification.segment_simulation import SegmentBatch, SegmentSimulation
 from mjfim.identification.segments import Segment
 from mjfim.identification.unknowns import UnknownLayout
@@ -83,23 +84,31 @@ class SharedRecording(SharedValue[AlignedRecording]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordingOrder:
-    """A recording that a worker reads from its file, or else receives. It can be pickled.
+    """A recording that a worker reads from files, or else receives. It can be pickled.
 
     Attributes:
         value: The recording, sent once.
         file: The file that it was read from; None where a worker cannot read it in the same way.
+        arrays: Its arrays as files of the caller; None without them.
     """
 
     value: SharedValue[AlignedRecording]
     file: FileContent | None
+    arrays: RecordingFiles | None
 
     @classmethod
-    def of(cls, recording: AlignedRecording, channels: Channels) -> RecordingOrder:
+    def of(
+        cls,
+        recording: AlignedRecording,
+        channels: Channels,
+        arrays: RecordingFiles | None = None,
+    ) -> RecordingOrder:
         """Order a recording.
 
         Args:
             recording: The recording.
             channels: How workers read logs.
+            arrays: Its arrays as files of the caller.
 
         Raises:
             RecordingError: Its file has changed since it was read.
@@ -110,12 +119,15 @@ class RecordingOrder:
         return cls(
             value=SharedRecording(uuid.uuid4().hex, recording, size),
             file=file.content if file is not None and is_read_alike else None,
+            arrays=arrays,
         )
 
     @property
     def is_here(self) -> bool:
-        """True where this process has the recording, or finds its file."""
-        return self.value.is_here or (self.file is not None and self.file.is_here)
+        """True where this process has the recording, or finds it as files."""
+        if self.value.is_here or (self.arrays is not None and self.arrays.is_here):
+            return True
+        return self.file is not None and self.file.is_here
 
     def made(self, system: System) -> AlignedRecording:
         """The recording, read and aligned where this process has not received it.
@@ -126,7 +138,11 @@ class RecordingOrder:
         Raises:
             AbsentValueError: It was not received, and cannot be read here.
         """
-        if self.value.is_here or self.file is None:
+        if self.value.is_here:
+            return self.value.value
+        if self.arrays is not None and self.arrays.is_here:
+            return self.arrays.mapped()
+        if self.file is None:
             return self.value.value
         recording = align(system, read_recording(self.file.path, system.channels))
         keep_value(self.value, recording)
@@ -208,12 +224,11 @@ class PartOrder:
     def _all_segments(self, rows: Sequence[int]) -> tuple[Segment, ...]:
         """Segments of the whole problem; those of other parts have nothing but their size."""
         nothing = np.zeros(0)
-        return tuple(
-            self.segments[i]
-            if i in self.segments
-            else Segment(recording=0, begin=0, samples=0, rows=slice(0, count), start=nothing)
-            for i, count in enumerate(rows)
-        )
+        empty = {
+            count: Segment(recording=0, begin=0, samples=0, rows=slice(0, count), start=nothing)
+            for count in set(rows)
+        }
+        return tuple(self.segments.get(i) or empty[count] for i, count in enumerate(rows))
 
     def _all_masks(self, row_counts: Sequence[int], ny: int) -> Iterator[np.ndarray]:
         """(M, ny) for every recording, True for the values of these segments that count."""

@@ -29,6 +29,7 @@ from mjfim.identification.fit_orders import (
     SearchOrder,
 )
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.recording_files import RecordingFolder
 from mjfim.identification.segment_simulation import SegmentBatch
 from mjfim.optimize.levenberg_marquardt import (
     InterruptedPassError,
@@ -49,6 +50,10 @@ from mjfim.parallel.shared_value import SharedValue
 from mjfim.recordings.channels import Channels
 
 T = TypeVar("T")
+
+# Size of a recording above which workers of this computer find it as files [bytes]; smaller ones
+# are sent.
+MIN_FILE_BYTES = 2**20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -129,6 +134,7 @@ class FitWorkers:
         self._systems: dict[tuple[int, int], tuple[System, SharedValue[SystemOrder]]] = {}
         self._recordings: WeakKeyDictionary[AlignedRecording, RecordingOrder]
         self._recordings = WeakKeyDictionary()
+        self._folder = RecordingFolder()
 
     def of_batches(
         self,
@@ -239,7 +245,9 @@ class FitWorkers:
     def _recording_order(self, recording: AlignedRecording, channels: Channels) -> RecordingOrder:
         """A recording, which each worker reads or receives once."""
         if recording not in self._recordings:
-            self._recordings[recording] = RecordingOrder.of(recording, channels)
+            size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
+            files = self._folder.written(recording) if size > MIN_FILE_BYTES else None
+            self._recordings[recording] = RecordingOrder.of(recording, channels, files)
         return self._recordings[recording]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
@@ -15,9 +16,10 @@ from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
-from mjfim.identification import segment_simulation
+from mjfim.identification import fit_workers, segment_simulation
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.fit_orders import RecordingOrder, SharedRecording
+from mjfim.identification.recording_files import RecordingFolder
 from mjfim.output.archive import write_recording
 from mjfim.parallel import shared_value
 from mjfim.parallel.shared_value import AbsentValueError, require_values
@@ -113,12 +115,49 @@ def test_a_file_that_workers_would_read_otherwise_is_sent(system: System, logs: 
     assert RecordingOrder.of(align(system, simulated), system.channels).file is None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sent", [False, True], ids=["read", "sent"])
-def test_processes_that_read_the_files_find_the_same_estimate(
-    system: System, logs: list[Path], sent: bool, monkeypatch: pytest.MonkeyPatch
+def test_a_worker_maps_the_arrays_of_the_caller(system: System, logs: list[Path]) -> None:
+    """They are not copied, and an empty control is an array as well."""
+    read = align(system, read_recording(logs[0], system.channels))
+    for recording in (read, replace(read, ctrl=np.zeros((len(read.t) - 1, 0)))):
+        folder = RecordingFolder()
+        files = folder.written(recording)
+        assert files is not None
+        arrived = pickle.loads(pickle.dumps(files))
+        assert arrived.is_here
+        found = arrived.mapped()
+        for name in ("t", "y", "ctrl"):
+            array = getattr(found, name)
+            assert np.array_equal(array, getattr(recording, name), equal_nan=True)
+            assert array.base is not None
+            assert not array.flags.writeable
+        assert (found.dt, found.on_grid, found.name) == (read.dt, read.on_grid, read.name)
+
+        # The files are removed with the folder.
+        del found, array, folder
+        assert not arrived.is_here
+
+
+def test_without_room_recordings_are_sent(
+    system: System, logs: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    recording = align(system, read_recording(logs[0], system.channels))
+    folder = RecordingFolder()
+    assert folder.written(recording) is None
+    assert folder.written(recording) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["mapped", "read", "sent"])
+def test_processes_that_read_the_files_find_the_same_estimate(
+    system: System, logs: list[Path], way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They map the caller's arrays, read the logs, or receive the recordings."""
     monkeypatch.setattr(segment_simulation, "MAX_NUMBERS_AT_ONCE", 2000)
+    monkeypatch.setattr(fit_workers, "MIN_FILE_BYTES", 0 if way == "mapped" else 1e9)
     recordings = [read_recording(path, system.channels) for path in logs]
     alone = mjfim.identify(system.experiment, recordings, threads=1)
 
@@ -132,12 +171,12 @@ def test_processes_that_read_the_files_find_the_same_estimate(
 
     monkeypatch.setattr(SharedRecording, "to_send", counted)
     with processes("pool") as executor:
-        if sent:
+        if way != "read":
             for path in logs:
                 path.rename(path.with_suffix(".moved"))
         found = mjfim.identify(system.experiment, recordings, threads=1, executor=executor)
 
-    assert (count > 0) == sent
+    assert (count > 0) == (way == "sent")
     assert np.array_equal(found.theta, alone.theta)
     assert np.array_equal(found.covariance, alone.covariance)
     assert found.chi2 == alone.chi2

@@ -1,0 +1,98 @@
+"""Aligned recordings as files, which all workers of one computer share.
+
+A worker maps such a file into its memory, where the system keeps what is used often. This takes a
+small part of the time in which a log is parsed or sent.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import uuid
+import weakref
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mjfim.identification.aligned_recording import AlignedRecording
+
+# Arrays of a recording, each of which is a file.
+ARRAYS = ("t", "y", "ctrl")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingFiles:
+    """A recording in a folder that a worker may find. It can be pickled.
+
+    Attributes:
+        folder: Folder of the arrays; its name occurs once on all computers.
+        name: Name of the recording.
+        dt: Sample period of the grid [s].
+        on_grid: True where every time stamp lies on the grid.
+    """
+
+    folder: Path
+    name: str
+    dt: float
+    on_grid: bool
+
+    @classmethod
+    def written(cls, parent: Path, recording: AlignedRecording) -> RecordingFiles:
+        """Write a recording.
+
+        Args:
+            parent: Folder in which a new one is made.
+            recording: The recording.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        # Workers find a folder only when it is complete.
+        folder = parent / uuid.uuid4().hex
+        unfinished = folder.with_suffix(".part")
+        unfinished.mkdir()
+        for array in ARRAYS:
+            np.save(unfinished / f"{array}.npy", getattr(recording, array), allow_pickle=False)
+        unfinished.rename(folder)
+        return cls(folder=folder, name=recording.name, dt=recording.dt, on_grid=recording.on_grid)
+
+    @property
+    def is_here(self) -> bool:
+        """True where this process finds the folder."""
+        return self.folder.is_dir()
+
+    def mapped(self) -> AlignedRecording:
+        """The recording, whose arrays are read from the files when they are used."""
+        arrays = {
+            array: np.load(self.folder / f"{array}.npy", mmap_mode="r", allow_pickle=False).view(
+                np.ndarray
+            )
+            for array in ARRAYS
+        }
+        return AlignedRecording(name=self.name, dt=self.dt, on_grid=self.on_grid, **arrays)
+
+
+class RecordingFolder:
+    """A temporary folder of recordings, removed with this object or at the end of the process."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._is_full = False
+
+    def written(self, recording: AlignedRecording) -> RecordingFiles | None:
+        """Write a recording; None where there is no room for it.
+
+        Args:
+            recording: The recording.
+        """
+        if self._is_full:
+            return None
+        try:
+            if self._path is None:
+                self._path = Path(tempfile.mkdtemp(prefix="mjfim-recordings-"))
+                weakref.finalize(self, shutil.rmtree, self._path, ignore_errors=True)
+            return RecordingFiles.written(self._path, recording)
+        except OSError:
+            self._is_full = True
+            return None
