@@ -15,8 +15,9 @@ from mjfim.records.recording import Recording
 FIT_COPIES = 15
 CHECK_COPIES = 5
 
-# Copies of every recorded number: as read, aligned, predicted, whitened and sorted.
-RECORDED_COPIES = 10
+# Copies of every recorded number, as measured: read, aligned, predicted, and parts of them while
+# residuals are tested.
+RECORDED_COPIES = 5
 
 
 def require_memory_for_recordings(
