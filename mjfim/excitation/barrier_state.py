@@ -11,7 +11,7 @@ from mjfim.arrays import Array
 from mjfim.budget import PausedBudget
 from mjfim.excitation.interior_problem import InteriorPoint
 from mjfim.excitation.run_result import RunResult
-from mjfim.excitation.search_slices import SearchSlice
+from mjfim.excitation.search_slices import SealedState, SearchSlice
 from mjfim.excitation.short_steps import ShortSteps
 from mjfim.optimize.projection_operator import DescentState
 from mjfim.optimize.structured_bfgs import StructuredBFGS
@@ -101,4 +101,4 @@ def unfinished(result: RunResult, state: SearchState) -> SearchSlice[SearchState
     earlier = tuple(state.best_of_stages.values())[:-1]
     so_far = replace(result, status=Status.INTERRUPTED, earlier=earlier)
     late = Status.MAX_ITERATIONS if np.isfinite(result.cost) else Status.INFEASIBLE
-    return SearchSlice(result=so_far, state=state, late_status=late)
+    return SearchSlice(result=so_far, state=SealedState.of(state), late_status=late)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
@@ -132,7 +133,8 @@ class ConstrainedSearch:
         if self.start.repeats > 1:
             task = task.with_horizon(task.horizon / self.start.repeats)
 
-        return (yield from _Search.begin(self, task, length, before).run(before))
+        begun = None if before is None else _Begun.of(before)
+        return (yield from _Search.begin(self, task, length, begun).run(begun))
 
     def resolved(self) -> DesignTask:
         """The task on the plant of the search."""
@@ -160,8 +162,19 @@ class ConstrainedSlice(SliceOrder[SearchState]):
         return self.search.start.name
 
 
-# Tasks that a worker keeps for later slices: those of two rounds of a design.
-_tasks = KeptPerThread[DesignTask](2)
+# Number of tasks that a worker keeps for later slices: those of all levels of a design.
+KEPT_TASKS = 5
+_tasks = KeptPerThread[DesignTask](KEPT_TASKS)
+
+
+def task_in_worker(key: str, search: ConstrainedSearch) -> DesignTask:
+    """The task of a search, which a worker resolves once.
+
+    Args:
+        key: Text that is equal for searches on the same task.
+        search: The search.
+    """
+    return _tasks.get(key, search.resolved)
 
 
 @one_blas_thread()
@@ -177,8 +190,31 @@ def run_in_worker(order: ConstrainedSlice) -> SearchSlice[SearchState]:
     """
     search = order.search
     search = replace(search, budget=worker_budget(search.budget))
-    task = _tasks.get(order.task_key, search.resolved)
-    return consume(search.run_slice(task, order.length, order.own_before), None)
+    task = task_in_worker(order.task_key, search)
+    begun = time.monotonic()
+    found = consume(search.run_slice(task, order.length, order.before), None)
+    before = 0.0 if order.before is None else order.before.seconds
+    return replace(found, seconds=before + time.monotonic() - begun)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Begun:
+    """What the parts of a search before have found.
+
+    Attributes:
+        result: The result so far.
+        state: State from which the search goes on, which it may change.
+    """
+
+    result: RunResult
+    state: SearchState
+
+    @classmethod
+    def of(cls, before: SearchSlice[SearchState]) -> _Begun | None:
+        """Open what the part before has left; None where it has ended the search."""
+        if before.state is None:
+            return None
+        return cls(result=before.result, state=before.state.opened())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -214,7 +250,7 @@ class _Search:
         order: ConstrainedSearch,
         task: DesignTask,
         length: SliceLength,
-        before: SearchSlice[SearchState] | None,
+        begun: _Begun | None,
     ) -> _Search:
         """Set up the interior-point method; the time of the search counts from here."""
         budget = Budget(
@@ -223,9 +259,9 @@ class _Search:
             stop=order.budget.stop,
         )
         steps_done = 0
-        if before is not None and before.state is not None:
-            budget = before.state.barrier.budget.resumed(order.budget.stop)
-            steps_done = before.result.steps
+        if begun is not None:
+            budget = begun.state.barrier.budget.resumed(order.budget.stop)
+            steps_done = begun.result.steps
 
         # The controls that hold the start are found once for all searches of a process, so their
         # few steps do not count.
@@ -264,27 +300,25 @@ class _Search:
             steps_before=steps_before,
         )
 
-    def run(
-        self, before: SearchSlice[SearchState] | None
-    ) -> Generator[DesignEvent, None, SearchSlice[SearchState]]:
+    def run(self, begun: _Begun | None) -> Generator[DesignEvent, None, SearchSlice[SearchState]]:
         """Yield every iterate of this part, and return the best result so far.
 
         Args:
-            before: The part before; None for the first one.
+            begun: What the parts before have found; None for the first one.
         """
         result = RunResult(name=self.order.start.name)
         status: Status | None = None
         best_of_stages: dict[float, Array] = {}
         steps = ShortSteps()
-        if before is not None and before.state is not None:
-            result = before.result
-            best_of_stages = before.state.best_of_stages
-            steps = before.state.short_steps
+        if begun is not None:
+            result = begun.result
+            best_of_stages = begun.state.best_of_stages
+            steps = begun.state.short_steps
 
         # A simulation that diverges ends this search, not those of other initial controls.
         rows_before = len(result.history)
         try:
-            for iterate in self._iterates(before):
+            for iterate in self._iterates(begun):
                 status = iterate.status
                 point = self._exact_point(iterate)
                 result = self._updated(result, iterate, point)
@@ -326,10 +360,10 @@ class _Search:
         ended = replace(result, status=self._final_status(result, status), earlier=earlier)
         return SearchSlice(result=ended)
 
-    def _iterates(self, before: SearchSlice[SearchState] | None) -> Iterator[BarrierIterate]:
+    def _iterates(self, begun: _Begun | None) -> Iterator[BarrierIterate]:
         """Iterates of the interior-point method, from the beginning or after those of a part."""
-        if before is not None and before.state is not None:
-            return self.method.resume(before.state.barrier, self.budget)
+        if begun is not None:
+            return self.method.resume(begun.state.barrier, self.budget)
 
         control = self.task.averaged(self.order.start.control)
         return self.method.run(control, self.budget)

@@ -77,8 +77,8 @@ def run_free_in_worker(order: FreeSlice) -> SearchSlice[FreeState]:
         The result so far with the engine steps of all levels, and the state.
     """
     tasks = _tasks.get(order.task_key, order.resolved)
-    before = order.own_before
-    state = None if before is None else before.state
+    sealed = None if order.before is None else order.before.state
+    state = None if sealed is None else sealed.opened()
     steps_done = 0 if state is None else state.steps
     search = UnconstrainedSearch(
         levels=[DescentLevel(task, order.basis) for task in tasks],

@@ -18,7 +18,10 @@ from mjfim.excitation.controls_within_limits import (
 )
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import easier_level
+from mjfim.excitation.limited_rounds import LimitedRounds
+from mjfim.excitation.limited_searches import LimitedSearches
 from mjfim.excitation.merged_results import append_run
+from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.random_search import LEAST_PROGRESS, PATIENCE, RandomSearch
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.task import DesignTask
@@ -98,17 +101,22 @@ class LimitedSearch:
         free = self.limited.level
         has_parts = any(start.repeats > 1 for start in starts)
         levels = () if done or has_parts else coarser_levels(free)
-        search = CoarseToFine(
-            fine=free,
-            coarse=easier_level(free) if done == 0 and not levels else None,
-            levels=levels,
+        searches = LimitedSearches(
+            stated=free,
             executor=self.executor,
             budget=self.budget,
             until_held_up=True,
             cost_to_beat=cost_to_beat,
-            iterations_done=done,
         )
-        constrained = yield from search.run(starts)
+        search: LimitedRounds
+        if levels:
+            search = CoarseToFine(searches=searches, starts=starts, levels=levels)
+        else:
+            coarse = None if done else easier_level(free)
+            search = Multistart(
+                searches=searches, starts=starts, coarse=coarse, iterations_done=done
+            )
+        constrained = yield from search.run()
         return (yield from search.tighten_winner(constrained))
 
     def _helped_by_chance(

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.run_result import RunResult
 from mjfim.records.design import HistoryRow, Status, extended
+from mjfim.records.events import DesignEvent
 
 
 def continued(result: RunResult) -> InitialControl:
@@ -21,38 +22,15 @@ def continued(result: RunResult) -> InitialControl:
     return InitialControl(name=result.name, control=np.asarray(result.control))
 
 
-def renumber(events: Runs, offset: int) -> Runs:
-    """Add an offset to the numbers of the iterates.
+def numbered_from(event: DesignEvent, offset: int) -> DesignEvent:
+    """The same iterate with a number that counts from the first one of its start.
 
     Args:
-        events: Yields the iterates, and returns the results.
-        offset: Number of the first iterate.
+        event: An iterate of a later run.
+        offset: Number of iterates of the runs before.
     """
-    while True:
-        try:
-            event = next(events)
-        except StopIteration as end:
-            results: list[RunResult] = end.value
-            return results
-
-        row = replace(event.row, iteration=event.row.iteration + offset)
-        yield replace(event, row=row)
-
-
-def merge_rounds(first: Sequence[RunResult], second: Sequence[RunResult]) -> list[RunResult]:
-    """Results of two rounds; every start keeps its control of lower cost.
-
-    Args:
-        first: Result of every start in the first round.
-        second: Results of those that took part in the second round.
-    """
-    by_name = {result.name: result for result in second}
-    merged = [
-        _merge(result, by_name[result.name]) if result.name in by_name else result
-        for result in first
-    ]
-
-    return without_discarded_winner(merged)
+    row = replace(event.row, iteration=event.row.iteration + offset)
+    return replace(event, row=row)
 
 
 def without_discarded_winner(results: Sequence[RunResult]) -> list[RunResult]:
@@ -75,7 +53,12 @@ def without_discarded_winner(results: Sequence[RunResult]) -> list[RunResult]:
 
 
 def append_run(first: RunResult, second: RunResult) -> RunResult:
-    """The second result, with the history and the engine steps of both."""
+    """The second result, with the history and the engine steps of both.
+
+    Args:
+        first: Result of the first run.
+        second: Result of the second run from the same start.
+    """
     return replace(
         second,
         history=_join(first.history, second.history),
@@ -83,8 +66,13 @@ def append_run(first: RunResult, second: RunResult) -> RunResult:
     )
 
 
-def _merge(first: RunResult, second: RunResult) -> RunResult:
-    """Result of a start after both rounds."""
+def better_of(first: RunResult, second: RunResult) -> RunResult:
+    """Result of a start after two runs, with the control of lower cost.
+
+    Args:
+        first: Result of the first run.
+        second: Result of the second run from the same start.
+    """
     merged = replace(
         first,
         history=_join(first.history, second.history),

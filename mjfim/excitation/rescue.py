@@ -10,9 +10,9 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
+from mjfim.excitation.limited_searches import LimitedSearches, SearchTerms
 from mjfim.excitation.merged_results import append_run
 from mjfim.excitation.run_result import RunResult, Runs
-from mjfim.excitation.search_round import RoundTerms, SearchRounds
 from mjfim.excitation.winner_repair import WinnerRepair
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
@@ -27,12 +27,12 @@ class Rescue:
     """Searches for a feasible motion, and optimises from there.
 
     Attributes:
-        rounds: Runs the searches.
+        searches: Runs the searches.
         repair: Makes results keep all limits of the unmodified model.
         max_iterations: Largest number of iterations of one start.
     """
 
-    rounds: SearchRounds
+    searches: LimitedSearches
     repair: WinnerRepair
     max_iterations: int
 
@@ -52,7 +52,7 @@ class Rescue:
             The results.
         """
         results = list(results)
-        budget = self.rounds.budget
+        budget = self.searches.budget
         for i, result in enumerate(results):
             # With several starts this may take long.
             if i and budget.exhausted is not None:
@@ -118,16 +118,17 @@ class Rescue:
         """
         done = result.history[-1].iteration if result.history else 0
         iterations = max(self.max_iterations - done, RESCUE_ITERATIONS)
-        runs = yield from self.rounds.run(
+        run = yield from self.searches.run(
             self.repair.cost.level,
-            [InitialControl(name=result.name, control=control)],
-            RoundTerms(
+            InitialControl(name=result.name, control=control),
+            SearchTerms(
                 schedule=BarrierSchedule(),
                 max_iterations=min(iterations, self.max_iterations),
-                seconds=self.rounds.budget.seconds_left,
+                seconds=self.searches.budget.seconds_left,
                 inside_first=True,
             ),
         )
-        for run in self.repair.repaired(runs):
-            return append_run(result, run)
-        return result
+        if run is None:
+            return result
+        (repaired,) = self.repair.repaired([run])
+        return append_run(result, repaired)

@@ -7,8 +7,8 @@ costs at most one part.
 
 from __future__ import annotations
 
-import copy
 import math
+import pickle
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
@@ -47,6 +47,35 @@ class SliceLength:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class SealedState(Generic[S]):
+    """State of a search as bytes.
+
+    The caller sends it from one worker to the next without reading it, which would take much of
+    its time where there are many workers. Whoever opens it gets a copy of its own, so that an order
+    that is lost on a thread can be done again from the same state.
+
+    Attributes:
+        data: The pickled state.
+    """
+
+    data: bytes
+
+    @classmethod
+    def of(cls, state: S) -> SealedState[S]:
+        """Seal a state.
+
+        Args:
+            state: The state, which can be pickled.
+        """
+        return cls(data=pickle.dumps(state, pickle.HIGHEST_PROTOCOL))
+
+    def opened(self) -> S:
+        """Make a copy of the state, which a search may change."""
+        state: S = pickle.loads(self.data)
+        return state
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SearchSlice(Generic[S]):
     """Result and state of a search at the end of a slice.
 
@@ -55,11 +84,20 @@ class SearchSlice(Generic[S]):
             follows, such as after a request to stop.
         state: State from which the search goes on; None where it has ended.
         late_status: How the search ends where the time is over before it has ended.
+        seconds: Time that the search has taken so far [s].
     """
 
     result: RunResult
-    state: S | None = None
+    state: SealedState[S] | None = None
     late_status: Status = Status.MAX_ITERATIONS
+    seconds: float = 0.0
+
+    @property
+    def late_result(self) -> RunResult:
+        """The result, if the search does not go on because its time is over."""
+        if self.state is None:
+            return self.result
+        return replace(self.result, status=self.late_status)
 
 
 def worker_budget(budget: Budget) -> Budget:
@@ -93,16 +131,6 @@ class SliceOrder(ABC, Generic[S]):
     @abstractmethod
     def name(self) -> str:
         """Name of the initial control."""
-
-    @property
-    def own_before(self) -> SearchSlice[S] | None:
-        """The slice before with a copy of its state, which the search may change.
-
-        An order that is lost on a thread is done again from the same state.
-        """
-        if self.before is None:
-            return None
-        return replace(self.before, state=copy.deepcopy(self.before.state))
 
     @property
     def length(self) -> SliceLength:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
@@ -41,76 +41,79 @@ def run_in_slices(
     Returns:
         One result per search that was begun, in the order of the searches.
     """
-    running = _SlicedSearches(orders, Dispatch(Workers.of(executor), function, budget))
-    for outcome in running.dispatch.arrivals():
-        for event in running.take(outcome, budget):
+    searches = SlicedSearches[Order]()
+    dispatch = Dispatch(Workers.of(executor), function, budget)
+    for index, order in enumerate(orders):
+        searches.begin(index, order)
+        dispatch.add(index, order)
+
+    for outcome in dispatch.arrivals():
+        events = searches.take(outcome)
+        following = searches.following(outcome.index)
+        if following is not None:
+            dispatch.add(outcome.index, following, next_one=True)
+        if budget.exhausted is not None:
+            dispatch.withdraw()
+
+        for event in events:
             if budget.stop.requested:
                 break
             yield event
 
-    return running.results(budget)
+    found = [searches.latest[index] for index in sorted(searches.latest)]
+    is_stopped = budget.stop.requested
+    return [each.result if is_stopped else each.late_result for each in found]
 
 
-class _SlicedSearches(Generic[Order]):
+class SlicedSearches(Generic[Order]):
     """Searches of which each has at most one slice under way.
 
-    Args:
-        orders: The first slice of each search.
-        dispatch: Carries out the slices.
+    Attributes:
+        latest: What the last slice of each search has found, by the number of the search.
     """
 
-    def __init__(
-        self, orders: Sequence[Order], dispatch: Dispatch[Order, SearchSlice[Any]]
-    ) -> None:
-        self.dispatch = dispatch
-        self._latest: dict[int, SearchSlice[Any]] = {}
-        self._orders = orders
-        for index, order in enumerate(orders):
-            dispatch.add(index, order)
+    def __init__(self) -> None:
+        self.latest: dict[int, SearchSlice[Any]] = {}
+        self._orders: dict[int, Order] = {}
 
-    def take(self, outcome: Outcome[SearchSlice[Any]], budget: Budget) -> Iterator[DesignEvent]:
-        """Take what a slice returns, and let its search go on.
+    def begin(self, index: int, order: Order) -> None:
+        """Note a search.
+
+        Args:
+            index: Its number.
+            order: Its first slice.
+        """
+        self._orders[index] = order
+
+    def take(self, outcome: Outcome[SearchSlice[Any]]) -> list[DesignEvent]:
+        """Take what a slice returns.
+
+        A search whose worker is lost each time ends: its result so far counts.
 
         Args:
             outcome: What became of the slice.
-            budget: Time of all searches.
 
-        Yields:
+        Returns:
             The iterates of the slice.
         """
         index = outcome.index
-        before = self._latest.get(index)
+        before = self.latest.get(index)
         found = self._lost(index) if outcome.is_lost else outcome.result
-        self._latest[index] = found
-
-        if found.state is not None:
-            order = replace(self._orders[index], before=found)
-            self.dispatch.add(index, order, next_one=True)
-        if budget.exhausted is not None:
-            self.dispatch.withdraw()
+        self.latest[index] = found
 
         known = 0 if before is None else len(before.result.history)
-        for row in found.result.history[known:]:
-            yield DesignEvent(start=found.result.name, row=row)
+        return [DesignEvent(start=found.result.name, row=r) for r in found.result.history[known:]]
 
-    def results(self, budget: Budget) -> list[RunResult]:
-        """Result of every search that was begun.
-
-        Args:
-            budget: Time of all searches; a search that has not ended was left by its end.
-        """
-        results = []
-        for index in sorted(self._latest):
-            found = self._latest[index]
-            result = found.result
-            if found.state is not None and not budget.stop.requested:
-                result = replace(result, status=found.late_status)
-            results.append(result)
-        return results
+    def following(self, index: int) -> Order | None:
+        """Order of the next slice of a search; None where it has ended."""
+        found = self.latest[index]
+        return None if found.state is None else replace(self._orders[index], before=found)
 
     def _lost(self, index: int) -> SearchSlice[Any]:
-        """End a search whose worker is lost each time: its result so far counts."""
-        name = self._orders[index].name
-        latest = self._latest.get(index)
-        result = RunResult(name=name) if latest is None else latest.result
-        return SearchSlice(result=replace(result, status=Status.LOST))
+        """End a search whose worker is lost each time."""
+        latest = self.latest.get(index)
+        if latest is None:
+            result = RunResult(name=self._orders[index].name, status=Status.LOST)
+            return SearchSlice(result=result)
+        result = replace(latest.result, status=Status.LOST)
+        return SearchSlice(result=result, seconds=latest.seconds)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
+from mjfim.excitation.limited_searches import LimitedSearches, SearchTerms
 from mjfim.excitation.merged_results import append_run, continued
 from mjfim.excitation.run_result import RunResult, Runs
-from mjfim.excitation.search_round import RoundTerms, SearchRounds
 from mjfim.excitation.winner_repair import WinnerRepair
 
 # Largest number of runs within tighter limits.
@@ -23,12 +23,12 @@ TIGHTENED_RUN_ITERATIONS = 60
 
 
 def run_within_tighter_limits(
-    rounds: SearchRounds, repair: WinnerRepair, results: Sequence[RunResult]
+    searches: LimitedSearches, repair: WinnerRepair, results: Sequence[RunResult]
 ) -> Runs:
     """Optimise the best result again while it violates a limit on the unmodified model.
 
     Args:
-        rounds: Runs the searches.
+        searches: Runs the searches.
         repair: Tells whether the best result violates a limit.
         results: Result of every start.
 
@@ -43,22 +43,21 @@ def run_within_tighter_limits(
 
     for _ in range(MAX_TIGHTENED_RUNS):
         winner = repair.violating(results)
-        if winner is None or rounds.budget.exhausted is not None:
+        if winner is None or searches.budget.exhausted is not None:
             break
 
         tightening = updated_tightening(tightening, winner.margins)
-        repeated = yield from rounds.run(
+        repeated = yield from searches.run(
             repair.cost.level,
-            [continued(results[winner.index])],
-            RoundTerms(
+            continued(results[winner.index]),
+            SearchTerms(
                 schedule=BarrierSchedule(first=TIGHTENED_RUN_MU),
                 max_iterations=TIGHTENED_RUN_ITERATIONS,
-                seconds=rounds.budget.seconds_left,
+                seconds=searches.budget.seconds_left,
                 tightening=tightening,
             ),
         )
-        for result in repeated:
-            if np.isfinite(result.cost):
-                results[winner.index] = append_run(results[winner.index], result)
+        if repeated is not None and np.isfinite(repeated.cost):
+            results[winner.index] = append_run(results[winner.index], repeated)
 
     return results

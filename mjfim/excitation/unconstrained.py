@@ -19,7 +19,7 @@ from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.run_result import RunResult, Runs
-from mjfim.excitation.search_slices import SearchSlice, SliceLength
+from mjfim.excitation.search_slices import SealedState, SearchSlice, SliceLength
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.projection_operator import (
@@ -270,7 +270,7 @@ class UnconstrainedSearch:
                     state = FreeState(
                         level=number, power=power, interrupted=ended, steps=self.steps
                     )
-                    return SearchSlice(result=progress.result, state=state)
+                    return SearchSlice(result=progress.result, state=SealedState.of(state))
                 if ended.ends_run:
                     return SearchSlice(result=progress.result)
 

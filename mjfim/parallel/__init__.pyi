@@ -1,5 +1,5 @@
 from .carry_out import carry_out, results_or_here
-from .dispatch import Dispatch, LostWorkError, Outcome
+from .dispatch import Dispatch, LostWorkError, NumberedOrder, Outcome
 from .pool import LOST_SENTENCE, Pool
 from .threads import cores, one_blas_thread, process_count, require_threads
 from .worker_process import offer_result, pool_stop_token
@@ -10,6 +10,7 @@ __all__ = [
     "Dispatch",
     "ExecutorLike",
     "LostWorkError",
+    "NumberedOrder",
     "Outcome",
     "Pool",
     "Workers",

@@ -74,6 +74,19 @@ class Outcome(Generic[T]):
         return self.found[0]
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NumberedOrder(Generic[Order]):
+    """An order with its number.
+
+    Attributes:
+        index: Number under which its outcome is reported.
+        order: The order.
+    """
+
+    index: int
+    order: Order
+
+
 @dataclass(kw_only=True, eq=False)
 class _Work(Generic[Order]):
     """An order that has no result yet.
@@ -106,9 +119,18 @@ class Dispatch(Generic[Order, T]):
         function: Carries out an order; both can be pickled, and the result depends on the order
             alone.
         budget: Its token ends the work early; see `arrivals` for its time.
+        source: Asked for a further order whenever there is a worker for it and none waits. It
+            returns None where there is none at present.
     """
 
-    def __init__(self, workers: Workers, function: Callable[[Order], T], budget: Budget) -> None:
+    def __init__(
+        self,
+        workers: Workers,
+        function: Callable[[Order], T],
+        budget: Budget,
+        source: Callable[[], NumberedOrder[Order] | None] | None = None,
+    ) -> None:
+        self._source = source
         self._workers = workers
         self._function = function
         self._budget = budget
@@ -175,7 +197,7 @@ class Dispatch(Generic[Order, T]):
 
     def _fill(self) -> None:
         """Submit orders while there are workers for them."""
-        while self._waiting and len(self._running) < self._workers.window:
+        while len(self._running) < self._workers.window and self._has_waiting():
             in_isolation = self._waiting[0].needs_isolation or any(
                 work.needs_isolation for work in self._running.values()
             )
@@ -183,6 +205,14 @@ class Dispatch(Generic[Order, T]):
                 return
 
             self._submit(self._waiting.popleft())
+
+    def _has_waiting(self) -> bool:
+        """Check whether an order waits, and ask the source for one where none does."""
+        if not self._waiting and self._source is not None:
+            further = self._source()
+            if further is not None:
+                self.add(further.index, further.order)
+        return bool(self._waiting)
 
     def _submit(self, work: _Work[Order]) -> None:
         """Submit an order; in an executor whose processes have ended, it is lost at once."""

@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 
 from mjfim.budget import Budget
-from mjfim.excitation.coarse_to_fine import CoarseToFine, _State
+from mjfim.excitation.coarse_comparison import CoarseComparison, point_without_limits
+from mjfim.excitation.coarse_to_fine import CoarseToFine
 from mjfim.excitation.coarser_levels import coarser_levels
 from mjfim.excitation.controls_within_limits import LimitedCost
 from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import initial_controls_of
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.levels import DescentLevel, has_similar_cost
+from mjfim.excitation.limited_searches import LimitedSearches
 from mjfim.excitation.objective import DIVERGED
+from mjfim.excitation.rounds import Entry
 from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.running_rounds import EndedSearch, RunningRounds
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.records.design import Status
@@ -46,8 +50,21 @@ def level_of(**descent: object) -> DescentLevel:
 
 def search_of(fine: DescentLevel, budget: Budget) -> CoarseToFine:
     """A search on two coarse levels and the stated one."""
-    coarse = coarser_levels(fine)[:2]
-    return CoarseToFine(fine=fine, coarse=None, levels=coarse, budget=budget)
+    starts = list(initial_controls_of(fine.task, None))
+    searches = LimitedSearches(stated=fine, executor=None, budget=budget)
+    return CoarseToFine(searches=searches, starts=starts, levels=coarser_levels(fine)[:2])
+
+
+@pytest.fixture(scope="module")
+def cost(fine: DescentLevel) -> LimitedCost:
+    """Cost of controls that keep all limits."""
+    return LimitedCost(level=fine)
+
+
+@pytest.fixture(scope="module")
+def comparison(search: CoarseToFine) -> CoarseComparison:
+    """Comparison of the results of the coarsest level."""
+    return search.comparison(search.levels[0])
 
 
 def factors_of(fine: DescentLevel) -> list[int]:
@@ -75,7 +92,7 @@ def test_every_round_leaves_controls_that_keep_all_limits(fine: DescentLevel) ->
     tasks = [level.task for level in (*search.levels, fine)]
     assert all(len(task.centres) for task in tasks)
     steps_before = sum(task.plant.engine_steps for task in tasks)
-    results = consume(search.run(starts), events.append)
+    results = consume(search.run(), events.append)
     taken = sum(task.plant.engine_steps for task in tasks) - steps_before
     assert sum(result.steps for result in results) == taken
     rows = [event.row for event in events]
@@ -102,105 +119,114 @@ def test_every_round_leaves_controls_that_keep_all_limits(fine: DescentLevel) ->
 @pytest.mark.slow
 def test_a_single_iteration_is_not_spent_on_every_level() -> None:
     fine = level_of(starts=1, max_iterations=1)
-    starts = list(initial_controls_of(fine.task, None))
-    (result,) = consume(search_of(fine, Budget()).run(starts), None)
+    (result,) = consume(search_of(fine, Budget()).run(), None)
     assert [row.rate for row in result.history] == [12.5, 12.5, 100.0, 100.0]
 
 
 @pytest.mark.slow
 def test_a_short_time_is_for_few_starts_and_for_coarse_levels(fine: DescentLevel) -> None:
-    starts = list(initial_controls_of(fine.task, None))
-    assert len(search_of(fine, Budget())._affordable(starts)) == 5
-    assert len(search_of(fine, Budget(seconds=1e-3))._affordable(starts)) == 1
+    assert len(search_of(fine, Budget()).affordable()) == 5
+    assert len(search_of(fine, Budget(seconds=1e-3)).affordable()) == 1
 
     # The stated level is left out where its iterations would take too long.
-    results = consume(search_of(fine, Budget(seconds=1e-3)).run(starts), None)
+    results = consume(search_of(fine, Budget(seconds=1e-3)).run(), None)
     assert [result.name for result in results] == ["initial control"]
     assert {row.rate for row in results[0].history} == {12.5}
     assert np.isfinite(results[0].cost)
 
 
 def test_a_better_control_of_an_earlier_round_remains(search: CoarseToFine) -> None:
-    control = 0.5 * search.fine.task.control
+    control = 0.5 * search.searches.stated.task.control
     before = RunResult(name="a", control=control, cost=1.0)
     worse = RunResult(name="a", control=2.0 * control, cost=2.0, status=Status.CONVERGED)
-    kept = search._merged(before, worse)
+    kept = search.merged(before, worse)
     assert kept.control is control and kept.cost == 1.0 and kept.status is Status.BEST_SEEN
     lost = replace(worse, cost=np.inf, status=Status.INFEASIBLE)
-    assert search._merged(before, lost).status is Status.MAX_ITERATIONS
-    better = search._merged(before, replace(worse, cost=0.5))
+    assert search.merged(before, lost).status is Status.MAX_ITERATIONS
+    better = search.merged(before, replace(worse, cost=0.5))
     assert better.cost == 0.5 and better.earlier[-1] is control
 
     # The control outside the limits is kept too, for a last attempt to shrink it.
     outside = replace(before, cost=np.inf)
-    assert search._merged(outside, replace(lost, control=None)).control is control
+    assert search.merged(outside, replace(lost, control=None)).control is control
 
 
 def test_the_result_of_a_coarse_level_is_neither_converged_nor_infeasible(
-    search: CoarseToFine,
+    comparison: CoarseComparison, cost: LimitedCost
 ) -> None:
-    coarse = search.levels[0]
-    found = RunResult(name="a", control=0.1 * search.fine.task.control, status=Status.INFEASIBLE)
-    inside = search._on_stated_plant(found, coarse, is_tried=True)
+    control = 0.1 * cost.level.task.control
+    found = RunResult(name="a", control=control, status=Status.INFEASIBLE)
+    inside = comparison.on_stated_plant(cost, found, is_tried=True)
     assert np.isfinite(inside.cost) and inside.status is Status.MAX_ITERATIONS
 
     useless = RunResult(name="a", status=Status.CONVERGED)
-    assert search._on_stated_plant(useless, coarse, is_tried=True).status is Status.INFEASIBLE
-    late = search._on_stated_plant(replace(found, cost=1.0), coarse, is_tried=False)
+    assert comparison.on_stated_plant(cost, useless, is_tried=True).status is Status.INFEASIBLE
+    late = comparison.on_stated_plant(cost, replace(found, cost=1.0), is_tried=False)
     assert late.control is found.control and np.isinf(late.cost)
 
 
-def test_a_misleading_level_does_not_lose_the_start(search: CoarseToFine) -> None:
-    task, level = search.fine.task, search.levels[0]
-    start = next(iter(initial_controls_of(task, None)))
+def test_a_misleading_level_does_not_lose_the_start(
+    search: CoarseToFine, comparison: CoarseComparison, cost: LimitedCost
+) -> None:
+    task, start = cost.level.task, search.starts[0]
     misled = RunResult(name=start.name, control=np.tile(task.centre, (task.samples, 1)), cost=1e-3)
-    candidate = search._candidate(misled, start, level)
-    assert candidate.start.control is start.control and not candidate.is_new
-    assert candidate.cost > 1e-3
+    found = comparison.candidate(cost, misled, start)
+    assert found.following is not None and found.following.control is start.control
+    assert not found.is_new and found.cost > 1e-3
 
-    # The barrier weight remains where the next round begins with the control before.
-    state = _State(starts=[start])
-    search._choose_starts([misled], level, state, 0.03)
-    assert [each.control is start.control for each in state.starts] == [True]
-    assert state.mu == BarrierSchedule().first
+    # The barrier weight remains where the next round begins with the control before, also after a
+    # round without any usable control.
+    useless = comparison.candidate(cost, RunResult(name=start.name), start)
+    for judgement in (found, useless):
+        rounds = RunningRounds(replace(search, starts=[start]), [start])
+        entry = rounds.next_entry()
+        assert entry is not None
+        ended = EndedSearch(entry=entry, result=misled, seconds=1.0)
+        rounds.settle(ended, judgement)
+        following = rounds.next_entry()
+        assert following is not None and following.start.control is start.control
+        assert (following.round, following.mu) == (1, BarrierSchedule().first)
 
-    # Neither is a round without any control useful.
-    search._choose_starts([RunResult(name=start.name)], level, state, 0.03)
-    assert len(state.starts) == 1 and state.mu == BarrierSchedule().first
 
-
-def test_a_misleading_cost_does_not_win(search: CoarseToFine) -> None:
-    task, level = search.fine.task, search.levels[0]
-    start = next(iter(initial_controls_of(task, None)))
-    useless = replace(start, name="b", control=np.tile(task.centre, (task.samples, 1)))
-    stated = search._point_without_limits(start.control)
+def test_a_misleading_cost_does_not_win(
+    search: CoarseToFine, comparison: CoarseComparison, cost: LimitedCost
+) -> None:
+    task, start = cost.level.task, search.starts[0]
+    centre = np.tile(task.centre, (task.samples, 1))
+    useless = replace(start, name="b", control=centre)
+    stated = point_without_limits(cost.level, start.control)
     assert stated is not None
-    found = [
-        RunResult(name="b", control=useless.control, cost=0.5 * stated.cost),
-        RunResult(name=start.name, control=start.control, cost=stated.cost),
-    ]
-    state = _State(starts=[useless, start])
-    search._choose_starts(found, level, state, 0.03)
-    assert [each.name for each in state.starts] == [start.name] and state.mu == 0.03
+
+    rounds = RunningRounds(search, [useless, start])
+    for start_cost in (0.5 * stated.cost, stated.cost):
+        entry = rounds.next_entry()
+        assert entry is not None
+        result = RunResult(name=entry.start.name, control=entry.start.control, cost=start_cost)
+        judgement = comparison.candidate(cost, result, entry.start)
+        rounds.settle(EndedSearch(entry=entry, result=result, seconds=1.0), judgement)
+    following = rounds.next_entry()
+    assert following is not None and rounds.next_entry() is None
+    assert (following.start.name, following.mu) == (start.name, 0.03)
 
 
 def test_no_coarse_level_begins_after_the_end_of_the_time(fine: DescentLevel) -> None:
-    search = CoarseToFine(fine=fine, coarse=None, levels=(fine,), budget=Budget(seconds=0.0))
-    state = _State(starts=[], results={"a": RunResult(name="a")})
-    assert search._is_over(replace(fine), state) and not search._is_over(fine, state)
+    search = search_of(fine, Budget(seconds=0.0))
+    start = search.starts[0]
+    coarse, stated = (Entry(number=0, index=0, round=r, start=start) for r in (1, 2))
+    assert not search.may_begin(coarse, has_feasible=False)
+    assert search.may_begin(stated, has_feasible=False)
 
 
-def test_only_staircases_are_smoothed(search: CoarseToFine) -> None:
-    coarse = search.levels[0]
+def test_only_staircases_are_smoothed(comparison: CoarseComparison) -> None:
     limited = LIMITS.replace(limits={"control_rate": 5.0})
     fine = DescentLevel(DesignTask.resolve(limited, threads=1).relaxed(), None)
-    search = replace(search, fine=fine)
-    assert search._limited_cost.constraints.rate is not None
+    cost = LimitedCost(level=fine)
+    assert cost.constraints.rate is not None
 
     curve = np.sin(np.arange(fine.task.samples) / 9.0)[:, None]
-    assert search._without_jumps(curve, coarse) is curve
+    assert comparison.without_jumps(cost, curve) is curve
     stairs = np.repeat(curve[::8], 8, axis=0)
-    smooth = search._without_jumps(stairs, coarse)
+    smooth = comparison.without_jumps(cost, stairs)
     assert np.abs(np.diff(smooth, axis=0)).max() < 0.3 * np.abs(np.diff(stairs, axis=0)).max()
 
 

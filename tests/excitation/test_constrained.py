@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -23,10 +24,11 @@ from mjfim.excitation.feasibility import SHRINK_FACTORS
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.interior_point import BarrierSchedule, InteriorPointMethod, updated_tightening
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.merged_results import merge_rounds
+from mjfim.excitation.limited_searches import LimitedSearches, SearchTerms
+from mjfim.excitation.merged_results import better_of
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.run_result import RunResult, consume
-from mjfim.excitation.search_round import RoundTerms
+from mjfim.excitation.stated_comparison import StatedComparison
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import verify
@@ -80,9 +82,14 @@ def method_of(free: DesignTask) -> InteriorPointMethod:
     )
 
 
-def multistart_of(free: DesignTask) -> Multistart:
+def multistart_of(
+    free: DesignTask, starts: Sequence[InitialControl] = (), budget: Budget | None = None
+) -> Multistart:
     """Several starts on a plant without clamps, without a coarse level."""
-    return Multistart(fine=DescentLevel(free, None), coarse=None, budget=Budget())
+    budget = Budget() if budget is None else budget
+    level = DescentLevel(free, None)
+    searches = LimitedSearches(stated=level, executor=None, budget=budget)
+    return Multistart(searches=searches, starts=starts, coarse=None)
 
 
 # ---- the requirement
@@ -224,7 +231,7 @@ def test_a_stopped_search_shrinks_only_the_actuator_that_leaves_its_limit(tmp_pa
     wave = np.sin(4.0 * np.pi * task.t)[:, None]
     control = task.centre + wave * [1.6, 0.3]
     search = multistart_of(task.relaxed())
-    search.budget.stop.request()
+    search.searches.budget.stop.request()
     shrunk = search.repair.shrink(control)
     assert np.isfinite(shrunk.cost)
 
@@ -433,7 +440,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     # another start is still optimised
     rows: list[DesignEvent] = []
     starts = [search.start, InitialControl(name="initial control", control=task.control)]
-    results = consume(multistart_of(task.relaxed()).run(starts), rows.append)
+    results = consume(multistart_of(task.relaxed(), starts).run(), rows.append)
     assert rows
     assert np.isfinite(results[1].cost)
 
@@ -567,7 +574,7 @@ def test_a_second_round_that_converges_at_a_higher_cost_is_not_reported() -> Non
     control = np.zeros((3, 1))
     first = RunResult(name="x", control=control, cost=1.0, status=Status.MAX_ITERATIONS)
     second = RunResult(name="x", control=control + 1.0, cost=2.0, status=Status.CONVERGED)
-    (merged,) = merge_rounds([first], [second])
+    merged = better_of(first, second)
     assert merged.control is control
     assert merged.status is Status.BEST_SEEN
 
@@ -637,18 +644,16 @@ def test_an_interrupted_multistart_keeps_the_best_so_far(tmp_path: Path) -> None
 def test_a_fourier_start_is_optimised_as_a_series_in_the_first_round(tmp_path: Path) -> None:
     task = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
     starts = list(initial_controls_of(task, None))
-    terms = RoundTerms(schedule=BarrierSchedule(last=0.01), max_iterations=6, seconds=np.inf)
-    level = DescentLevel(task.relaxed(), None)
-    first_round = multistart_of(task.relaxed()).rounds.run(level, starts, terms)
-    first = {result.name: result.control for result in consume(first_round, None)}
-    assert list(first) == ["initial control", "Fourier series of 2 Hz"]
+    assert [start.name for start in starts] == ["initial control", "Fourier series of 2 Hz"]
+    search = multistart_of(task.relaxed(), starts)
+    terms = SearchTerms(schedule=BarrierSchedule(last=0.01), max_iterations=6, seconds=np.inf)
+    first = consume(search.searches.run(search.searches.stated, starts[1], terms), None)
     waves = [f(2 * np.pi * 2.0 * k * task.t) for k in range(1, 16) for f in (np.sin, np.cos)]
     series = np.column_stack(waves)
-    found = first["Fourier series of 2 Hz"]
-    assert found is not None
-    control = found - task.centre
+    assert first is not None
+    control = first.control - task.centre
     assert relative_error(series @ np.linalg.lstsq(series, control)[0], control) < 1e-6
-    results = consume(multistart_of(task.relaxed()).run(starts), None)
+    results = consume(search.run(), None)
     assert np.isfinite(min(result.cost for result in results))
 
 
@@ -814,9 +819,9 @@ def test_a_design_that_comes_too_close_between_its_samples_is_corrected(
         limits={"clearance": 0.15, "control_rate": 20.0},
         descent={"max_iterations": 16, "coarse": 1},
     )
-    search = multistart_of(task.relaxed())
+    free = task.relaxed()
     starts = [InitialControl(name="initial control", control=task.control)]
-    (first,) = consume(search.run(starts), None)
+    (first,) = consume(multistart_of(free, starts).run(), None)
     distance = nearest(task, first.control)
     assert distance < 0.15
     found = verify(task, task.plant.simulate(task.theta, first.control))
@@ -824,7 +829,7 @@ def test_a_design_that_comes_too_close_between_its_samples_is_corrected(
     assert found.margins["clearance"] == pytest.approx(distance - 0.15, abs=1e-6)
 
     budget = Budget() if has_time else Budget(seconds=0.0)
-    (final,) = consume(replace(search, budget=budget).tighten_winner([first]), None)
+    (final,) = consume(multistart_of(free, budget=budget).tighten_winner([first]), None)
     assert nearest(task, final.control) >= 0.15
     assert (len(final.history) > len(first.history)) is has_time
 
@@ -834,9 +839,9 @@ def test_a_design_that_comes_too_close_between_its_samples_is_corrected(
     # A search that was stopped keeps what it gained as well.
     stopped = Budget()
     stopped.stop.request()
-    (kept,) = consume(replace(search, budget=stopped).tighten_winner([first]), None)
+    (kept,) = consume(multistart_of(free, budget=stopped).tighten_winner([first]), None)
     assert nearest(task, kept.control) >= 0.15
-    assert kept.cost < search.fine.problem.point(task.initial).cost
+    assert kept.cost < DescentLevel(free, None).problem.point(task.initial).cost
 
 
 @pytest.mark.slow
@@ -928,20 +933,21 @@ def test_a_control_that_violates_a_limit_a_little_continues_beside_its_start(
     tmp_path: Path,
 ) -> None:
     free = cart_inside(tmp_path).relaxed()
-    rivals = multistart_of(free)
+    cost = LimitedCost(level=DescentLevel(free, None))
     start, leaking, inside = (
         InitialControl(name="x", control=s * free.control) for s in (0.2, 3.0, 0.1)
     )  # the smallest control has the lowest cost here
-    result, candidate = rivals.reevaluate(
-        RunResult(name="x", control=leaking.control, cost=1e-3), start
-    )
-    assert (candidate.control is leaking.control, candidate.cost) == (True, 1e-3)
+    leaked = RunResult(name="x", control=leaking.control, cost=1e-3)
+    judgement = StatedComparison().judged(cost, leaked, start)
+    result, following = judgement.result, judgement.following
+    assert following is not None and following.control is leaking.control
+    assert judgement.cost == 1e-3
     assert result.control is not leaking.control
     assert result.cost == pytest.approx(
         free.problem.point(free.plant.simulate(free.theta, start.control)).cost
     )
-    result, candidate = rivals.reevaluate(
-        RunResult(name="x", control=inside.control, cost=1e-3), start
-    )
-    assert candidate.control is result.control is inside.control
-    assert candidate.cost == result.cost > 1e-3
+    kept = RunResult(name="x", control=inside.control, cost=1e-3)
+    judgement = StatedComparison().judged(cost, kept, start)
+    assert judgement.following is not None
+    assert judgement.following.control is judgement.result.control is inside.control
+    assert judgement.cost == judgement.result.cost > 1e-3
