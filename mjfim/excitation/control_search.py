@@ -35,6 +35,10 @@ from mjfim.records.design import Status
 # Largest number of searches, stopped on a coarse level, that are compared at the stated rate.
 EVALUATED_STOPPED = 4
 
+# Number of the best searches under hard limits that are evaluated on the unmodified plant, where
+# the costs of all of them are known from the plant without clamps.
+EVALUATED_LIMITED = 8
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControlSearch:
@@ -119,8 +123,7 @@ class ControlSearch:
             budget=self.budget,
         )
         constrained = yield from search.run(starts, inside)
-        found = [self._on_stated_plant(result) for result in constrained]
-        results += self._not_worse(found, inside)
+        results += self._not_worse(self._evaluated(constrained), inside)
         if results:
             steps = results[0].steps + steps_without_barrier
             results[0] = replace(results[0], steps=steps)
@@ -170,6 +173,22 @@ class ControlSearch:
         kept = replace(first, control=inside.control, cost=inside.cost, status=status)
         return [self._on_stated_plant(kept), *found[1:]]
 
+    def _evaluated(self, results: Sequence[RunResult]) -> list[RunResult]:
+        """Results of which the first and the best ones are evaluated on the unmodified plant.
+
+        The costs of the others are those of the searches. After a request to stop, these may be
+        costs on a coarse level, of controls that were not verified.
+        """
+        by_cost = sorted(range(len(results)), key=lambda index: results[index].cost)
+        evaluated = {0, *by_cost[:EVALUATED_LIMITED]}
+        is_stopped = self.budget.stop.requested
+        return [
+            self._on_stated_plant(result)
+            if index in evaluated
+            else replace(result, is_feasible=bool(np.isfinite(result.cost)) and not is_stopped)
+            for index, result in enumerate(results)
+        ]
+
     def _on_stated_plant(self, result: RunResult) -> RunResult:
         """Result of one start, evaluated again on the unmodified plant."""
         point = None
@@ -190,12 +209,27 @@ class ControlSearch:
         )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Choice:
+    """The best run of a design.
+
+    Attributes:
+        best: The best run.
+        point: Point of the design.
+        results: One result per run, of which the chosen one is evaluated on the stated plant.
+    """
+
+    best: RunResult
+    point: DesignPoint
+    results: tuple[RunResult, ...]
+
+
 def choose(
     search: ControlSearch,
     begins: Sequence[DesignPoint],
-    results: list[RunResult],
+    results: Sequence[RunResult],
     interrupted: bool,
-) -> tuple[RunResult, DesignPoint]:
+) -> Choice:
     """Choose the best run and the point of the design.
 
     The point is that of the control with which the search began, or of the initial control, where
@@ -210,12 +244,12 @@ def choose(
         interrupted: True where the search was stopped.
     """
     if not results:
-        results.append(RunResult(name="initial control", status=Status.INTERRUPTED))
+        results = [RunResult(name="initial control", status=Status.INTERRUPTED)]
 
-    _evaluate_stopped(search.stage, results)
-    best = min(results, key=lambda result: (not result.is_feasible, result.cost))
+    known = _with_best_evaluated(search.stage, _with_evaluated_stops(search.stage, results))
+    best = _best_of(known)
     if best.point is None and not interrupted:
-        if all(result.status is Status.LOST for result in results):
+        if all(result.status is Status.LOST for result in known):
             raise LostWorkError(
                 "the workers of all starts were lost several times (their processes were ended "
                 "from outside, perhaps because the memory was full), so there is no design"
@@ -227,13 +261,29 @@ def choose(
     cheaper = [
         begin for begin in begins if begin.cost < bound and keeps_limits(search.limited, begin)
     ]
+    point = begins[0] if best.point is None else best.point
     if cheaper:
         status = Status.BEST_SEEN if best.status is Status.INFEASIBLE else best.status
-        return replace(best, status=status), min(cheaper, key=lambda begin: begin.cost)
-    return best, begins[0] if best.point is None else best.point
+        best, point = replace(best, status=status), min(cheaper, key=lambda begin: begin.cost)
+    return Choice(best=best, point=point, results=tuple(known))
 
 
-def _evaluate_stopped(stage: DescentLevel, results: list[RunResult]) -> None:
+def _best_of(results: Sequence[RunResult]) -> RunResult:
+    """The feasible run of lowest cost; an infeasible one where none is feasible."""
+    return min(results, key=lambda result: (not result.is_feasible, result.cost))
+
+
+def _with_best_evaluated(stage: DescentLevel, results: Sequence[RunResult]) -> list[RunResult]:
+    """Results of which the best one is evaluated on the stated plant, where its cost is known."""
+    known = list(results)
+    while True:
+        best = _best_of(known)
+        if best.point is not None or best.control is None or np.isinf(best.cost):
+            return known
+        known[known.index(best)] = _evaluated_at(stage, best)
+
+
+def _with_evaluated_stops(stage: DescentLevel, results: Sequence[RunResult]) -> list[RunResult]:
     """Evaluate the best searches that were stopped on a coarse level, at the stated rate.
 
     On workers several searches may be stopped there. Each evaluation costs as much as an iterate,
@@ -241,7 +291,10 @@ def _evaluate_stopped(stage: DescentLevel, results: list[RunResult]) -> None:
 
     Args:
         stage: The stated level.
-        results: One result per run; the evaluated ones are replaced.
+        results: One result per run.
+
+    Returns:
+        The results, some of which are evaluated.
     """
 
     def last_cost(index: int) -> float:
@@ -252,14 +305,20 @@ def _evaluate_stopped(stage: DescentLevel, results: list[RunResult]) -> None:
     stopped = [
         index
         for index, result in enumerate(results)
-        if result.point is None and result.control is not None
+        if result.point is None and result.control is not None and np.isinf(result.cost)
     ]
-    for index in sorted(stopped, key=last_cost)[:EVALUATED_STOPPED]:
-        result = results[index]
-        assert result.control is not None
-        point = point_at_stated_rate(stage, result.control)
-        cost = np.inf if point is None else point.cost
-        results[index] = replace(result, point=point, cost=cost)
+    compared = {
+        index: _evaluated_at(stage, results[index])
+        for index in sorted(stopped, key=last_cost)[:EVALUATED_STOPPED]
+    }
+    return [compared.get(index, result) for index, result in enumerate(results)]
+
+
+def _evaluated_at(stage: DescentLevel, result: RunResult) -> RunResult:
+    """A result with a control, evaluated on the stated plant."""
+    assert result.control is not None
+    point = point_at_stated_rate(stage, result.control)
+    return replace(result, point=point, cost=np.inf if point is None else point.cost)
 
 
 def _is_bounded_by_weights(task: DesignTask) -> bool:

@@ -14,6 +14,7 @@ from mjfim.excitation.controls_within_limits import keeps_limits, limited_cost_o
 from mjfim.excitation.design_report import DesignReport
 from mjfim.excitation.designable import identifiability_along, require_designable
 from mjfim.excitation.initial_controls import initial_controls_of
+from mjfim.excitation.left_starts import starts_without_time
 from mjfim.excitation.levels import DescentLevel, require_coarse_factor
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.release_search import ReleaseSearch
@@ -130,7 +131,7 @@ def design_task(
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if initial_control is not None:
         initial_control = _checked_control(task, initial_control)
-    starts = initial_controls_of(task, initial_control)
+    starts = list(initial_controls_of(task, initial_control))
     begin = _point_of_given(task, first, initial_control)
     identifiability = identifiability_along(task, begin)
     require_designable(task, identifiability)
@@ -154,16 +155,17 @@ def design_task(
     interrupted = budget.stop.requested
 
     # Steps on other plants, also those of workers, are counted by the runs.
+    choice = choose(search, [first, begin], results, interrupted)
     steps = task.plant.engine_steps - steps_before + sum(result.steps for result in results)
-    best, chosen = choose(search, [first, begin], results, interrupted)
     report = DesignReport(
         stage=stage,
         identifiability=identifiability,
         initial=first,
-        final=chosen,
+        final=choice.point,
         scaled_start=None if outside is None else outside.record,
+        remarks=() if interrupted else starts_without_time(task, starts, results),
     )
-    return report.design(best, results, budget.seconds_used, steps, interrupted)
+    return report.design(choice.best, choice.results, budget.seconds_used, steps, interrupted)
 
 
 def _design_release(

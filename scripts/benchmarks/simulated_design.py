@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,10 +11,10 @@ from unittest.mock import patch
 import mjfim
 from mjfim.excitation import design as design_module
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
-from mjfim.excitation.multistart import Multistart
-from mjfim.excitation.run_result import RunResult
+from mjfim.excitation.judging import JudgeOrder
+from mjfim.excitation.rounds import Judgement
 from mjfim.excitation.task import DesignTask
-from scripts.benchmarks.simulated_cluster import MeasuredTasks, SimulatedCluster, simulated
+from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
 
 # Time that a task needs to reach a worker of a cluster, and its result to return [s].
 LATENCY = 5e-3
@@ -106,7 +105,6 @@ def _simulated_seconds(
     with (
         patch.object(design_module, "initial_controls_of", many),
         simulated(workers, tasks, LATENCY) as cluster,
-        patch.object(Multistart, "reevaluate", tasks.reevaluation(cluster)),
     ):
         design_module.design_task(task, executor=cluster.workers)
     return _Times(
@@ -125,51 +123,27 @@ class _MeasuredSearches(MeasuredTasks):
 
     def __init__(self) -> None:
         super().__init__(key_of=_key)
-        self._reevaluated: dict[Hashable, tuple[Any, float]] = {}
-
-    def reevaluation(self, cluster: SimulatedCluster) -> Any:
-        """Return a method in place of `Multistart.reevaluate` that does copies only once.
-
-        Args:
-            cluster: Where the CPU time of the caller counts each time.
-        """
-        original = Multistart.reevaluate
-
-        def reevaluate(self_: Multistart, result: RunResult, start: InitialControl) -> Any:
-            control = b"" if result.control is None else result.control.tobytes()
-            key = start.name.partition(COPY)[0], control
-            if key in self._reevaluated:
-                found, seconds = self._reevaluated[key]
-                cluster.charge(seconds)
-            else:
-                begun = time.process_time()
-                found = original(self_, result, start)
-                self._reevaluated[key] = found, time.process_time() - begun
-            return tuple(replace(each, name=start.name) for each in found)
-
-        return reevaluate
 
     def done(self, fn: Any, args: tuple[Any, ...]) -> tuple[Any, float]:
-        """Result of a search under the name of its start, and its CPU time [s]."""
+        """Result of a slice or of a judgement under the name of its start, and its CPU time [s]."""
         found, seconds = super().done(fn, args)
-        name = _search(args).start.name
-        if hasattr(found, "result"):  # of a slice
-            return replace(found, result=replace(found.result, name=name)), seconds
-        return replace(found, name=name), seconds
-
-
-def _search(args: tuple[Any, ...]) -> Any:
-    """Return the search of an order, which may be that of a slice."""
-    return getattr(args[0], "search", args[0])
+        name = args[0].search.start.name
+        renamed = replace(found, result=replace(found.result, name=name))
+        if isinstance(found, Judgement) and found.following is not None:
+            renamed = replace(renamed, following=replace(found.following, name=name))
+        return renamed, seconds
 
 
 def _key(args: tuple[Any, ...]) -> Hashable:
-    """Return what tells a search or a slice from others, apart from copies of its start."""
-    search, before = _search(args), getattr(args[0], "before", None)
-    done = 0 if before is None else len(before.result.history)
-    schedule = search.schedule
-    name = search.start.name.partition(COPY)[0]
-    return name, schedule.first, schedule.last, tuple(search.tightening.items()), done
+    """Return what tells a slice or a judgement from others, apart from copies of its start."""
+    (order,) = args
+    search = order.search
+    name, schedule = search.start.name.partition(COPY)[0], search.schedule
+    common = name, str(search.variant), schedule.first, tuple(search.tightening.items())
+    if isinstance(order, JudgeOrder):
+        return (*common, order.result.control.tobytes())
+    done = 0 if order.before is None else len(order.before.result.history)
+    return (*common, search.start.control.tobytes(), search.max_iterations, done)
 
 
 def save_curve(rows: Sequence[Efficiency], wanted: float, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -40,9 +41,30 @@ def test_the_best_of_several_runs_that_were_stopped_on_the_coarse_level_counts(
     monkeypatch.setattr(control_search, "point_at_stated_rate", point)
     results = [stopped(cost) for cost in (7.0, 3.0, 9.0, 8.0, 6.0, 5.0)]
 
-    best, chosen = choose(SEARCH, [INITIAL], results, True)
-    assert (best.name, best.cost, chosen.cost) == ("3", 3.1, 3.1)
+    choice = choose(SEARCH, [INITIAL], results, True)
+    assert (choice.best.name, choice.best.cost, choice.point.cost) == ("3", 3.1, 3.1)
     assert evaluated == [3.0, 5.0, 6.0, 7.0][:EVALUATED_STOPPED]
+
+    # The results that the caller holds are not changed.
+    assert all(result.point is None for result in results)
+    assert sum(result.point is not None for result in choice.results) == EVALUATED_STOPPED
+
+
+def test_the_best_of_many_starts_is_evaluated_whatever_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of many starts under limits only some are evaluated before; one of them may cost more."""
+
+    def point(stage: object, control: Array) -> Any:
+        """Evaluate a control, which is as good as its search has said."""
+        return SimpleNamespace(cost=control[0, 0])
+
+    monkeypatch.setattr(control_search, "point_at_stated_rate", point)
+    evaluated = replace(stopped(2.0), cost=6.0, point=SimpleNamespace(cost=6.0))
+    others = [replace(stopped(cost), cost=cost) for cost in (4.0, 5.0)]
+    choice = choose(SEARCH, [INITIAL], [evaluated, *others], False)
+    assert choice.best.name == "4" and choice.point.cost == 4.0
+    assert [result.point is None for result in choice.results] == [False, False, True]
 
 
 def test_a_design_all_of_whose_workers_are_lost_says_so() -> None:

@@ -1,0 +1,232 @@
+"""Successive halving: its decisions do not depend on who ends first, and nobody waits for it."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.budget import Budget
+from mjfim.excitation.design import design_task
+from mjfim.excitation.halving import HALVING_RATE, HalvingRound, Settled
+from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.judging import JudgeOrder
+from mjfim.excitation.left_starts import starts_without_time
+from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.limited_searches import LimitedSearches
+from mjfim.excitation.merged_results import continued
+from mjfim.excitation.multistart import Multistart
+from mjfim.excitation.round_times import LEAST_SHARE, RoundTimes
+from mjfim.excitation.rounds import Judgement
+from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.search_slices import SealedState, SearchSlice
+from mjfim.excitation.task import DesignTask
+from mjfim.records.design import Design, Status
+from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
+from tests.support.limits import cart_inside
+
+
+def promoted(costs: Sequence[float], arrivals: Sequence[int]) -> list[int]:
+    """Starts that go on, in the order of the decisions, for a given order of arrival."""
+    halving = HalvingRound()
+    for number in range(len(costs)):
+        halving.enter(number)
+    halving.close()
+
+    found: list[int] = []
+    for number in arrivals:
+        halving.settle(number, Settled(cost=costs[number]))
+        found += halving.decide()
+    assert halving.is_over
+    return found
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 7, 8, 9, 30])
+def test_the_same_starts_go_on_whoever_ends_first(count: int) -> None:
+    rng = np.random.default_rng(count)
+    costs = rng.permutation(count).astype(float).tolist()
+    found = promoted(costs, range(count))
+    for _ in range(20):
+        assert promoted(costs, rng.permutation(count).tolist()) == found
+
+    # The best quarter always goes on; with fewer than eight starts nobody else does.
+    best = set(np.argsort(costs)[: max(1, count // HALVING_RATE)].tolist())
+    assert best <= set(found)
+    assert len(found) == len(set(found)) <= max(1, count // HALVING_RATE) + count // 8
+
+
+def test_a_decision_does_not_wait_for_starts_behind_it() -> None:
+    halving = HalvingRound()
+    for number in range(8):
+        halving.enter(number)
+    for number in (3, 0, 2):
+        halving.settle(number, Settled(cost=float(number)))
+        assert halving.decide() == []
+    halving.settle(1, Settled(cost=-1.0))
+    assert halving.decide() == [1]
+    assert halving.discarded == {0, 2, 3}
+
+    # The last decision waits until no further start can enter.
+    for number in range(4, 8):
+        halving.settle(number, Settled(cost=-2.0, may_go_on=number != 4, is_usable=number < 6))
+    assert halving.decide() == [] and not halving.is_over
+    halving.close()
+    assert halving.decide() == [5] and halving.is_over
+
+
+# ---- the rounds of a design, with invented results
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
+    """A short experiment of the cart-pendulum within limits."""
+    return cart_inside(tmp_path_factory.mktemp("halving"), horizon=0.3)
+
+
+def multistart_of(task: DesignTask, count: int, executor: Executor) -> Multistart:
+    """Several starts in two rounds, whose results are judged."""
+    level = DescentLevel(task.relaxed(), None)
+    searches = LimitedSearches(stated=level, executor=executor, budget=Budget())
+    starts = [InitialControl(name=f"{i}", control=task.control) for i in range(count)]
+    return Multistart(searches=searches, starts=starts, coarse=level)
+
+
+class InventedTasks(MeasuredTasks):
+    """Slices, two of each search, and judgements whose results and lengths are invented.
+
+    Args:
+        seconds: Length of the searches of a round, by the name of the start and whether the round
+            is the last one.
+    """
+
+    def __init__(self, seconds: Callable[[str, bool], float]) -> None:
+        super().__init__()
+        self._seconds = seconds
+        self.begun: list[tuple[str, bool]] = []
+
+    def done(self, fn: Any, args: tuple[Any, ...]) -> tuple[Any, float]:
+        (order,) = args
+        name = order.search.start.name
+        cost = float(np.random.default_rng(int(name)).uniform())
+        result = RunResult(name=name, control=order.search.start.control, cost=cost)
+        if isinstance(order, JudgeOrder):
+            return Judgement(result=result, following=continued(result), cost=cost), 0.1
+
+        is_last = order.search.schedule.first < 0.1
+        seconds = 0.5 * self._seconds(name, is_last)
+        if order.before is None:
+            self.begun.append((name, is_last))
+            return SearchSlice(result=result, state=SealedState.of(0)), seconds
+        return SearchSlice(result=result), seconds
+
+
+def test_no_worker_waits_for_the_end_of_a_round(task: DesignTask) -> None:
+    """One of the first starts takes a third of the whole time."""
+    lengths = np.random.default_rng(0).uniform(50.0, 150.0, 96)
+    lengths[5] = 1000.0
+    tasks = InventedTasks(lambda name, is_last: lengths[int(name)] * (2.0 if is_last else 1.0))
+    with simulated(4, tasks) as cluster:
+        results = consume(multistart_of(task, 96, cluster.workers).run(), None)
+    assert len(results) == 96
+    assert cluster.busy > 0.95 * 4 * cluster.searching
+
+    # Survivors begin before the last start of the first round has ended.
+    places = [place for place, (_, is_last) in enumerate(tasks.begun) if is_last]
+    assert len(places) >= 24
+
+
+def test_invented_results_are_the_same_on_any_number_of_workers(task: DesignTask) -> None:
+    found = []
+    for workers in (1, 3, 16):
+        lengths = np.random.default_rng(workers).uniform(1.0, 100.0, (2, 40))
+        tasks = InventedTasks(lambda name, last, n=lengths: float(n[int(last), int(name)]))
+        with simulated(workers, tasks) as cluster:
+            results = consume(multistart_of(task, 40, cluster.workers).run(), None)
+        found.append([(each.name, each.cost, each.status) for each in results])
+    assert found[0] == found[1] == found[2]
+    assert sum(status is not Status.LEFT for *_, status in found[0]) >= 10
+
+
+# ---- the time of a search
+
+
+def test_what_a_search_leaves_of_its_time_is_for_those_after_it() -> None:
+    now = [0.0]
+    budget = Budget(seconds=110.0)
+    budget._now = lambda: now[0]
+    budget.begun, budget.deadline = 0.0, 110.0
+    times = RoundTimes(budget, 10.0, lambda count: -(-count // 2))
+
+    # Six searches on two workers have 60 s together; the first two end early.
+    assert times.seconds(0, 0.6, 6) == times.seconds(0, 0.6, 5) == pytest.approx(20.0)
+    now[0] = 5.0
+    assert times.seconds(0, 0.6, 4) == pytest.approx(27.5)
+    now[0] = 32.0
+    assert times.seconds(0, 0.6, 2) == pytest.approx(28.0)
+
+    # Where the others took too long there is a least time; the next round has what is left.
+    now[0] = 59.0
+    assert times.seconds(0, 0.6, 1) == pytest.approx(LEAST_SHARE * 20.0)
+    assert times.seconds(1, 1.0, 1) == pytest.approx(41.0)
+
+
+def test_starts_for_which_there_was_no_time_are_named(task: DesignTask) -> None:
+    limited = replace(
+        task,
+        system=replace(task.system, experiment=task.experiment.replace(descent={"seconds": 3})),
+    )
+    starts = [InitialControl(name=name, control=task.control) for name in ("a", "b", "c")]
+    (said,) = starts_without_time(limited, starts, [RunResult(name="a")])
+    assert said.startswith(
+        "2 of 3 initial controls were left out (b, c), because 3 s are too short"
+    )
+    assert starts_without_time(limited, starts, [RunResult(name=s.name) for s in starts]) == ()
+
+
+# ---- real searches
+
+
+class LosingThreads(Executor):
+    """Does each task at once, pickled as on its way to another process; loses every fifth one."""
+
+    _max_workers = 3
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+        self.count += 1
+        future: Future[Any] = Future()
+        if self.count % 5 == 0:
+            future.set_exception(BrokenExecutor())
+        else:
+            fn, args = pickle.loads(pickle.dumps((fn, args)))
+            future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
+        return future
+
+
+def digits(design: Design) -> tuple[Any, ...]:
+    """Numbers of a design that have to be equal to the last digit."""
+    rows = [replace(row, seconds=0.0, motion=None, steps=0, margins={}) for row in design.history]
+    return design.final.cost, design.trajectory.ctrl.tobytes(), design.starts, rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("repeats", [(), (2,)], ids=["levels", "repeated"])
+def test_starts_give_the_same_design_on_any_executor(
+    repeats: tuple[int, ...], tmp_path: Path
+) -> None:
+    """Nine starts on two levels, or with a repeated one; two decisions are made."""
+    descent = {"starts": 9, "max_iterations": 4, "seed": 3, "repeats": repeats}
+    task = cart_inside(tmp_path, horizon=0.6, descent=descent)
+    serial = digits(design_task(task))
+    for count in (1, 2, 3):
+        with ThreadPoolExecutor(count) as threads:
+            assert digits(design_task(task, executor=threads)) == serial
+    assert digits(design_task(task, executor=LosingThreads())) == serial
