@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
+
 import mjfim
 from mjfim.excitation import design as design_module
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
@@ -141,7 +143,7 @@ def _key(args: tuple[Any, ...]) -> Hashable:
     name, schedule = search.start.name.partition(COPY)[0], search.schedule
     common = name, str(search.variant), schedule.first, tuple(search.tightening.items())
     if isinstance(order, JudgeOrder):
-        return (*common, order.result.control.tobytes())
+        return (*common, np.asarray(order.result.control).tobytes())
     done = 0 if order.before is None else len(order.before.result.history)
     return (*common, search.start.control.tobytes(), search.max_iterations, done)
 
