@@ -225,7 +225,7 @@ class DesignProblem:
         may_lump = lumps and np.array_equal(theta, self.theta)
         lumped = self.lumped if may_lump else None
         sensitivity = self.plant.derivatives.sensitivity(
-            theta, trajectory, central=central, lumped=lumped
+            theta, trajectory, central=central, lumped=lumped, closed_form=True
         )
         if sensitivity is None:
             return DIVERGED

@@ -225,6 +225,19 @@ class Rollouts:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class EngineSteps:
+    """All engine steps of n samples of s engine steps each.
+
+    Attributes:
+        states: (n, s+1, ns) states before the steps, and after the last one.
+        fields: MjData fields that belong to the states before the steps, each (n, s, ...).
+    """
+
+    states: Array
+    fields: dict[str, Array]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SampleSteps:
     """One sample of many simulations.
 
@@ -398,6 +411,36 @@ class BatchSimulator:
                 forces = self._forces_between_steps(observations, models, start, out, ctrl)
                 observed = _with_force_rows(observations, observed, forces)
         return Rollouts(states=states, sensors=sensors, finite=finite, observed=observed)
+
+    def engine_steps(
+        self, model: Any, states: Array, ctrl: Array, fields: Sequence[str]
+    ) -> EngineSteps:
+        """Advance every simulation by one sample and record its engine steps.
+
+        Args:
+            model: The model.
+            states: (n, ns) states before the sample.
+            ctrl: (n, nu) controls, held over the sample.
+            fields: MjData fields that an engine step computes before it moves the state.
+
+        Returns:
+            The engine steps; without a meaning where a simulation diverges.
+        """
+        count = len(states)
+        batch = self._batch("engine steps", count)
+        batch.set_models(model)
+        ids = self._load(batch, states, [model])
+
+        held = np.repeat(ctrl[:, None], self.substeps, axis=1)
+        with silence_mujoco_log():
+            out = batch.rollout(self.substeps, held, record=(RECORDED_STATE, *fields), ids=ids)
+        self._count.steps += count * self.substeps
+
+        after = out[RECORDED_STATE][:, :, 1:]
+        return EngineSteps(
+            states=np.concatenate([states[:, None], after], axis=1),
+            fields={name: out[name] for name in fields},
+        )
 
     def _held(self, ctrl: Array) -> Array:
         """(m, engine steps, nu) control of every engine step of rollouts under ctrl: (m, N, nu)."""

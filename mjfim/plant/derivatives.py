@@ -1,8 +1,9 @@
 """All derivatives of a plant in one object.
 
-Every derivative is a difference of MuJoCo steps in tangent-space coordinates (`StateSpace`):
+Derivatives are differences of MuJoCo steps in tangent-space coordinates (`StateSpace`):
 `rollout_derivatives` differentiates whole rollouts, `step_derivatives` single samples,
-`mixed_derivatives` single samples twice.
+`mixed_derivatives` single samples twice. Where the plant is an arm or similar,
+`closed_form_derivatives` takes their place in a design.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from mjfim.plant.rollout_derivatives import RolloutDerivatives
 
 
 class Derivatives(RolloutDerivatives, MixedDerivatives):
-    """Derivatives of a plant by differences of MuJoCo steps.
+    """Derivatives of a plant, most of them by differences of MuJoCo steps.
 
     Attributes:
         plant: The plant.

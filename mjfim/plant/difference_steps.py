@@ -12,6 +12,9 @@ from mjfim.records.trajectory import Trajectory
 if TYPE_CHECKING:
     from mjfim.plant.plant import Plant
 
+# Smallest divisor; it prevents a division by zero.
+TINY = 1e-300
+
 
 class DifferenceSteps:
     """A plant with the magnitudes to which the steps of its differences are relative.
@@ -51,3 +54,18 @@ class DifferenceSteps:
             (nx+nu,) magnitudes [x-unit, u-unit].
         """
         return self.plant.sizes.along(trajectory)
+
+    def direction_step(self, relative_step: float, relative_direction: Array, w: Array) -> float:
+        """Step along (psi w, w).
+
+        It is relative to the larger of the two parts.
+
+        Args:
+            relative_step: The step where the larger part is 1.
+            relative_direction: (..., nx) direction psi w, divided by the sizes of the state.
+            w: (p,) direction of the parameters [theta-unit].
+        """
+        in_model = self.plant.parameters.changes_model
+        relative = np.where(in_model, np.abs(w / self.parameter_scale), 0.0).max(initial=0.0)
+        largest = max(np.abs(relative_direction).max(initial=0.0), relative, TINY)
+        return float(relative_step / largest)

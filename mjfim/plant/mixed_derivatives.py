@@ -12,6 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.closed_form_derivatives import ClosedFormDerivatives
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.step_derivatives import MovedSamples, StepDerivatives, all_samples, tiled
 from mjfim.records.trajectory import Trajectory
@@ -51,9 +52,6 @@ SHARED_ORIGIN_SHORT = DifferenceAccuracy(
 
 # Two-sided in everything: the most accurate differences.
 CENTRAL_DIFFERENCES = DifferenceAccuracy(central=True, coordinate_step=1e-4, direction_step=1e-3)
-
-# Smallest divisor; it prevents a division by zero.
-TINY = 1e-300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,7 +103,7 @@ class _PairDerivatives:
     observation_jacobian: Array | None
 
 
-class MixedDerivatives(StepDerivatives):
+class MixedDerivatives(StepDerivatives, ClosedFormDerivatives):
     """First and mixed second derivatives of F and h."""
 
     @property
@@ -125,7 +123,8 @@ class MixedDerivatives(StepDerivatives):
         """First derivatives and mixed second derivatives along a trajectory.
 
         The latter are derivatives of `DF[psi w, w]` and `Dh[psi w, w]` by (x, u), for each
-        direction w. They are taken on the smooth plant, all others on this plant.
+        direction w. They are taken on the smooth plant, all others on this plant. Where the plant
+        has derivatives in closed form, these are taken instead of differences.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -141,6 +140,10 @@ class MixedDerivatives(StepDerivatives):
         Raises:
             SimulationDivergedError: MuJoCo cannot compile a perturbed model.
         """
+        closed = self._in_closed_form(theta, trajectory, psi, directions, observations)
+        if closed is not None:
+            return closed
+
         given = (theta, trajectory, psi, directions, accuracy)
 
         # Derivatives of sensors need the mean of both sides, so one-sided differences are used only
@@ -153,6 +156,39 @@ class MixedDerivatives(StepDerivatives):
             return found
         smooth = self.plant.smooth.derivatives._symmetric_pairs(*given, None)
         return replace(found, F_mixed=smooth.F_mixed, h_mixed=smooth.h_mixed)
+
+    def _in_closed_form(
+        self,
+        theta: Array,
+        trajectory: Trajectory,
+        psi: Array,
+        directions: Array,
+        observations: SubstepObservations | None,
+    ) -> Bilinear | None:
+        """`bilinear` in closed form, but for observations; None where there is no closed form."""
+        found = self.closed_form_mixed(theta, trajectory, psi, directions)
+        if found is None:
+            return None
+
+        jacobian = None
+        if observations is not None:
+            jacobian = self.observation_jacobians(theta, trajectory, observations)[2]
+
+        # Nothing refers to the state after the last sample.
+        first = np.moveaxis(np.concatenate([found.first.A, found.first.B], axis=2), 2, 0)
+        after = np.zeros((*first.shape[:1], 1, first.shape[2]))
+        mixed = [np.concatenate([each.swapaxes(0, 1), after], axis=1) for each in found.F_mixed]
+        return self._bilinear_from(
+            theta,
+            trajectory.state,
+            psi,
+            directions,
+            first=np.concatenate([first, after], axis=1),
+            mixed=mixed,
+            sensor_first=None,
+            sensor_mixed=[],
+            observation_jacobian=jacobian,
+        )
 
     def _symmetric_pairs(
         self,
@@ -176,7 +212,7 @@ class MixedDerivatives(StepDerivatives):
             # them.
             wanted = observations if number == 0 else None
             state_direction = psi @ w
-            epsilon = self._direction_step(accuracy, state_direction / sizes[:nx], w)
+            epsilon = self.direction_step(accuracy.direction_step, state_direction / sizes[:nx], w)
             pairs.append(self._pair(theta, moved, state_direction, w, epsilon, wanted))
 
         sensor_firsts = [pair.sensor_first for pair in pairs if pair.sensor_first is not None]
@@ -282,7 +318,7 @@ class MixedDerivatives(StepDerivatives):
         mixed = []
         for w in directions:
             state_direction = psi @ w
-            epsilon = self._direction_step(accuracy, state_direction / sizes[:nx], w)
+            epsilon = self.direction_step(accuracy.direction_step, state_direction / sizes[:nx], w)
             mixed.append(
                 self._one_sided_difference(theta, moved, origin, state_direction, w, epsilon)
             )
@@ -382,19 +418,6 @@ class MixedDerivatives(StepDerivatives):
             delay_derivative=plant.parameters.delay_derivative,
             observation_jacobian=observation_jacobian,
         )
-
-    def _direction_step(
-        self, accuracy: DifferenceAccuracy, relative_direction: Array, w: Array
-    ) -> float:
-        """Step along (psi w, w).
-
-        It is relative to the larger of the two parts: the state direction psi w in units of the
-        sizes of the state: (N+1, nx), and w divided by `parameter_scale`.
-        """
-        in_model = self.plant.parameters.changes_model
-        relative = np.where(in_model, np.abs(w / self.parameter_scale), 0.0).max(initial=0.0)
-        largest = max(np.abs(relative_direction).max(initial=0.0), relative, TINY)
-        return float(accuracy.direction_step / largest)
 
 
 def _sensor_differences(moved: MovedSamples, sensors: Array, epsilon: float) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import PlantModel
 from mjfim.optimize.lq import TangentCurve
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
+from mjfim.plant.closed_form_derivatives import ClosedFormMemory
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.derivatives import Derivatives
 from mjfim.plant.divergence import explain_divergence
@@ -45,6 +46,7 @@ class Plant:
             theta-unit].
         nu: Number of controls.
         dt: Sample period [s].
+        closed_form_memory: What derivatives in closed form keep from call to call.
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class Plant:
         self._smooth = smooth
         self._cached_models: dict[bytes, Any] = {}
         self._written_models = WrittenModels(source, parameters)
+        self.closed_form_memory = ClosedFormMemory(self.simulator, parameters)
 
     @property
     def derivatives(self) -> Derivatives:

@@ -9,8 +9,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.plant.batch import Rollouts
+from mjfim.plant.closed_form_derivatives import ClosedFormDerivatives
 from mjfim.plant.delay import OutputDelay
-from mjfim.plant.difference_steps import DifferenceSteps
+from mjfim.plant.difference_steps import TINY
 from mjfim.plant.lumped_parameters import LumpedParameters
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -28,9 +29,6 @@ MAX_NUMBERS_AT_ONCE = 2_000_000
 
 # Largest effect of the parameters on an output, relative to the output, that may be round-off.
 ROUND_OFF_EFFECT = 1e-9
-
-# Smallest divisor; it prevents a division by zero.
-TINY = 1e-300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,7 +71,7 @@ class _ResponseMoves:
     central: bool
 
 
-class RolloutDerivatives(DifferenceSteps):
+class RolloutDerivatives(ClosedFormDerivatives):
     """Derivatives of whole rollouts by the parameters and by the initial state."""
 
     def predict(
@@ -100,6 +98,7 @@ class RolloutDerivatives(DifferenceSteps):
         step: float | Array = SENSITIVITY_STEP,
         central: bool = True,
         lumped: LumpedParameters | None = None,
+        closed_form: bool = False,
     ) -> Sensitivity | None:
         """Sensitivities psi and G of a trajectory at fixed control, by differences of rollouts.
 
@@ -112,6 +111,8 @@ class RolloutDerivatives(DifferenceSteps):
             lumped: Parameters whose columns follow from those of the others, without rollouts of
                 their own; None for none. Where this motion shows that they do not follow, all
                 parameters are moved.
+            closed_form: True to take derivatives by inertial parameters in closed form where the
+                plant has one.
 
         Returns:
             The sensitivities, or None if a perturbed rollout diverges.
@@ -124,6 +125,7 @@ class RolloutDerivatives(DifferenceSteps):
             states=trajectory.state,
             central=central or self.plant.outputs.needs_sensors,
             lumped=lumped if self._can_lump(lumped) else None,
+            closed_form=trajectory if closed_form else None,
         )
         return None if found is None else found[1]
 
@@ -176,6 +178,7 @@ class RolloutDerivatives(DifferenceSteps):
         states: Array | None = None,
         central: bool = True,
         lumped: LumpedParameters | None = None,
+        closed_form: Trajectory | None = None,
     ) -> tuple[Array, Sensitivity] | None:
         """Outputs and sensitivities from rollouts at theta +- h.
 
@@ -190,6 +193,8 @@ class RolloutDerivatives(DifferenceSteps):
             states: (N+1, ns) states at theta, or None where they are not known.
             central: True for two-sided differences.
             lumped: Parameters whose columns follow from those of the others, or None.
+            closed_form: The trajectory at theta, whose derivatives by inertial parameters are
+                taken in closed form where the plant has one; None for rollouts only.
 
         Returns:
             y: (N+1, ny) outputs [y-unit] and the sensitivities, or None if a rollout diverges. The
@@ -200,34 +205,57 @@ class RolloutDerivatives(DifferenceSteps):
         needs_origin = states is None or (delay is not None and plant.outputs.needs_sensors)
 
         moving, directions, h = self._moved_directions(step, lumped)
-        moves = _theta_moves(directions * h[:, None], central, needs_origin)
+        known = None
+        if closed_form is not None:
+            known = self.closed_form_sensitivity(theta, closed_form, directions)
+        rolled = np.ones(len(h), dtype=bool) if known is None else ~known.among
+        moves = _theta_moves(directions[rolled] * h[rolled, None], central, needs_origin)
 
-        sensors = None
-        origin = np.zeros((len(ctrl) + 1, 0)) if states is None else states
-        psi = np.zeros((len(origin), plant.space.nx, len(theta)))
-        G = np.zeros((len(origin), len(plant.outputs), len(theta)))
+        out = None
         if len(moves):
             out = self._moved_rollouts(theta, initial_state, ctrl, moves)
             if out is None:
                 return None
-            if needs_origin:
-                origin = out.states[-1]
-                sensors = None if out.sensors is None else out.sensors[-1]
-            dx, dy = self._rollout_quotients(out, origin, h, central)
-            psi[..., moving] = np.moveaxis(dx[: len(moving)], 0, 2)
-            G[..., moving] = np.moveaxis(dy[: len(moving)], 0, 2)
+        origin, sensors = _origin(ctrl, states, out if needs_origin else None)
 
-            if lumped is not None:
-                psi = lumped.expanded(psi[..., lumped.base])
-                G = lumped.expanded(G[..., lumped.base])
-                y = plant.outputs(out.states[0], None if out.sensors is None else out.sensors[0])
-                if not self._is_explained(lumped, psi, G, np.abs(y).max(axis=0), dx[-1], dy[-1]):
-                    return self._rollout_differences(
-                        theta, initial_state, ctrl, step, states=states, central=central
-                    )
+        dx = np.zeros((len(h), len(origin), plant.space.nx))
+        dy = np.zeros((len(h), len(origin), len(plant.outputs)))
+        if out is not None:
+            dx[rolled], dy[rolled] = self._rollout_quotients(out, origin, h[rolled], central)
+        if known is not None:
+            dx[~rolled] = known.psi
+            dy[~rolled] = plant.outputs.tangent(origin, known.psi, None)
+
+        psi = np.zeros((len(origin), plant.space.nx, len(theta)))
+        G = np.zeros((len(origin), len(plant.outputs), len(theta)))
+        psi[..., moving] = np.moveaxis(dx[: len(moving)], 0, 2)
+        G[..., moving] = np.moveaxis(dy[: len(moving)], 0, 2)
+
+        if lumped is not None:
+            psi = lumped.expanded(psi[..., lumped.base])
+            G = lumped.expanded(G[..., lumped.base])
+            largest = self._largest_outputs(out, origin)
+            if not self._is_explained(lumped, psi, G, largest, dx[-1], dy[-1]):
+                return self._rollout_differences(
+                    theta,
+                    initial_state,
+                    ctrl,
+                    step,
+                    states=states,
+                    central=central,
+                    closed_form=closed_form,
+                )
 
         y, G = self._with_bias_and_delay(theta, plant.outputs(origin, sensors), G, delay)
         return y, Sensitivity(psi=psi, G=G, is_lumped=lumped is not None)
+
+    def _largest_outputs(self, out: Rollouts | None, origin: Array) -> Array:
+        """(ny,) largest outputs of the first moved rollout, or of the states at theta."""
+        if out is None:
+            y = self.plant.outputs(origin, None)
+        else:
+            y = self.plant.outputs(out.states[0], None if out.sensors is None else out.sensors[0])
+        return np.asarray(np.abs(y).max(axis=0))
 
     def _with_bias_and_delay(
         self, theta: Array, y: Array, G: Array, delay: OutputDelay | None
@@ -490,6 +518,23 @@ class RolloutDerivatives(DifferenceSteps):
         common = np.zeros((*y.shape, len(theta)))
         common[..., moves.moving] = G[..., :count]
         return Response(first=first, y=y, common=common + bias, private=G[..., count:])
+
+
+def _origin(ctrl: Array, states: Array | None, out: Rollouts | None) -> tuple[Array, Array | None]:
+    """States and sensors at theta.
+
+    Args:
+        ctrl: (N, nu) controls.
+        states: (N+1, ns) states at theta, or None where they are not known.
+        out: Rollouts of which the last one is at theta, or None.
+
+    Returns:
+        (N+1, ns) states, and (N+1, nsensordata) sensor data or None.
+    """
+    if out is not None:
+        return out.states[-1], None if out.sensors is None else out.sensors[-1]
+
+    return (np.zeros((len(ctrl) + 1, 0)) if states is None else states), None
 
 
 def _unit_moves(p: int, moving: np.ndarray) -> Array:

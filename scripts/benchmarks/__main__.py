@@ -13,6 +13,7 @@ import sys
 BENCHMARKS = {
     "benchmark": "where does the time of a design go?",
     "benchmark_arm": "how does the time of an iteration grow with the number of parameters?",
+    "equal_time": "are designs of an arm better than at an earlier commit in equal time?",
     "benchmark_hour": "how long do reading and fitting an hour of data at 1 kHz take?",
     "benchmark_limits": "is the design under hard limits better than CasADi + IPOPT in equal time?",
     "casadi_peer": "what do CasADi's solvers find on the hand-derived cart-pendulum?",

@@ -4,9 +4,10 @@
 
 The parameters are p = 3, 10, 30 or 70 barycentric coordinates of the inertias of the last links.
 The experiment takes 5 s at 100 Hz, with position servos inside the model. The value of J needs psi,
-which takes two rollouts for each identifiable combination; its gradient needs one direction for
-every p. All cores: seconds of the processor in an iteration, which tell more than the time of an
-iteration where other programs run.
+its gradient A, B and mixed derivatives along one direction for every p. Both are computed in closed
+form; the last tables show the parts of an iteration, in closed form and by differences of rollouts.
+All cores: seconds of the processor in an iteration, which tell more than the time of an iteration
+where other programs run.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
 from mjfim.plant.mixed_derivatives import FORWARD_DIFFERENCES
 from mjfim.records.events import DesignEvent
+from scripts.benchmarks.iteration_parts import IterationParts, measure, parts_table
 
 # Models that others wrote, beside the repository.
 MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
@@ -36,6 +38,10 @@ ARM = MODELS / "menagerie_panda" / "panda_nohand_nomesh.xml"
 
 # Numbers of parameters.
 COUNTS = (3, 10, 30, 70)
+
+# Numbers of parameters whose iterations are divided into parts, with the time of an iteration on
+# two cores that is aimed at [s].
+AIMS = {30: 0.25, 70: 0.35}
 
 
 @dataclass(frozen=True)
@@ -78,6 +84,11 @@ def experiment(model: Path, p: int, iterations: int) -> Experiment:
     Returns:
         The experiment.
     """
+    return Experiment(**tables_of(model, p, iterations))
+
+
+def tables_of(model: Path, p: int, iterations: int) -> dict[str, Any]:
+    """Tables of the experiment, see `experiment`."""
     unknown: dict[str, Any] = {}
     if p == 3:
         for i in range(3):
@@ -91,17 +102,17 @@ def experiment(model: Path, p: int, iterations: int) -> Experiment:
         noise[f"qpos:joint{i}"] = 0.002
 
     chirp = {"kind": "chirp", "amplitude": 0.2, "frequency": 0.2}
-    return Experiment(
-        model=str(model),
-        rate=100.0,
-        horizon=5.0,
-        initial={"keyframe": "home", "control": chirp},
-        parameters=unknown,
-        noise=noise,
-        cost={"control": 1.0},
-        descent={"max_iterations": iterations, "coarse": 1},
-        limits={"enforce": False},
-    )
+    return {
+        "model": str(model),
+        "rate": 100.0,
+        "horizon": 5.0,
+        "initial": {"keyframe": "home", "control": chirp},
+        "parameters": unknown,
+        "noise": noise,
+        "cost": {"control": 1.0},
+        "descent": {"max_iterations": iterations, "coarse": 1},
+        "limits": {"enforce": False},
+    }
 
 
 def measured(model: Path, p: int, iterations: int) -> Cost:
@@ -213,6 +224,39 @@ def cost_table(costs: list[Cost]) -> Table:
     return table
 
 
+def print_parts(console: Console, model: Path, p: int, iterations: int) -> None:
+    """Print the parts of an iteration, in closed form and by differences.
+
+    Args:
+        console: Where to print.
+        model: MJCF of the arm.
+        p: Number of parameters.
+        iterations: Number of iterations.
+    """
+
+    def parts(closed_form: bool) -> IterationParts:
+        """Measure a design of its own."""
+        return measure(DesignTask.resolve(experiment(model, p, iterations)), closed_form)
+
+    closed, differences = parts(True), parts(False)
+    console.print(parts_table(closed, f"(e2) p = {p}, in closed form"))
+    console.print(parts_table(differences, f"(e2) p = {p}, by differences"))
+    console.print(
+        f"p = {p}: {closed.seconds:.2f} s of the processor in an iteration instead of "
+        f"{differences.seconds:.2f} s (aim: {AIMS[p]:.2f} s on two cores)\n"
+        f"over the time of the bare engine for the steps of differences: "
+        f"{closed.seconds / differences.engine:.2f} in closed form, "
+        f"{differences.seconds / differences.engine:.2f} by differences (aim: 1.15)\n"
+        f"J of the iterates, in closed form: {_numbers(closed.costs)}\n"
+        f"J of the iterates, by differences: {_numbers(differences.costs)}\n"
+    )
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    """Numbers with five digits."""
+    return " ".join(f"{value:.5g}" for value in values)
+
+
 def main() -> None:
     """Measure all numbers of parameters and print the table."""
     parser = argparse.ArgumentParser(
@@ -232,3 +276,5 @@ def main() -> None:
     console = Console(highlight=False, width=170)
     costs = [measured(args.model, p, args.iterations) for p in COUNTS]
     console.print(cost_table(costs), f"{cores()} cores")
+    for p in AIMS:
+        print_parts(console, args.model, p, args.iterations)

@@ -15,6 +15,9 @@ The errors that are printed for each model are relative to the largest number of
     mixed   d DF[psi w, w] / d (x, u), the second derivatives that give a design its gradient; with
             mjfim's most accurate differences, and with its quickest ones
 
+"Closed" are the derivatives in closed form, which a design takes instead where there are enough
+joints; there are none for RK4.
+
 Usage:  python -m scripts.benchmarks mjx_oracle [MODEL...]
 """
 
@@ -34,6 +37,7 @@ from mujoco import mjx
 from mjfim.arrays import Array
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
+from mjfim.plant.closed_form import closed_form_tree
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 
 MODELS = Path(__file__).resolve().parents[2] / "models"
@@ -100,6 +104,8 @@ class Agreement:
         B: Difference of F_u.
         mixed: Difference of the mixed second derivatives, most accurate differences.
         mixed_quick: The same with the quickest differences.
+        psi_closed: Difference of the sensitivities in closed form; NaN where there are none.
+        mixed_closed: Difference of the mixed second derivatives in closed form; NaN as well.
     """
 
     model: str
@@ -111,6 +117,8 @@ class Agreement:
     B: float
     mixed: float
     mixed_quick: float
+    psi_closed: float
+    mixed_closed: float
 
 
 def _entry(array: str, *index: int, factor: float = 1.0) -> tuple[Entry, ...]:
@@ -222,16 +230,28 @@ def agreement(case: Case) -> Agreement:
     careful, quick = (np.swapaxes(each.F_mixed[0], 1, 2) for each in mixed)
 
     first = task.plant.derivatives.jacobians(theta, trajectory)
+
+    # The closed form is meant for more joints, since these models are stepped as quickly.
+    task.plant.closed_form_memory.tree = closed_form_tree(task.plant.source.model, least_joints=1)
+    psi_closed = mixed_closed = np.nan
+    closed = task.plant.derivatives.sensitivity(theta, trajectory, closed_form=True)
+    along = task.plant.derivatives.closed_form_mixed(theta, trajectory, found.psi, w[None])
+    if closed is not None and along is not None:
+        psi_closed = _worst_parameter(closed.psi, exact.psi)
+        mixed_closed = _relative(np.swapaxes(along.F_mixed[0], 1, 2), exact.mixed)
+
     return Agreement(
         model=case.model,
         parameters=len(theta),
         samples=len(trajectory.ctrl),
         F=_relative(trajectory.state[1:], exact.following),
-        psi=max(_relative(found.psi[..., j], exact.psi[..., j]) for j in range(len(theta))),
+        psi=_worst_parameter(found.psi, exact.psi),
         A=_relative(first[0], exact.AB[..., :nx]),
         B=_relative(first[1], exact.AB[..., nx:]),
         mixed=_relative(careful, exact.mixed),
         mixed_quick=_relative(quick, exact.mixed),
+        psi_closed=psi_closed,
+        mixed_closed=mixed_closed,
     )
 
 
@@ -320,6 +340,11 @@ def _relative(found: Array, exact: Array) -> float:
     return float(np.abs(found - exact).max() / np.abs(exact).max())
 
 
+def _worst_parameter(found: Array, exact: Array) -> float:
+    """Return the difference of the parameter that is known worst, from (N+1, nx, p) arrays."""
+    return max(_relative(found[..., j], exact[..., j]) for j in range(exact.shape[2]))
+
+
 def table(rows: Sequence[Agreement]) -> str:
     """Return the agreements as a table of text.
 
@@ -327,10 +352,12 @@ def table(rows: Sequence[Agreement]) -> str:
         rows: One agreement per model.
     """
     titles = ("model", "p", "N", "F", "psi", "A", "B", "mixed", "mixed, quick")
-    lines = ["{:15s} {:>2s} {:>4s} {:>9s} {:>9s} {:>9s} {:>9s} {:>9s} {:>13s}".format(*titles)]
+    widths = "{:15s} {:>2s} {:>4s} {:>9s} {:>9s} {:>9s} {:>9s} {:>9s} {:>13s} {:>12s} {:>14s}"
+    lines = [widths.format(*titles, "psi, closed", "mixed, closed")]
     lines += [
         f"{row.model:15s} {row.parameters:2d} {row.samples:4d} {row.F:9.1e} {row.psi:9.1e} "
-        f"{row.A:9.1e} {row.B:9.1e} {row.mixed:9.1e} {row.mixed_quick:13.1e}"
+        f"{row.A:9.1e} {row.B:9.1e} {row.mixed:9.1e} {row.mixed_quick:13.1e} "
+        f"{row.psi_closed:12.1e} {row.mixed_closed:14.1e}"
         for row in rows
     ]
     return "\n".join(lines)

@@ -22,3 +22,5 @@ def test_derivatives_agree_with_automatic_differentiation_of_mjx(model: str) -> 
     assert found.B < 3e-8
     assert found.mixed < 1e-5
     assert found.mixed_quick < 1e-2
+    assert found.psi_closed < 1e-7
+    assert found.mixed_closed < 1e-5

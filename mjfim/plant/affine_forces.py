@@ -1,0 +1,176 @@
+"""Forces of actuators and springs on the joints: affine in state and control, between limits."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.plant.batch import BatchSimulator
+
+# MjData fields whose sum are these forces.
+FORCE_FIELDS = ("qfrc_passive", "qfrc_actuator")
+
+# MjData fields with the moment arms of the actuators, a sparse matrix by rows.
+MOMENT_FIELDS = ("actuator_moment", "moment_rownnz", "moment_rowadr", "moment_colind")
+
+# Move of every coordinate from which the slopes are computed, relative to its size. Affine forces
+# allow long moves, which have little round-off.
+RELATIVE_MOVE = 1e-2
+
+# Largest deviation of a force from this function, relative to the terms of the function.
+LARGEST_DEVIATION = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ForceSlopes:
+    """Joint forces at n states and their derivatives.
+
+    Attributes:
+        slopes: (n, nv, 2 nv + nu) derivatives by positions, speeds and controls.
+        implicit_damping: (n, nv, nv) damping D of an engine step, which solves
+            `(M + timestep D) a = forces` for the mean acceleration a of the step.
+        agree: (n,) True where the forces are those of the engine.
+    """
+
+    slopes: Array
+    implicit_damping: Array
+    agree: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AffineForces:
+    """Springs, dampers and actuators whose forces are affine in (q, v, u), with clamped forces.
+
+    Attributes:
+        model: The model, whose limits clamp controls and forces.
+        springs: (nv, 1 + 2 nv + nu) forces of springs and dampers at zero, and their slopes.
+        actuators: (actuators, 1 + 2 nv + nu) forces of actuators at zero, and their slopes.
+        moments: (actuators, nv) joint forces per unit of an actuator's force.
+    """
+
+    model: Any
+    springs: Array
+    actuators: Array
+    moments: Array
+
+    @staticmethod
+    def measured(
+        simulator: BatchSimulator, model: Any, state: Array, ctrl: Array, sizes: Array
+    ) -> AffineForces:
+        """Slopes by differences of the engine's forces, without their limits.
+
+        Args:
+            simulator: Steps the model.
+            model: A model with hinges and slides only.
+            state: (2 nv,) state about which coordinates are moved.
+            ctrl: (nu,) control about which it is moved.
+            sizes: (2 nv + nu,) sizes of the coordinates.
+        """
+        unlimited = copy.copy(model)
+        unlimited.actuator_forcelimited[:] = 0
+        unlimited.actuator_ctrllimited[:] = 0
+
+        moves = RELATIVE_MOVE * sizes
+        about = np.concatenate([state, ctrl])
+        points = about + np.concatenate([np.zeros((1, len(moves))), np.diag(moves)])
+        n = len(state)
+        names = ("qfrc_passive", "actuator_force", *MOMENT_FIELDS)
+        fields = simulator.engine_steps(unlimited, points[:, :n], points[:, n:], names).fields
+        first = {name: values[0, 0] for name, values in fields.items()}
+
+        return AffineForces(
+            model=model,
+            springs=_affine(fields["qfrc_passive"][:, 0], about, moves),
+            actuators=_affine(fields["actuator_force"][:, 0], about, moves),
+            moments=_dense_moments(first, n // 2),
+        )
+
+    def at(self, states: Array, ctrl: Array, fields: dict[str, Array]) -> ForceSlopes:
+        """Derivatives of the forces at n states.
+
+        Args:
+            states: (n, 2 nv) states.
+            ctrl: (n, nu) controls.
+            fields: The `FORCE_FIELDS` of the engine, each (n, nv).
+        """
+        applied, is_free = self._applied(ctrl)
+        points = np.concatenate([np.ones((len(states), 1)), states, applied], axis=1)
+
+        force = points @ self.actuators.T
+        clamped = force
+        if self.model.actuator_forcelimited.any():
+            low, high = self._limits()
+            clamped = np.clip(force, low, high)
+
+        # The largest terms of the function show the round-off that its sum may have.
+        total = points @ self.springs.T + clamped @ self.moments
+        terms = (
+            np.abs(points)
+            @ (np.abs(self.springs) + np.abs(self.moments.T) @ np.abs(self.actuators)).T
+        )
+        deviation = np.abs(total - sum(fields[name] for name in FORCE_FIELDS))
+        agree = (deviation <= LARGEST_DEVIATION * terms.max(axis=0)).all(axis=1)
+
+        slopes = self._slopes(force == clamped, is_free)
+        return ForceSlopes(slopes=slopes, implicit_damping=self._damping(slopes), agree=agree)
+
+    def _slopes(self, acts: np.ndarray, is_free: np.ndarray) -> Array:
+        """(n, nv, 2 nv + nu) derivatives.
+
+        Args:
+            acts: (n, actuators) True where the force of an actuator is not clamped.
+            is_free: (n, nu) True where a control is not clamped.
+        """
+        slopes = self.springs[:, 1:] + (self.moments.T * acts[:, None]) @ self.actuators[:, 1:]
+        slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
+        return np.asarray(slopes)
+
+    def _damping(self, slopes: Array) -> Array:
+        """(n, nv, nv) damping that the integrator takes at the end of an engine step."""
+        model, nv = self.model, slopes.shape[1]
+        if model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+            return -slopes[..., nv : 2 * nv]
+        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
+            return np.zeros((len(slopes), nv, nv))
+        return np.broadcast_to(np.diag(model.dof_damping), (len(slopes), nv, nv))
+
+    def _applied(self, ctrl: Array) -> tuple[Array, np.ndarray]:
+        """(n, nu) controls within their limits, and (n, nu) True where they are not clamped."""
+        model = self.model
+        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL):
+            return ctrl, np.ones(ctrl.shape, dtype=bool)
+
+        low = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 0], -np.inf)
+        high = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange[:, 1], np.inf)
+        applied = np.clip(ctrl, low, high)
+        return applied, applied == ctrl
+
+    def _limits(self) -> tuple[Array, Array]:
+        """(actuators,) least and largest forces of the actuators."""
+        limited, limits = self.model.actuator_forcelimited, self.model.actuator_forcerange
+        return (
+            np.where(limited, limits[:, 0], -np.inf),
+            np.where(limited, limits[:, 1], np.inf),
+        )
+
+
+def _affine(forces: Array, about: Array, moves: Array) -> Array:
+    """(w, 1 + c) values at zero and slopes, from (1 + c, w) forces: unmoved, then moved each."""
+    slopes = ((forces[1:] - forces[0]) / moves[:, None]).T
+    offset = forces[0] - slopes @ about
+    return np.concatenate([offset[:, None], slopes], axis=1)
+
+
+def _dense_moments(fields: dict[str, Array], nv: int) -> Array:
+    """(actuators, nv) moment arms from the sparse matrix of the `MOMENT_FIELDS`."""
+    counts, starts = fields["moment_rownnz"], fields["moment_rowadr"]
+    moments = np.zeros((len(counts), nv))
+    for row, (start, count) in enumerate(zip(starts.tolist(), counts.tolist(), strict=True)):
+        entries = slice(start, start + count)
+        moments[row, fields["moment_colind"][entries]] = fields["actuator_moment"][entries]
+    return moments

@@ -1,0 +1,287 @@
+"""Derivatives of samples in closed form, for arms and other rigid bodies on hinges and slides.
+
+An engine step of such a plant solves
+
+    M(q) a + c(q, v) = tau - timestep D a,      tau = offset + slopes (q, v, u)
+
+for the mean acceleration a, and sets `v+ = v + timestep a` and `q+ = q + timestep v+`. Derivatives
+of the left-hand side at fixed a have a closed form (`RigidBodyMotion`), and it is linear in the
+inertial parameters. So one engine step at each state takes the place of a step for every coordinate
+and every parameter. Whether the equation holds is checked at every engine step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.model.parameters import Parameter
+from mjfim.model.targets import InertiaField, ModelField
+from mjfim.plant.affine_forces import FORCE_FIELDS, AffineForces, ForceSlopes
+from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.joint_tree import JointTree
+from mjfim.plant.rigid_body_motion import MOTION_FIELDS, RigidBodyMotion, barycentric_inertias
+
+# Smallest number of joints for which the closed form is quicker than steps of the engine.
+LEAST_JOINTS = 4
+
+# Largest error of the equation of motion, relative to the terms of the forces.
+LARGEST_ERROR = 1e-9
+
+# MjData fields that are recorded at every engine step.
+RECORDED_FIELDS = (*MOTION_FIELDS, *FORCE_FIELDS, "xpos", "xmat")
+
+# Engine steps whose derivatives are computed at once, so that they stay in the processor's cache.
+STEPS_AT_ONCE = 500
+
+# Arrays of MjModel that hold the inertia of bodies.
+INERTIA_ARRAYS = ("body_mass", "body_ipos", "body_inertia")
+
+# Difference step of the inertias by the parameters, relative to the size of a parameter.
+INERTIA_STEP = 1e-5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampleJacobians:
+    """First derivatives of N samples.
+
+    Attributes:
+        A: (N, nx, nx) by the state.
+        B: (N, nx, nu) by the control.
+        E: (N, nx, m) by the parameters, or along m directions of them.
+    """
+
+    A: Array
+    B: Array
+    E: Array
+
+
+def closed_form_tree(model: Any, least_joints: int = LEAST_JOINTS) -> JointTree | None:
+    """Joints of a model whose samples may have derivatives in closed form.
+
+    Args:
+        model: The model that is stepped.
+        least_joints: Smallest number of joints.
+
+    Returns:
+        The joints; None where the equation of motion is certainly another one, or where too few
+        joints make steps of the engine quicker.
+    """
+    integrators = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    other_forces = (
+        model.na > 0
+        or model.neq > 0
+        or model.nflex > 0
+        or model.dof_frictionloss.any()
+        or model.tendon_frictionloss.any()
+        or model.body_gravcomp.any()
+        or model.opt.density != 0.0
+        or model.opt.viscosity != 0.0
+    )
+    has_single_controls = model.nu == model.nactuator and (model.actuator_ctrlnum == 1).all()
+    if (
+        not has_single_controls
+        or model.nv < LEAST_JOINTS
+        or model.opt.integrator not in integrators
+        or other_forces
+    ):
+        return None
+
+    return JointTree.of(model)
+
+
+def is_inertial(parameter: Parameter) -> bool:
+    """Whether a parameter changes nothing but the inertia of bodies."""
+    fields = [target.field for target in parameter.targets]
+    return bool(fields) and all(
+        isinstance(field, InertiaField)
+        or (isinstance(field, ModelField) and field.array in INERTIA_ARRAYS)
+        for field in fields
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClosedForm:
+    """Derivatives of samples in closed form.
+
+    Attributes:
+        simulator: Steps the model.
+        tree: Joints of the model.
+        sizes: (2 nv + nu,) sizes of the coordinates of state and control.
+    """
+
+    simulator: BatchSimulator
+    tree: JointTree
+    sizes: Array
+
+    def jacobians(
+        self, model: Any, states: Array, ctrl: Array, inertia_change: Array | None = None
+    ) -> SampleJacobians | None:
+        """First derivatives of samples.
+
+        Args:
+            model: The model at the parameter values.
+            states: (N, 2 nv) states before the samples.
+            ctrl: (N, nu) controls, held over the samples.
+            inertia_change: (b, 10, m) derivative of the moved bodies' barycentric inertias by m
+                parameters; None for none.
+
+        Returns:
+            The derivatives; None where the samples have another equation of motion.
+        """
+        if inertia_change is None:
+            inertia_change = np.zeros((len(self.tree.bodies), 10, 0))
+        forces = AffineForces.measured(self.simulator, model, states[0], ctrl[0], self.sizes)
+        system = _System(
+            simulator=self.simulator,
+            tree=self.tree,
+            model=model,
+            forces=forces,
+            inertia_change=inertia_change,
+        )
+
+        parts = []
+        samples = max(1, STEPS_AT_ONCE // self.simulator.substeps)
+        for first in range(0, len(states), samples):
+            rows = slice(first, first + samples)
+
+            # Numbers may overflow where a simulation diverges; the check then fails.
+            with np.errstate(over="ignore", invalid="ignore"):
+                part = system.jacobians(states[rows], ctrl[rows])
+            if part is None:
+                return None
+            parts.append(part)
+
+        return SampleJacobians(
+            A=np.concatenate([part.A for part in parts]),
+            B=np.concatenate([part.B for part in parts]),
+            E=np.concatenate([part.E for part in parts]),
+        )
+
+    def inertias(self, model: Any) -> Array:
+        """(b, 10) barycentric inertias of the moved bodies in a model."""
+        return barycentric_inertias(model, self.tree.bodies)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _System:
+    """A model at parameter values, with the forces on its joints.
+
+    Attributes:
+        simulator: Steps the model.
+        tree: Joints of the model.
+        model: The model.
+        forces: Forces of springs and actuators.
+        inertia_change: (b, 10, m) derivative of the moved bodies' inertias by m parameters.
+    """
+
+    simulator: BatchSimulator
+    tree: JointTree
+    model: Any
+    forces: AffineForces
+    inertia_change: Array
+
+    def jacobians(self, states: Array, ctrl: Array) -> SampleJacobians | None:
+        """First derivatives of N samples, see `ClosedForm.jacobians`."""
+        steps = self.simulator.engine_steps(self.model, states, ctrl, RECORDED_FIELDS)
+        N, substeps, nv = len(states), self.simulator.substeps, self.tree.count
+        fields = {name: _flat(values) for name, values in steps.fields.items()}
+
+        speed = steps.states[..., nv:]
+        change = _flat(np.diff(speed, axis=1))
+        motion = RigidBodyMotion.of(
+            self.tree,
+            self.model,
+            fields,
+            _flat(speed[:, :-1]),
+            change / float(self.model.opt.timestep),
+        )
+        slopes = self.forces.at(
+            _flat(steps.states[:, :-1]), np.repeat(ctrl, substeps, axis=0), fields
+        )
+        if not (slopes.agree.all() and self._solves(motion, slopes, fields)):
+            return None
+
+        # The two right-hand sides are solved apart, so that A and B do not depend on the last digit
+        # on whether parameters are asked for.
+        by_position, by_speed = motion.force_derivatives()
+        by_point = slopes.slopes
+        by_point[..., :nv] -= by_position
+        by_point[..., nv : 2 * nv] -= by_speed
+        matrix = motion.mass_matrix + self._timestep * slopes.implicit_damping
+        by_point = np.asarray(np.linalg.solve(matrix, by_point), dtype=np.float64)
+
+        count = self.inertia_change.shape[2]
+        by_theta: Array = np.zeros((N * substeps, nv, count))
+        if count:
+            by_theta = np.asarray(
+                np.linalg.solve(matrix, -self._regressor(motion, fields)), dtype=np.float64
+            )
+        return self._over_samples(
+            by_point.reshape(N, substeps, nv, -1), by_theta.reshape(N, substeps, nv, count)
+        )
+
+    @property
+    def _timestep(self) -> float:
+        """Engine timestep [s]."""
+        return float(self.model.opt.timestep)
+
+    def _solves(
+        self, motion: RigidBodyMotion, slopes: ForceSlopes, fields: dict[str, Array]
+    ) -> bool:
+        """Check whether a motion of the engine solves the equation of motion."""
+        damping = slopes.implicit_damping @ motion.acceleration[..., None]
+        force = sum(fields[name] for name in FORCE_FIELDS)
+        error = np.abs(motion.force + self._timestep * damping[..., 0] - force)
+        return bool((error <= LARGEST_ERROR * motion.largest_force).all())
+
+    def _regressor(self, motion: RigidBodyMotion, fields: dict[str, Array]) -> Array:
+        """(n, nv, m) derivatives of the joint forces by the parameters."""
+        bodies = self.tree.bodies
+        axes = fields["xmat"].reshape(len(motion.speed), -1, 3, 3)
+        return motion.regressor(fields["xpos"][:, bodies], axes[:, bodies], self.inertia_change)
+
+    def _over_samples(self, by_point: Array, by_theta: Array) -> SampleJacobians:
+        """Derivatives of samples from those of the accelerations of their engine steps.
+
+        Args:
+            by_point: (N, s, nv, 2 nv + nu) derivatives of the accelerations by state and control.
+            by_theta: (N, s, nv, m) derivatives of the accelerations by the parameters.
+        """
+        N, substeps, nv, count = by_point.shape
+        nx = 2 * nv
+        AB = np.zeros((N, nx, count))
+        AB[..., :nx] = np.eye(nx)
+        E = np.zeros((N, nx, by_theta.shape[3]))
+
+        for i in range(substeps):
+            by_state = np.ascontiguousarray(by_point[:, i, :, :nx])
+            acceleration = by_state @ AB
+            acceleration[..., nx:] += by_point[:, i, :, nx:]
+            self._advance(AB, acceleration)
+            self._advance(E, by_state @ E + by_theta[:, i])
+
+        A, B = np.split(AB, [nx], axis=2)
+        return SampleJacobians(A=np.ascontiguousarray(A), B=np.ascontiguousarray(B), E=E)
+
+    def _advance(self, derivative: Array, acceleration: Array) -> None:
+        """Take derivatives of the state over an engine step, in place.
+
+        The engine adds the acceleration to the speed, then the new speed to the position.
+
+        Args:
+            derivative: (N, 2 nv, k) derivatives of the state.
+            acceleration: (N, nv, k) derivatives of the mean acceleration.
+        """
+        nv = acceleration.shape[1]
+        derivative[:, nv:] += self._timestep * acceleration
+        derivative[:, :nv] += self._timestep * derivative[:, nv:]
+
+
+def _flat(values: Array) -> Array:
+    """(N * s, ...) values of all engine steps from (N, s, ...)."""
+    return values.reshape(-1, *values.shape[2:])

@@ -1,0 +1,221 @@
+"""Derivatives along a trajectory in closed form, where the plant allows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.model.parameters import ParameterSet
+from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.closed_form import (
+    INERTIA_STEP,
+    ClosedForm,
+    SampleJacobians,
+    closed_form_tree,
+    is_inertial,
+)
+from mjfim.plant.difference_steps import DifferenceSteps
+from mjfim.records.trajectory import Trajectory
+
+# Largest number of parameter values for which the derivatives of the inertias are kept.
+MAX_KEPT_CHANGES = 64
+
+# Step along (psi w, w) between two derivatives in closed form. It can be short, because they have
+# little round-off.
+CLOSED_FORM_STEP = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _KnownJacobians:
+    """Derivatives of the samples of a trajectory.
+
+    Attributes:
+        theta: (p,) parameters [theta-unit].
+        trajectory: The trajectory.
+        substeps: Engine steps of a sample.
+        jacobians: The derivatives, without those by parameters.
+    """
+
+    theta: Array
+    trajectory: Trajectory
+    substeps: int
+    jacobians: SampleJacobians
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownSensitivities:
+    """Sensitivities of the states along some directions of theta.
+
+    Attributes:
+        among: (n,) True for the c directions along which they are known.
+        psi: (c, N+1, nx) sensitivities along these directions [x-unit].
+    """
+
+    among: np.ndarray
+    psi: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MixedInClosedForm:
+    """First and mixed second derivatives of F.
+
+    Attributes:
+        first: First derivatives of the samples.
+        F_mixed: (r, N, nx+nu, nx) derivatives of `DF[psi w, w]` by (x, u), for r directions.
+    """
+
+    first: SampleJacobians
+    F_mixed: Array
+
+
+class ClosedFormMemory:
+    """What the derivatives in closed form of one plant and of its variants have in common.
+
+    Attributes:
+        tree: Joints of the model; None where there is no closed form.
+        inertial: (p,) True for parameters that change nothing but the inertia of bodies.
+        latest: Derivatives that were computed last. The gradient of a design needs those of the
+            trajectory whose sensitivities were computed before.
+        inertia_change: (b, 10, p) derivative of the moved bodies' inertias by the parameters, by
+            the bytes of theta.
+    """
+
+    def __init__(self, simulator: BatchSimulator, parameters: ParameterSet) -> None:
+        """Begin with nothing computed."""
+        self.tree = None if simulator.sensors else closed_form_tree(simulator.model)
+        self.inertial = np.array([is_inertial(p) for p in parameters.parameters], dtype=bool)
+        self.latest: _KnownJacobians | None = None
+        self.inertia_change: dict[bytes, Array] = {}
+
+
+class ClosedFormDerivatives(DifferenceSteps):
+    """Derivatives in closed form; None wherever the plant has no closed form."""
+
+    def closed_form_sensitivity(
+        self, theta: Array, trajectory: Trajectory, directions: Array
+    ) -> KnownSensitivities | None:
+        """Sensitivities of the states along directions of the inertial parameters.
+
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            trajectory: The trajectory.
+            directions: (n, p) directions of theta [theta-unit].
+
+        Returns:
+            The sensitivities along directions that change nothing but inertias; None where there is
+            no closed form or no such direction.
+        """
+        memory = self.plant.closed_form_memory
+        among_inertial = np.asarray(~directions[:, ~memory.inertial].any(axis=1))
+        closed = self._closed_form(trajectory)
+        if closed is None or not among_inertial.any():
+            return None
+
+        change = self._inertia_change(closed, theta) @ directions[among_inertial].T
+        found = closed.jacobians(
+            self.plant.model(theta), trajectory.state[:-1], trajectory.ctrl, change
+        )
+        if found is None:
+            return None
+
+        self._remember(theta, trajectory, found)
+        psi = np.zeros((len(found.A) + 1, *found.E.shape[1:]))
+        for k, (A, E) in enumerate(zip(found.A, found.E, strict=True)):
+            psi[k + 1] = A @ psi[k] + E
+        return KnownSensitivities(among=among_inertial, psi=np.moveaxis(psi, 2, 0))
+
+    def closed_form_mixed(
+        self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array
+    ) -> MixedInClosedForm | None:
+        """First derivatives of F, and mixed second ones along directions (psi w, w).
+
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            trajectory: The trajectory.
+            psi: (N+1, nx, p) sensitivity [x-unit / theta-unit].
+            directions: (r, p) directions w [theta-unit].
+
+        Returns:
+            The derivatives; None where there is no closed form.
+        """
+        closed = self._closed_form(trajectory)
+        origin = None if closed is None else self._origin_jacobians(closed, theta, trajectory)
+        if closed is None or origin is None:
+            return None
+
+        nx = self.plant.space.nx
+        sizes = self.difference_sizes(trajectory)[:nx]
+        mixed = np.zeros((len(directions), *origin.A.shape[:1], nx + self.plant.nu, nx))
+        for r, w in enumerate(directions):
+            along = psi[:-1] @ w
+            epsilon = self.direction_step(CLOSED_FORM_STEP, along / sizes, w)
+            states = self.plant.space.plus(trajectory.state[:-1], epsilon * along)
+            model = self.plant.models((theta + epsilon * w)[None])[0]
+            moved = closed.jacobians(model, states, trajectory.ctrl)
+            if moved is None:
+                return None
+
+            by_both = np.concatenate([moved.A - origin.A, moved.B - origin.B], axis=2)
+            mixed[r] = np.swapaxes(by_both, 1, 2) / epsilon
+        return MixedInClosedForm(first=origin, F_mixed=mixed)
+
+    def _closed_form(self, trajectory: Trajectory) -> ClosedForm | None:
+        """The closed form with the sizes of a trajectory; None where there is none."""
+        plant = self.plant
+        tree = plant.closed_form_memory.tree
+        if tree is None or plant.smooth is not plant:
+            return None
+
+        sizes = self.difference_sizes(trajectory)
+        return ClosedForm(simulator=plant.simulator, tree=tree, sizes=sizes)
+
+    def _origin_jacobians(
+        self, closed: ClosedForm, theta: Array, trajectory: Trajectory
+    ) -> SampleJacobians | None:
+        """Derivatives along a trajectory: those that were computed last, or new ones."""
+        known = self.plant.closed_form_memory.latest
+        if (
+            known is not None
+            and known.trajectory is trajectory
+            and known.substeps == self.plant.simulator.substeps
+            and np.array_equal(known.theta, theta)
+        ):
+            return known.jacobians
+
+        model = self.plant.model(theta)
+        found = closed.jacobians(model, trajectory.state[:-1], trajectory.ctrl)
+        if found is not None:
+            self._remember(theta, trajectory, found)
+        return found
+
+    def _remember(self, theta: Array, trajectory: Trajectory, found: SampleJacobians) -> None:
+        """Keep the first derivatives of a trajectory for its mixed ones."""
+        self.plant.closed_form_memory.latest = _KnownJacobians(
+            theta=np.array(theta),
+            trajectory=trajectory,
+            substeps=self.plant.simulator.substeps,
+            jacobians=SampleJacobians(A=found.A, B=found.B, E=np.zeros((*found.E.shape[:2], 0))),
+        )
+
+    def _inertia_change(self, closed: ClosedForm, theta: Array) -> Array:
+        """(b, 10, p) derivative of the moved bodies' inertias, by two-sided differences.
+
+        Coordinates in which inertias are not linear need no other treatment.
+        """
+        kept = self.plant.closed_form_memory.inertia_change
+        key = np.asarray(theta, dtype=np.float64).tobytes()
+        if key not in kept:
+            steps = INERTIA_STEP * self.parameter_scale
+            change = np.zeros((len(closed.tree.bodies), 10, len(theta)))
+            for i in np.flatnonzero(self.plant.closed_form_memory.inertial):
+                move = np.zeros(len(theta))
+                move[i] = steps[i]
+                pair = self.plant.models(np.stack([theta + move, theta - move]))
+                forward, backward = (closed.inertias(model) for model in pair)
+                change[:, :, i] = (forward - backward) / (2.0 * steps[i])
+            if len(kept) >= MAX_KEPT_CHANGES:
+                kept.clear()
+            kept[key] = change
+        return kept[key]

@@ -1,0 +1,194 @@
+"""Derivatives in closed form of arms and other rigid bodies, against differences of the engine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.excitation.task import DesignTask
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
+from mjfim.records.trajectory import Trajectory
+from tests.support.numerics import make_task
+
+# A tree of hinges and slides: two joints on one body, a branch, a welded body, springs and dampers,
+# servos whose forces are clamped, and a motor whose control is clamped.
+TREE = """
+<mujoco model="tree">
+  <option timestep="0.005" {option}><flag contact="disable"/></option>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="base" pos="0.1 -0.2 0.3" euler="10 0 20">
+      <joint name="yaw" axis="0 0 1" damping="0.3" armature="0.02"/>
+      <joint name="lift" type="slide" axis="0 0.2 1" stiffness="200" damping="4"/>
+      <inertial pos="0.02 0.01 0.1" mass="2" diaginertia="0.03 0.02 0.025"/>
+      <body name="upper" pos="0.05 0 0.2">
+        <joint name="shoulder" axis="0 1 0.3" pos="0.01 0 0.02" damping="0.2" armature="0.01"/>
+        <inertial pos="0.03 0.02 0.15" mass="1.2" euler="20 30 10" diaginertia="0.02 0.018 0.004"/>
+        <body name="fore" pos="0 0.03 0.3">
+          <joint name="elbow" axis="1 0.2 0" damping="0.1" {joint}/>
+          <inertial pos="0 0.01 0.12" mass="0.8" diaginertia="0.01 0.011 0.003"/>
+          <body name="load" pos="0.02 0 0.25" euler="0 40 0" {load}>
+            <inertial pos="0.01 0 0.02" mass="0.4" diaginertia="0.001 0.0012 0.0008"/>
+          </body>
+        </body>
+      </body>
+      <body name="tail" pos="-0.2 0 0">
+        <joint name="slider" type="slide" axis="1 1 0" stiffness="30" damping="1"/>
+        <inertial pos="0 0 0.05" mass="0.5" diaginertia="0.002 0.002 0.001"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="yaw" joint="yaw" kp="40" kv="3"/>
+    <position name="shoulder" joint="shoulder" kp="60" kv="2" forcerange="-9 9"/>
+    <position name="elbow" joint="elbow" kp="30" kv="1"/>
+    <motor name="push" joint="slider" gear="2" ctrlrange="-0.5 0.5"/>
+  </actuator>
+</mujoco>
+"""
+
+# Inertial parameters in three forms, and one that is none.
+PARAMETERS: dict[str, Any] = {
+    "mass": {"target": "body/upper:mass"},
+    "centre": {"target": "body/fore:ipos[2]"},
+    "load": {"inertial": "load", "coordinates": "barycentric"},
+    "damping": {"target": "joint/elbow:damping"},
+}
+
+CHIRP = {"control": {"kind": "chirp", "amplitude": 0.8, "frequency": 1.0}}
+
+
+def tree_task(folder: Path, option: str = 'integrator="implicitfast"', **parts: str) -> DesignTask:
+    """A task for the tree: 20 samples of two engine steps."""
+    filled = {"joint": "", "load": "", **parts}
+    return make_task(
+        TREE.format(option=option, **filled),
+        folder,
+        rate=100.0,
+        horizon=0.2,
+        noise={"state": 0.01},
+        parameters=PARAMETERS,
+        initial=CHIRP,
+        limits={"enforce": False},
+    )
+
+
+def with_differences(task: DesignTask) -> DesignTask:
+    """The same task, all derivatives of which are differences."""
+    task.plant.closed_form_memory.tree = None
+    return task
+
+
+def curve(task: DesignTask) -> Trajectory:
+    """A motion with jumps of the controls, of which some are clamped, as are some forces."""
+    rng = np.random.default_rng(1)
+    return task.plant.simulate(task.theta, rng.uniform(-0.8, 0.8, (task.samples, 4)))
+
+
+def assert_close(found: Any, expected: Any, accuracy: float) -> None:
+    """Compare arrays, relative to the largest number of each."""
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=accuracy * np.abs(expected).max())
+
+
+# The damping of Euler's method is implicit or explicit.
+OPTIONS = (
+    'integrator="implicitfast"',
+    'integrator="Euler"',
+    'integrator="Euler" viscosity="0" gravity="3 -2 -9"',
+)
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_first_derivatives_agree_with_differences(tmp_path, option: str) -> None:
+    task = tree_task(tmp_path, option)
+    trajectory, derivatives = curve(task), task.plant.derivatives
+    p = len(task.theta)
+    found = derivatives.closed_form_mixed(
+        task.theta, trajectory, np.zeros((task.samples + 1, task.space.nx, p)), np.zeros((0, p))
+    )
+    assert found is not None
+
+    expected = derivatives.linearize(task.theta, trajectory)
+    assert_close(found.first.A, expected.A, 1e-8)
+    assert_close(found.first.B, expected.B, 1e-8)
+
+
+def test_sensitivities_agree_with_differences_of_rollouts(tmp_path) -> None:
+    task = tree_task(tmp_path)
+    trajectory, derivatives = curve(task), task.plant.derivatives
+    expected = derivatives.sensitivity(task.theta, trajectory)
+    before = task.plant.engine_steps
+    found = derivatives.sensitivity(task.theta, trajectory, closed_form=True)
+    steps = task.plant.engine_steps - before
+    assert found is not None and expected is not None
+
+    # Every engine step once, besides those from which forces are measured, and two rollouts for the
+    # parameter that is no inertia.
+    engine_steps = task.samples * task.plant.simulator.substeps
+    assert steps < 4 * engine_steps
+
+    for column in range(len(task.theta)):
+        assert_close(found.psi[..., column], expected.psi[..., column], 1e-6)
+        assert_close(found.G[..., column], expected.G[..., column], 1e-6)
+    np.testing.assert_array_equal(found.psi[..., -1], expected.psi[..., -1])
+
+
+def test_mixed_derivatives_agree_with_differences(tmp_path) -> None:
+    task = tree_task(tmp_path)
+    trajectory = curve(task)
+    sensitivity = task.plant.derivatives.sensitivity(task.theta, trajectory)
+    assert sensitivity is not None
+    directions = np.random.default_rng(2).standard_normal((2, len(task.theta)))
+    directions *= task.parameters.magnitude
+    given = (task.theta, trajectory, sensitivity.psi, directions, CENTRAL_DIFFERENCES)
+
+    found = task.plant.derivatives.bilinear(*given)
+    expected = with_differences(task).plant.derivatives.bilinear(*given)
+    assert_close(found.A, expected.A, 1e-6)
+    assert_close(found.B, expected.B, 1e-6)
+    np.testing.assert_array_equal(found.C, expected.C)
+    assert found.h_mixed is None and expected.h_mixed is None
+    assert_close(found.F_mixed, expected.F_mixed, 1e-5)
+
+
+def test_the_gradient_does_not_compute_known_derivatives_again(tmp_path) -> None:
+    task = tree_task(tmp_path)
+    point = task.problem.point(curve(task))
+    before = task.plant.engine_steps
+    known = task.problem.expand(point)
+    steps = task.plant.engine_steps - before
+
+    # The engine moves along one direction only, since the point has the derivatives along itself.
+    engine_steps = task.samples * task.plant.simulator.substeps
+    assert engine_steps <= steps < 2 * engine_steps
+
+    # What was computed anew is the same to the last digit.
+    task.plant.closed_form_memory.latest = None
+    again = task.problem.expand(point)
+    np.testing.assert_array_equal(again.A, known.A)
+    np.testing.assert_array_equal(again.b, known.b)
+
+
+@pytest.mark.parametrize(
+    ("option", "parts"),
+    [
+        ('integrator="RK4"', {}),
+        ('integrator="implicit"', {}),
+        ('integrator="implicitfast" viscosity="0.1"', {}),
+        ('integrator="implicitfast"', {"joint": 'frictionloss="0.2"'}),
+        ('integrator="implicitfast"', {"load": 'gravcomp="1"'}),
+        ('integrator="implicitfast"', {"joint": 'range="-0.1 0.1" limited="true"'}),
+    ],
+)
+def test_other_equations_of_motion_are_differentiated_by_the_engine(
+    tmp_path, option: str, parts: dict[str, str]
+) -> None:
+    task = tree_task(tmp_path, option, **parts)
+    trajectory, derivatives = curve(task), task.plant.derivatives
+    found = derivatives.sensitivity(task.theta, trajectory, closed_form=True)
+    expected = derivatives.sensitivity(task.theta, trajectory)
+    assert found is not None and expected is not None
+    np.testing.assert_array_equal(found.psi, expected.psi)
