@@ -1,6 +1,6 @@
 """Whether designs of an arm became better in equal time than at an earlier commit.
 
-    python -m scripts.benchmarks equal_time [--commit 2ef51a6] [--seconds 30] [--parameters 10 30 70]
+    python -m scripts.benchmarks equal_time [--commit 2ef51a6] [--seconds 30] [--parameters 10 70]
 
 Each experiment of `benchmark_arm` is designed twice, in processes of their own: by the code of this
 folder, and by that of the commit, which git checks out into a temporary folder. J is printed at the
@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mjfim.budget import Budget, StopToken
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -34,10 +35,6 @@ SHARES = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 ENDLESS = 100_000
 
 
-class _TimeIsOver(Exception):
-    """The seconds of the processor are used up."""
-
-
 def costs_over_time(tables: Mapping[str, Any], seconds: float) -> list[tuple[float, float]]:
     """Run one design until the seconds of the processor are used up.
 
@@ -49,21 +46,19 @@ def costs_over_time(tables: Mapping[str, Any], seconds: float) -> list[tuple[flo
         Seconds since the search began, and the best J so far, of every iterate.
     """
     task = DesignTask.resolve(Experiment(**tables))
+    token = StopToken()
     begun = time.process_time()
     found: list[tuple[float, float]] = []
 
     def note(event: DesignEvent) -> None:
-        """Note the iterate, or end the run."""
+        """Note the iterate, and end the run where its time is over."""
         spent = time.process_time() - begun
         if spent > seconds:
-            raise _TimeIsOver
+            token.request()
         best = min([event.row.cost, *(cost for _, cost in found[-1:])])
         found.append((spent, best))
 
-    try:
-        design_task(task, callback=note)
-    except _TimeIsOver:
-        pass
+    design_task(task, callback=note, budget=Budget(stop=token))
     return found
 
 
