@@ -101,11 +101,7 @@ class AffineForces:
         applied, is_free = self._applied(ctrl)
         points = np.concatenate([np.ones((len(states), 1)), states, applied], axis=1)
 
-        force = points @ self.actuators.T
-        clamped = force
-        if self.model.actuator_forcelimited.any():
-            low, high = self._limits()
-            clamped = np.clip(force, low, high)
+        clamped, acts = self._clamped(points)
 
         # The largest terms of the function show the round-off that its sum may have.
         total = points @ self.springs.T + clamped @ self.moments
@@ -116,8 +112,36 @@ class AffineForces:
         deviation = np.abs(total - sum(fields[name] for name in FORCE_FIELDS))
         agree = (deviation <= LARGEST_DEVIATION * terms.max(axis=0)).all(axis=1)
 
-        slopes = self._slopes(force == clamped, is_free)
+        slopes = self._slopes(acts, is_free)
         return ForceSlopes(slopes=slopes, implicit_damping=self._damping(slopes), agree=agree)
+
+    def actuator_slopes(self, states: Array, ctrl: Array) -> Array:
+        """(n, actuators, 2 nv + nu) derivatives of the actuators' forces at n states.
+
+        Args:
+            states: (n, 2 nv) states.
+            ctrl: (n, nu) controls.
+        """
+        applied, is_free = self._applied(ctrl)
+        points = np.concatenate([np.ones((len(states), 1)), states, applied], axis=1)
+        _, acts = self._clamped(points)
+        slopes = acts[..., None] * self.actuators[:, 1:]
+        slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
+        return np.asarray(slopes)
+
+    def _clamped(self, points: Array) -> tuple[Array, np.ndarray]:
+        """(n, actuators) forces within their limits, and True where they are not clamped.
+
+        Args:
+            points: (n, 1 + 2 nv + nu) ones, states and controls.
+        """
+        force = points @ self.actuators.T
+        if not self.model.actuator_forcelimited.any():
+            return force, np.ones(force.shape, dtype=bool)
+
+        low, high = self._limits()
+        clamped = np.clip(force, low, high)
+        return clamped, clamped == force
 
     def _slopes(self, acts: np.ndarray, is_free: np.ndarray) -> Array:
         """(n, nv, 2 nv + nu) derivatives.

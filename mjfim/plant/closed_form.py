@@ -53,11 +53,18 @@ class SampleJacobians:
         A: (N, nx, nx) by the state.
         B: (N, nx, nu) by the control.
         E: (N, nx, m) by the parameters, or along m directions of them.
+        states: (N, s+1, nx) states before and after each of the s engine steps of a sample.
+        accelerations: (N, s, nv, nx+nu) derivatives of the mean accelerations of the engine steps
+            by the state before the step and by the control.
+        forces: Forces of springs and actuators.
     """
 
     A: Array
     B: Array
     E: Array
+    states: Array
+    accelerations: Array
+    forces: AffineForces
 
 
 def closed_form_tree(model: Any, least_joints: int = LEAST_JOINTS) -> JointTree | None:
@@ -85,7 +92,7 @@ def closed_form_tree(model: Any, least_joints: int = LEAST_JOINTS) -> JointTree 
     has_single_controls = model.nu == model.nactuator and (model.actuator_ctrlnum == 1).all()
     if (
         not has_single_controls
-        or model.nv < LEAST_JOINTS
+        or model.nv < least_joints
         or model.opt.integrator not in integrators
         or other_forces
     ):
@@ -160,6 +167,9 @@ class ClosedForm:
             A=np.concatenate([part.A for part in parts]),
             B=np.concatenate([part.B for part in parts]),
             E=np.concatenate([part.E for part in parts]),
+            states=np.concatenate([part.states for part in parts]),
+            accelerations=np.concatenate([part.accelerations for part in parts]),
+            forces=forces,
         )
 
     def inertias(self, model: Any) -> Array:
@@ -221,8 +231,10 @@ class _System:
             by_theta = np.asarray(
                 np.linalg.solve(matrix, -self._regressor(motion, fields)), dtype=np.float64
             )
-        return self._over_samples(
-            by_point.reshape(N, substeps, nv, -1), by_theta.reshape(N, substeps, nv, count)
+        accelerations = by_point.reshape(N, substeps, nv, -1)
+        A, B, E = self._over_samples(accelerations, by_theta.reshape(N, substeps, nv, count))
+        return SampleJacobians(
+            A=A, B=B, E=E, states=steps.states, accelerations=accelerations, forces=self.forces
         )
 
     @property
@@ -245,41 +257,66 @@ class _System:
         axes = fields["xmat"].reshape(len(motion.speed), -1, 3, 3)
         return motion.regressor(fields["xpos"][:, bodies], axes[:, bodies], self.inertia_change)
 
-    def _over_samples(self, by_point: Array, by_theta: Array) -> SampleJacobians:
-        """Derivatives of samples from those of the accelerations of their engine steps.
+    def _over_samples(self, by_point: Array, by_theta: Array) -> tuple[Array, Array, Array]:
+        """A, B and E of samples from derivatives of the accelerations of their engine steps.
 
         Args:
             by_point: (N, s, nv, 2 nv + nu) derivatives of the accelerations by state and control.
             by_theta: (N, s, nv, m) derivatives of the accelerations by the parameters.
         """
-        N, substeps, nv, count = by_point.shape
-        nx = 2 * nv
-        AB = np.zeros((N, nx, count))
-        AB[..., :nx] = np.eye(nx)
-        E = np.zeros((N, nx, by_theta.shape[3]))
-
+        substeps, nx = by_point.shape[1], 2 * by_point.shape[2]
+        E = np.zeros((len(by_point), nx, by_theta.shape[3]))
+        AB = unmoved(by_point)
         for i in range(substeps):
+            advance(AB, by_state_and_control(by_point[:, i], AB), self._timestep)
             by_state = np.ascontiguousarray(by_point[:, i, :, :nx])
-            acceleration = by_state @ AB
-            acceleration[..., nx:] += by_point[:, i, :, nx:]
-            self._advance(AB, acceleration)
-            self._advance(E, by_state @ E + by_theta[:, i])
+            advance(E, by_state @ E + by_theta[:, i], self._timestep)
 
         A, B = np.split(AB, [nx], axis=2)
-        return SampleJacobians(A=np.ascontiguousarray(A), B=np.ascontiguousarray(B), E=E)
+        return np.ascontiguousarray(A), np.ascontiguousarray(B), E
 
-    def _advance(self, derivative: Array, acceleration: Array) -> None:
-        """Take derivatives of the state over an engine step, in place.
 
-        The engine adds the acceleration to the speed, then the new speed to the position.
+def unmoved(by_point: Array) -> Array:
+    """(N, 2 nv, 2 nv + nu) derivatives of the state at the beginning of samples.
 
-        Args:
-            derivative: (N, 2 nv, k) derivatives of the state.
-            acceleration: (N, nv, k) derivatives of the mean acceleration.
-        """
-        nv = acceleration.shape[1]
-        derivative[:, nv:] += self._timestep * acceleration
-        derivative[:, :nv] += self._timestep * derivative[:, nv:]
+    Args:
+        by_point: (N, s, nv, 2 nv + nu) derivatives of the accelerations.
+    """
+    N, _, nv, count = by_point.shape
+    AB = np.zeros((N, 2 * nv, count))
+    AB[..., : 2 * nv] = np.eye(2 * nv)
+    return AB
+
+
+def by_state_and_control(slopes: Array, AB: Array) -> Array:
+    """Derivatives within a sample of what depends on the present state and the control.
+
+    Args:
+        slopes: (N, w, nx + nu) derivatives by the present state and by the control.
+        AB: (N, nx, nx + nu) derivatives of the present state.
+
+    Returns:
+        (N, w, nx + nu) derivatives by the state at the beginning of the sample and the control.
+    """
+    nx = AB.shape[1]
+    total = np.ascontiguousarray(slopes[..., :nx]) @ AB
+    total[..., nx:] += slopes[..., nx:]
+    return np.asarray(total)
+
+
+def advance(derivative: Array, acceleration: Array, timestep: float) -> None:
+    """Take derivatives of the state over an engine step, in place.
+
+    The engine adds the acceleration to the speed, then the new speed to the position.
+
+    Args:
+        derivative: (N, 2 nv, k) derivatives of the state.
+        acceleration: (N, nv, k) derivatives of the mean acceleration.
+        timestep: Engine timestep [s].
+    """
+    nv = acceleration.shape[1]
+    derivative[:, nv:] += timestep * acceleration
+    derivative[:, :nv] += timestep * derivative[:, nv:]
 
 
 def _flat(values: Array) -> Array:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.parameters import ParameterSet
-from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.plant.closed_form import (
     INERTIA_STEP,
     ClosedForm,
@@ -16,6 +16,7 @@ from mjfim.plant.closed_form import (
     closed_form_tree,
     is_inertial,
 )
+from mjfim.plant.closed_form_observations import observation_jacobian
 from mjfim.plant.difference_steps import DifferenceSteps
 from mjfim.records.trajectory import Trajectory
 
@@ -68,6 +69,19 @@ class MixedInClosedForm:
 
     first: SampleJacobians
     F_mixed: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObservedInClosedForm:
+    """First derivatives of F and of observations.
+
+    Attributes:
+        first: First derivatives of the samples.
+        observed: (N, S, w, nx+nu) derivatives of the observations by (x, u).
+    """
+
+    first: SampleJacobians
+    observed: Array
 
 
 class ClosedFormMemory:
@@ -161,6 +175,27 @@ class ClosedFormDerivatives(DifferenceSteps):
             mixed[r] = np.swapaxes(by_both, 1, 2) / epsilon
         return MixedInClosedForm(first=origin, F_mixed=mixed)
 
+    def closed_form_observations(
+        self, theta: Array, trajectory: Trajectory, observations: SubstepObservations
+    ) -> ObservedInClosedForm | None:
+        """First derivatives of F and of observations.
+
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            trajectory: The trajectory.
+            observations: The w observed quantities.
+
+        Returns:
+            The derivatives; None where there is no closed form.
+        """
+        closed = self._closed_form(trajectory)
+        origin = None if closed is None else self._origin_jacobians(closed, theta, trajectory)
+        if origin is None:
+            return None
+
+        observed = observation_jacobian(origin, trajectory.ctrl, observations)
+        return None if observed is None else ObservedInClosedForm(first=origin, observed=observed)
+
     def _closed_form(self, trajectory: Trajectory) -> ClosedForm | None:
         """The closed form with the sizes of a trajectory; None where there is none."""
         plant = self.plant
@@ -196,7 +231,7 @@ class ClosedFormDerivatives(DifferenceSteps):
             theta=np.array(theta),
             trajectory=trajectory,
             substeps=self.plant.simulator.substeps,
-            jacobians=SampleJacobians(A=found.A, B=found.B, E=np.zeros((*found.E.shape[:2], 0))),
+            jacobians=replace(found, E=np.zeros((*found.E.shape[:2], 0))),
         )
 
     def _inertia_change(self, closed: ClosedForm, theta: Array) -> Array:

@@ -12,7 +12,6 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.closed_form_derivatives import ClosedFormDerivatives
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.step_derivatives import MovedSamples, StepDerivatives, all_samples, tiled
 from mjfim.records.trajectory import Trajectory
@@ -103,7 +102,7 @@ class _PairDerivatives:
     observation_jacobian: Array | None
 
 
-class MixedDerivatives(StepDerivatives, ClosedFormDerivatives):
+class MixedDerivatives(StepDerivatives):
     """First and mixed second derivatives of F and h."""
 
     @property

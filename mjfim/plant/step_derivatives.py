@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.difference_steps import DifferenceSteps
+from mjfim.plant.closed_form_derivatives import ClosedFormDerivatives
 from mjfim.records.trajectory import Linearization, Trajectory
 
 # Relative step of the differences that give A, B, C, D, E and H.
@@ -84,7 +84,7 @@ class StepEffects:
     output_sizes: Array | None
 
 
-class StepDerivatives(DifferenceSteps):
+class StepDerivatives(ClosedFormDerivatives):
     """First derivatives of F and h by state, control and parameters."""
 
     def linearize(
@@ -149,7 +149,9 @@ class StepDerivatives(DifferenceSteps):
         observations: SubstepObservations,
         step: float = FIRST_DERIVATIVE_STEP,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of F and of observations by state and control, by one-sided differences.
+        """Derivatives of F and of observations by state and control.
+
+        They have a closed form, or are one-sided differences where the plant has none.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -164,6 +166,10 @@ class StepDerivatives(DifferenceSteps):
         Raises:
             SimulationDivergedError: A perturbed step diverges.
         """
+        closed = self.closed_form_observations(theta, trajectory, observations)
+        if closed is not None:
+            return closed.first.A, closed.first.B, closed.observed
+
         plant, nx = self.plant, self.plant.space.nx
         sizes = self.difference_sizes(trajectory)
         moved = self._move_samples(trajectory.state[:-1], trajectory.ctrl, step * sizes, False)

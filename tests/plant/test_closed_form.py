@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.task import DesignTask
+from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.trajectory import Trajectory
 from tests.support.numerics import make_task
@@ -152,6 +153,32 @@ def test_mixed_derivatives_agree_with_differences(tmp_path) -> None:
     np.testing.assert_array_equal(found.C, expected.C)
     assert found.h_mixed is None and expected.h_mixed is None
     assert_close(found.F_mixed, expected.F_mixed, 1e-5)
+
+
+def test_derivatives_of_observations_agree_with_differences(tmp_path) -> None:
+    task = tree_task(tmp_path)
+    trajectory = curve(task)
+    observations = SubstepObservations(
+        positions=np.array([0, 3]),
+        velocities=np.array([1, 4]),
+        accelerations=np.array([0, 2, 4]),
+        actuator_forces=np.array([0, 1, 3]),
+        joint_forces=np.array([1, 2, 4]),
+        tendon_forces=((0, 2),),
+        derivative_substeps=(1, 2),
+        force_rows=(1,),
+        timestep=0.005,
+    )
+    A, B, found = task.plant.derivatives.observation_jacobians(task.theta, trajectory, observations)
+    differences = with_differences(task).plant.derivatives
+    expected = differences.observation_jacobians(task.theta, trajectory, observations)
+    assert_close(A, expected[0], 1e-5)
+    assert_close(B, expected[1], 1e-5)
+
+    # Accelerations have other sizes than positions.
+    assert found.shape == expected[2].shape
+    for number in range(found.shape[2]):
+        assert_close(found[:, :, number], expected[2][:, :, number], 1e-5)
 
 
 def test_the_gradient_does_not_compute_known_derivatives_again(tmp_path) -> None:
