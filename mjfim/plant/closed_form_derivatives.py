@@ -127,9 +127,15 @@ class ClosedFormDerivatives(DifferenceSteps):
         if closed is None or not among_inertial.any():
             return None
 
-        change = self._inertia_change(closed, theta) @ directions[among_inertial].T
+        change = self._inertia_change(closed, theta)
+        if change is None:
+            return None
+
         found = closed.jacobians(
-            self.plant.model(theta), trajectory.state[:-1], trajectory.ctrl, change
+            self.plant.model(theta),
+            trajectory.state[:-1],
+            trajectory.ctrl,
+            change @ directions[among_inertial].T,
         )
         if found is None:
             return None
@@ -234,23 +240,29 @@ class ClosedFormDerivatives(DifferenceSteps):
             jacobians=replace(found, E=np.zeros((*found.E.shape[:2], 0))),
         )
 
-    def _inertia_change(self, closed: ClosedForm, theta: Array) -> Array:
+    def _inertia_change(self, closed: ClosedForm, theta: Array) -> Array | None:
         """(b, 10, p) derivative of the moved bodies' inertias, by two-sided differences.
 
-        Coordinates in which inertias are not linear need no other treatment.
+        Coordinates in which inertias are not linear need no other treatment. None where MuJoCo
+        cannot compile a moved model.
         """
-        kept = self.plant.closed_form_memory.inertia_change
+        memory = self.plant.closed_form_memory
         key = np.asarray(theta, dtype=np.float64).tobytes()
-        if key not in kept:
-            steps = INERTIA_STEP * self.parameter_scale
-            change = np.zeros((len(closed.tree.bodies), 10, len(theta)))
-            for i in np.flatnonzero(self.plant.closed_form_memory.inertial):
-                move = np.zeros(len(theta))
-                move[i] = steps[i]
-                pair = self.plant.models(np.stack([theta + move, theta - move]))
-                forward, backward = (closed.inertias(model) for model in pair)
-                change[:, :, i] = (forward - backward) / (2.0 * steps[i])
-            if len(kept) >= MAX_KEPT_CHANGES:
-                kept.clear()
-            kept[key] = change
-        return kept[key]
+        if key in memory.inertia_change:
+            return memory.inertia_change[key]
+
+        steps = INERTIA_STEP * self.plant.parameters.magnitude
+        change = np.zeros((len(closed.tree.bodies), 10, len(theta)))
+        for i in np.flatnonzero(memory.inertial):
+            move = np.zeros(len(theta))
+            move[i] = steps[i]
+            pair, compiled = self.plant.try_models(np.stack([theta + move, theta - move]))
+            if not compiled.all():
+                return None
+            forward, backward = (closed.inertias(model) for model in pair)
+            change[:, :, i] = (forward - backward) / (2.0 * steps[i])
+
+        if len(memory.inertia_change) >= MAX_KEPT_CHANGES:
+            memory.inertia_change.clear()
+        memory.inertia_change[key] = change
+        return change
