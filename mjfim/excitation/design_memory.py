@@ -49,7 +49,8 @@ def design_bytes(system: System, samples: int) -> float:
     Returns:
         The memory [bytes].
     """
-    numbers = max(_rollouts(system), _moved_samples(system)) + _held(system)
+    numbers = max(_rollouts(system), _moved_samples(system), _engine_steps(system))
+    numbers += _held(system)
     return FIXED_BYTES + PEAK_FACTOR * NUMBER_BYTES * numbers * samples
 
 
@@ -73,6 +74,15 @@ def _moved_samples(system: System) -> int:
     of_step = 5 * state + 2 * nu + 2 * _sensors(system) + _observed(system)
     in_batch = 2 * (1 + state + system.space.nv + nu)
     return moves * (of_step + in_batch)
+
+
+def _engine_steps(system: System) -> int:
+    """Numbers per sample of derivatives in closed form, which are kept at every engine step.
+
+    They stand in memory twice while their parts are put together.
+    """
+    nx, nv = system.space.nx, system.space.nv
+    return 2 * system.grid.substeps * (nv * (nx + len(system.controls)) + nx)
 
 
 def _held(system: System) -> int:

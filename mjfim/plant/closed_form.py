@@ -216,21 +216,20 @@ class _System:
         if not (slopes.agree.all() and self._solves(motion, slopes, fields)):
             return None
 
-        # The two right-hand sides are solved apart, so that A and B do not depend on the last digit
-        # on whether parameters are asked for.
         by_position, by_speed = motion.force_derivatives()
         by_point = slopes.slopes
         by_point[..., :nv] -= by_position
         by_point[..., nv : 2 * nv] -= by_speed
-        matrix = motion.mass_matrix + self._timestep * slopes.implicit_damping
-        by_point = np.asarray(np.linalg.solve(matrix, by_point), dtype=np.float64)
+
+        # One small inverse for all right-hand sides takes a third of the time of solving for them,
+        # and A and B do not depend on whether parameters are asked for.
+        inverse = np.linalg.inv(motion.mass_matrix + self._timestep * slopes.implicit_damping)
+        by_point = inverse @ by_point
 
         count = self.inertia_change.shape[2]
         by_theta: Array = np.zeros((N * substeps, nv, count))
         if count:
-            by_theta = np.asarray(
-                np.linalg.solve(matrix, -self._regressor(motion, fields)), dtype=np.float64
-            )
+            by_theta = inverse @ -self._regressor(motion, fields)
         accelerations = by_point.reshape(N, substeps, nv, -1)
         A, B, E = self._over_samples(accelerations, by_theta.reshape(N, substeps, nv, count))
         return SampleJacobians(

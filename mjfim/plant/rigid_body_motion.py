@@ -346,7 +346,7 @@ def _cross_matrix(a: Array) -> Array:
 
 def _product(matrix: Array, vector: Array) -> Array:
     """(..., 6) product of matrices (..., 6, 6) and vectors (..., 6)."""
-    return np.asarray((matrix @ vector[..., None])[..., 0])
+    return np.asarray(np.einsum("...ij,...j->...i", matrix, vector))
 
 
 def _moved_motion(v: Array, motion: Array) -> Array:

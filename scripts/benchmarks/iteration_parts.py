@@ -6,6 +6,7 @@ those of the processor, so that other programs matter little.
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -99,11 +100,11 @@ class IterationParts:
 class _Meter:
     """Adds up calls, engine steps and seconds of the purposes while a design runs."""
 
-    def __init__(self, plants: Callable[[], int]) -> None:
-        """Begin with nothing; `plants` returns the engine steps so far."""
+    def __init__(self, steps_so_far: Callable[[], int]) -> None:
+        """Begin with nothing; the function returns the engine steps so far."""
         self.parts: dict[str, Part] = {REST: Part()}
         self.active: str | None = None
-        self._steps_so_far = plants
+        self._steps_so_far = steps_so_far
 
     def wrapped(self, function: Callable[..., Any], purpose: str) -> Callable[..., Any]:
         """The function, which counts for a purpose unless it is called by a counted one."""
@@ -174,27 +175,26 @@ def measure(task: DesignTask, closed_form: bool = True) -> IterationParts:
 
     meter = _Meter(lambda: plant.engine_steps)
     costs: list[float] = []
-    begun: list[float] = []
-    ended: list[float] = []
-    steps: list[int] = []
+    times: list[float] = []
+    parts = meter.parts
 
     def note(event: DesignEvent) -> None:
-        """Forget what was before the first iterate, and note the cost and the time of each."""
+        """Forget what was before the first iterate, and keep the parts up to the latest one."""
+        nonlocal parts
         if not costs:
             meter.parts = {REST: Part()}
-            begun.append(time.process_time())
+        parts = copy.deepcopy(meter.parts)
         costs.append(event.row.cost)
-        ended.append(time.process_time())
-        steps.append(plant.engine_steps)
+        times.append(time.process_time())
 
     with meter.attached():
         design_task(task, callback=note)
 
-    counted = sum(part.seconds for part in meter.parts.values())
-    meter.parts[REST].seconds = max(ended[-1] - begun[0] - counted, 0.0)
+    counted = sum(part.seconds for part in parts.values())
+    parts[REST].seconds = max(times[-1] - times[0] - counted, 0.0)
     return IterationParts(
         iterations=max(len(costs) - 1, 1),
-        parts=meter.parts,
+        parts=parts,
         costs=tuple(costs),
         bare_step=bare_step_time(plant.source.model, task),
     )
