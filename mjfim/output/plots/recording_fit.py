@@ -153,8 +153,7 @@ def _file_name(recording: Recording) -> str:
 def _draw(curves: _Curves, labels: Labels, title: str, note: str) -> Figure:
     """Draw a row per output: the curves over time, and their errors."""
     recording = curves.recording
-    residual = recording.y - curves.identified
-    columns = shown_outputs(residual, curves.noise)
+    columns = shown_outputs([recording.y], [curves.identified], curves.noise)
 
     figure = new_figure(1.2 * len(columns) + 1.5)
     grid = figure.subplots(len(columns), 2, squeeze=False, sharex=True, width_ratios=(1.4, 1.0))
@@ -223,18 +222,29 @@ def _checked_noise(estimate: Estimate, index: int, sigma: Sequence[float] | Arra
     return noise
 
 
-def shown_outputs(residual: Array, sigma: Array, largest: int = MAX_OUTPUTS) -> NDArray[np.intp]:
+def shown_outputs(
+    measured: Sequence[Array],
+    predicted: Sequence[Array],
+    sigma: Array,
+    largest: int = MAX_OUTPUTS,
+) -> NDArray[np.intp]:
     """Return the outputs to draw: of many, those with the largest residuals over sigma.
 
     Args:
-        residual: (n, ny) residuals, NaN where nothing was measured [output's unit].
+        measured: (M, ny) values of every recording, NaN where nothing was measured [output's unit].
+        predicted: (M, ny) predictions of every recording [output's unit].
         sigma: (ny,) noise of each output [output's unit].
         largest: Largest number of outputs.
     """
-    measured = np.isfinite(residual)
-    squares = np.where(measured, residual, 0.0) ** 2
-    count = np.maximum(measured.sum(axis=0), 1)
-    relative_mean_square = squares.sum(axis=0) / count / sigma**2
+    squares = np.zeros(len(sigma))
+    count = np.zeros(len(sigma))
+    for y, identified in zip(measured, predicted, strict=True):
+        for j in range(len(sigma)):
+            residual = y[:, j] - identified[:, j]
+            known = residual[np.isfinite(residual)]
+            squares[j] += known @ known
+            count[j] += len(known)
+    relative_mean_square = squares / np.maximum(count, 1.0) / sigma**2
 
     worst_first = np.argsort(-relative_mean_square, kind="stable")
     return np.sort(worst_first[:largest])

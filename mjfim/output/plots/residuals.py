@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from scipy.signal import welch
 from scipy.stats import chi2
 
 from mjfim.arrays import Array
@@ -35,6 +34,7 @@ from mjfim.output.plots.style import (
     shorten,
     write_message,
 )
+from mjfim.output.welch import density_of
 from mjfim.records.estimate import Estimate, Prediction
 from mjfim.records.labels import Labels
 
@@ -75,11 +75,8 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
     """
     outputs = estimate.recordings[0].outputs
     sigma = np.array([estimate.sigma[name] for name in outputs])
-    residuals = [
-        recording.y - predicted
-        for recording, predicted in zip(estimate.recordings, estimate.predicted, strict=True)
-    ]
-    columns = shown_outputs(np.concatenate(residuals), sigma, MAX_OUTPUTS)
+    measured = [recording.y for recording in estimate.recordings]
+    columns = shown_outputs(measured, estimate.predicted, sigma, MAX_OUTPUTS)
 
     across = min(PANEL_COLUMNS, len(columns))
     if len(columns) == PANEL_COLUMNS + 1:
@@ -152,7 +149,7 @@ def _smoothed_density(parts: list[tuple[Array, Array]]) -> tuple[Array, Array, f
     for _, residual in parts:
         # Welch's segments overlap by half.
         segments = max(2 * len(residual) // length - 1, 1)
-        frequencies, density = welch(residual, rate, nperseg=length, detrend=False)
+        frequencies, density = density_of(residual, rate, length)
         total = (total if count else np.zeros_like(density)) + segments * density
         count += segments
 

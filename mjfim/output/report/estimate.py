@@ -24,6 +24,7 @@ from mjfim.output.report.curves import (
     row_axis,
     rows_height,
     rows_of_bars,
+    thinned,
 )
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
 from mjfim.output.report.residual_curves import Residuals
@@ -52,6 +53,9 @@ MOST_LINEAR = 20.0
 
 # Decades of a logarithmic axis of prediction errors before the smallest and behind the largest one.
 NOISE_ROOM = (0.5, 0.05)
+
+# Number of residuals above which a plot holds fewer of them; a page shows still fewer.
+MAX_RESIDUALS = 100_000
 
 # Largest number of segments whose beginnings are drawn as lines.
 MAX_SEGMENTS = 20
@@ -465,9 +469,12 @@ def _residual_panel(t: Array, residual: Array, sigma: float, label: str, i: int)
     name, unit = split_unit(label)
     known = residual[np.isfinite(residual)]
     outside = 100.0 * float(np.mean(np.abs(known) > 2.0 * sigma)) if known.size else float("nan")
+
+    # The page shows fewer points than that, so that memory need not hold all of them.
+    kept = thinned(residual, MAX_RESIDUALS)
     return Panel(
         title=f"{name}: residual [{unit or '–'}]",
-        traces=[dots(t, residual, "residual", MEASURED.word)],
+        traces=[dots(t[kept], residual[kept], "residual", MEASURED.word)],
         layout={"xaxis": axis("time [s]"), "shapes": [band(-2.0 * sigma, 2.0 * sigma)]},
         remark=f"{outside:.1f} % outside ± 2 σ (noise: 4.6 %)",
         linked=f"time {i}",

@@ -76,8 +76,9 @@ class Residuals:
 
     def spectrum(self) -> tuple[Array, Array, tuple[float, float]]:
         """Return frequencies [Hz], power over that of white noise, and its range of 95 %."""
-        from scipy.signal import welch
         from scipy.stats import chi2
+
+        from mjfim.output.welch import density_of
 
         # At least four segments of the shortest recording make the curve smooth.
         shortest = min(len(part) for part in self.parts)
@@ -87,7 +88,7 @@ class Residuals:
         for part in self.parts:
             # Welch's segments overlap by half.
             own = max(2 * len(part) // length - 1, 1)
-            frequencies, power = welch(part, self.rate, nperseg=length, detrend=False)
+            frequencies, power = density_of(part, self.rate, length)
             total += own * power
             segments += own
 

@@ -1,0 +1,21 @@
+"""Spectral densities of long series are those of SciPy, although they are computed part by part."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import welch as reference
+
+from mjfim.output import welch
+
+
+@pytest.mark.parametrize(("count", "length"), [(1000, 100), (999, 101), (256, 256), (300, 257)])
+def test_parts_give_the_density_of_the_whole(
+    count: int, length: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(welch, "SEGMENTS_AT_ONCE", 3)
+    x = np.random.default_rng(0).normal(size=count)
+    frequencies, density = welch.density_of(x, 10.0, length)
+    expected, wanted = reference(x, 10.0, nperseg=length, detrend=False)
+    np.testing.assert_array_equal(frequencies, expected)
+    np.testing.assert_allclose(density, wanted, rtol=1e-12)
