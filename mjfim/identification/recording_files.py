@@ -6,6 +6,7 @@ small part of the time in which a log is parsed or sent.
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 import uuid
@@ -59,8 +60,8 @@ class RecordingFiles:
 
     @property
     def is_here(self) -> bool:
-        """True where this process finds the folder."""
-        return self.folder.is_dir()
+        """True where this process finds the files, and may read them."""
+        return all(os.access(self.folder / f"{array}.npy", os.R_OK) for array in ARRAYS)
 
     def mapped(self) -> AlignedRecording:
         """The recording, whose arrays are read from the files when they are used."""
