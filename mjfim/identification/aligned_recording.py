@@ -35,6 +35,9 @@ MIN_ROWS = 3
 # Number of samples that are simulated to find the sign of a quaternion at the first row.
 SAMPLES_FOR_SIGN = 4
 
+# Number of rows after which the recorded motion ends that is animated beside the fitted one.
+MAX_MOTION_ROWS = 200_000
+
 # Smallest norm of an interpolated quaternion in a denominator.
 SMALLEST_NORM = 1e-12
 
@@ -354,9 +357,10 @@ def _quaternion_outputs(system: System) -> list[list[int]]:
 
 
 def measured_trajectory(system: System, recording: Recording) -> Trajectory | None:
-    """The recorded motion as a trajectory, for figures.
+    """The recorded motion as a trajectory, for animations.
 
-    Missing positions are interpolated linearly. Velocities that were not measured are NaN.
+    Missing positions are interpolated linearly. Velocities that were not measured are NaN. A long
+    recording ends after `MAX_MOTION_ROWS` rows.
 
     Args:
         system: System that was recorded.
@@ -367,6 +371,7 @@ def measured_trajectory(system: System, recording: Recording) -> Trajectory | No
     """
     model = system.model
     measured = outputs_by_state(model, system.outputs)
+    recording = recording.first_rows(MAX_MOTION_ROWS)
 
     qpos = np.empty((len(recording.t), model.nq))
     for q in range(model.nq):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from mjfim.duration import estimated_seconds
 from mjfim.errors import MjfimError
@@ -28,7 +27,7 @@ def pass_seconds(system: System, recordings: Sequence[Recording]) -> float | Non
 
     def differentiate(count: int) -> None:
         """Compute the derivatives of the first rows of the longest recording."""
-        part = _first_rows(longest, count)
+        part = longest.first_rows(max(count, 2))
         problem = FitProblem.of(system, [part])
         sensitivity_rows(problem, problem.begin(system.parameters.guess))
 
@@ -39,14 +38,3 @@ def pass_seconds(system: System, recordings: Sequence[Recording]) -> float | Non
         # The fit itself says what is wrong.
         return None
     return part_seconds * rows / len(longest.t)
-
-
-def _first_rows(recording: Recording, count: int) -> Recording:
-    """The first rows of a recording, at least two."""
-    count = max(count, 2)
-    return replace(
-        recording,
-        t=recording.t[:count],
-        ctrl=recording.ctrl[: count - 1],
-        y=recording.y[:count],
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -42,6 +42,16 @@ class Recording(SavedRecord):
                     "measurement; give an array of numbers"
                 )
         freeze(self, "t", "ctrl", "y")
+
+    def first_rows(self, count: int) -> Recording:
+        """The recording without the rows after the first ones.
+
+        Args:
+            count: Number of rows that remain, at least 2; a shorter recording is unchanged.
+        """
+        if len(self.t) <= count:
+            return self
+        return replace(self, t=self.t[:count], ctrl=self.ctrl[: count - 1], y=self.y[:count])
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of recording.json."""

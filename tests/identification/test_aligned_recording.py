@@ -13,6 +13,7 @@ import pytest
 
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
+from mjfim.identification import aligned_recording
 from mjfim.identification.aligned_recording import (
     AlignedRecording,
     align,
@@ -304,6 +305,18 @@ def test_an_aligned_recording_does_not_change(task: DesignTask) -> None:
     with pytest.raises(ValueError, match="read-only"):
         aligned.y[0, 0] = 1.0
     np.testing.assert_array_equal(plain.y, before)
+
+
+def test_a_long_measured_motion_ends_early(
+    task: DesignTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody watches an hour; the rows before are the same."""
+    whole = measured_trajectory(task.system, log(task))
+    monkeypatch.setattr(aligned_recording, "MAX_MOTION_ROWS", 20)
+    part = measured_trajectory(task.system, log(task))
+    assert whole is not None and part is not None
+    assert len(part.t) == 20 and len(part.ctrl) == 19
+    np.testing.assert_array_equal(part.qpos, whole.qpos[:20])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 1.0])
