@@ -151,7 +151,12 @@ class RolloutDerivatives(ClosedFormDerivatives):
         outputs = self.plant.outputs
         states = None if outputs.needs_sensors else trajectory.state
         measured = self._rollout_differences(
-            theta, trajectory.state[0], trajectory.ctrl, SENSITIVITY_STEP, states=states
+            theta,
+            trajectory.state[0],
+            trajectory.ctrl,
+            SENSITIVITY_STEP,
+            states=states,
+            closed_form=None if outputs.needs_sensors else trajectory,
         )
         if measured is None:
             return None

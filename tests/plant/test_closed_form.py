@@ -155,6 +155,19 @@ def test_mixed_derivatives_agree_with_differences(tmp_path) -> None:
     assert_close(found.F_mixed, expected.F_mixed, 1e-5)
 
 
+def test_the_steps_of_differences_are_calibrated_in_closed_form(tmp_path) -> None:
+    task = tree_task(tmp_path)
+    trajectory = curve(task)
+    before = task.plant.engine_steps
+    found = task.plant.derivatives.calibrated_step_factors(task.theta, trajectory)
+    assert task.plant.engine_steps - before < 4 * task.samples * task.plant.simulator.substeps
+
+    differences = with_differences(task).plant.derivatives
+    expected = differences.calibrated_step_factors(task.theta, trajectory)
+    assert found is not None and expected is not None
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
 def test_derivatives_of_observations_agree_with_differences(tmp_path) -> None:
     task = tree_task(tmp_path)
     trajectory = curve(task)
