@@ -71,9 +71,12 @@ class AffineForces:
             ctrl: (nu,) control about which it is moved.
             sizes: (2 nv + nu,) sizes of the coordinates.
         """
-        unlimited = copy.copy(model)
-        unlimited.actuator_forcelimited[:] = 0
-        unlimited.actuator_ctrllimited[:] = 0
+        # A copy of a model with many meshes takes time.
+        unlimited = model
+        if model.actuator_forcelimited.any() or model.actuator_ctrllimited.any():
+            unlimited = copy.copy(model)
+            unlimited.actuator_forcelimited[:] = 0
+            unlimited.actuator_ctrllimited[:] = 0
 
         moves = RELATIVE_MOVE * sizes
         about = np.concatenate([state, ctrl])
