@@ -35,7 +35,7 @@ MAX_FOLDS = 5
 PREDICTED_SHARE = 0.25
 
 # Largest number of samples in a cross-validation; of more data, a subset of the segments is used.
-MAX_SAMPLES = 400_000
+MAX_SAMPLES = 200_000
 
 # Settings of the searches for theta without a part of the data, and for initial states. Few
 # iterations are enough, because these searches begin close to their result.
