@@ -8,6 +8,7 @@ same starts go on whatever the number of workers and their speed.
 
 from __future__ import annotations
 
+from bisect import insort
 from dataclasses import dataclass
 
 # A round keeps one in this number of starts.
@@ -40,9 +41,14 @@ class HalvingRound:
     def __init__(self) -> None:
         self._order: list[int] = []
         self._settled: dict[int, Settled] = {}
-        self._decided = 0
-        self._promoted: list[int] = []
         self._is_closed = False
+
+        # Number of the first starts that are all settled, and places and costs of the usable ones
+        # among those that are compared, the best one first.
+        self._settled_count = 0
+        self._ranks: list[tuple[float, int]] = []
+        self._decided = 0
+        self._promoted: set[int] = set()
 
     def enter(self, number: int) -> None:
         """Add a start behind all others.
@@ -73,7 +79,7 @@ class HalvingRound:
     @property
     def discarded(self) -> set[int]:
         """Numbers of the starts that do not go on, while others do."""
-        return set(self._order[: self._decided]) - set(self._promoted) if self._promoted else set()
+        return set(self._order[: self._decided]) - self._promoted if self._promoted else set()
 
     def decide(self) -> list[int]:
         """Make the decisions that are due.
@@ -81,12 +87,16 @@ class HalvingRound:
         Returns:
             Numbers of the starts that go on from now on, the best one of each decision first.
         """
-        following: list[int] = []
-        while (size := self._next_size) and all(n in self._settled for n in self._order[:size]):
-            following += [n for n in self._best(size) if n not in self._promoted + following]
-            self._decided = size
+        while self._settled_count < len(self._order):
+            if self._order[self._settled_count] not in self._settled:
+                break
+            self._settled_count += 1
 
-        self._promoted += following
+        following: list[int] = []
+        while 0 < (size := self._next_size) <= self._settled_count:
+            chosen = [number for number in self._best(size) if number not in self._promoted]
+            following += chosen
+            self._promoted.update(chosen)
         return following
 
     @property
@@ -102,8 +112,12 @@ class HalvingRound:
         return len(self._order) if self._is_closed and self._decided < len(self._order) else 0
 
     def _best(self, size: int) -> list[int]:
-        """Those of the first starts that go on, by their cost."""
-        usable = [number for number in self._order[:size] if self._settled[number].is_usable]
-        best_first = sorted(usable, key=lambda number: self._settled[number].cost)
-        chosen = best_first[: max(1, size // HALVING_RATE)]
+        """Compare the first starts; return those that go on, by their cost."""
+        for place in range(self._decided, size):
+            settled = self._settled[self._order[place]]
+            if settled.is_usable:
+                insort(self._ranks, (settled.cost, place))
+
+        self._decided = size
+        chosen = [self._order[place] for _, place in self._ranks[: max(1, size // HALVING_RATE)]]
         return [number for number in chosen if self._settled[number].may_go_on]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -48,7 +49,8 @@ class RunningRounds:
     def __init__(self, plan: RoundPlan, starts: Sequence[InitialControl]) -> None:
         self._plan = plan
         self._halvings = [HalvingRound() for _ in plan.rounds]
-        self._pending: list[Entry] = []
+        self._pending: list[tuple[int, float, int, Entry]] = []
+        self._pending_in: Counter[int] = Counter()
         self._begun: Counter[int] = Counter()
         self._results: dict[int, RunResult] = {}
         self._entries: dict[int, EndedSearch] = {}
@@ -84,8 +86,8 @@ class RunningRounds:
         When the time is over, a start begins only if it is the first one of its round.
         """
         while self._pending:
-            entry = min(self._pending, key=lambda each: (each.round, each.cost, each.number))
-            self._pending.remove(entry)
+            *_, entry = heapq.heappop(self._pending)
+            self._pending_in[entry.round] -= 1
             if self._may_begin(entry):
                 return entry
             self.drop(entry)
@@ -98,8 +100,7 @@ class RunningRounds:
             entry: The start.
         """
         number = entry.round
-        pending = 1 + sum(each.round == number for each in self._pending)
-        count = max(pending, self.expected(number) - self._begun[number])
+        count = max(self._pending_in[number] + 1, self.expected(number) - self._begun[number])
         self._begun[number] += 1
         seconds = self._times.seconds(number, self._plan.rounds[number].share, count)
         return self._plan.terms(entry, seconds)
@@ -160,7 +161,8 @@ class RunningRounds:
     def _enter(self, entry: Entry) -> None:
         """Let a start take part in a round."""
         self._halvings[entry.round].enter(entry.number)
-        self._pending.append(entry)
+        heapq.heappush(self._pending, (entry.round, entry.cost, entry.number, entry))
+        self._pending_in[entry.round] += 1
         self._count += 1
 
     def _may_begin(self, entry: Entry) -> bool:

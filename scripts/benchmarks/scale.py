@@ -370,13 +370,17 @@ def simulation(sizes: Sizes, measured: int, starts: int, picture: Path) -> bool:
     descent = {"starts": measured, "max_iterations": sizes.iterations, "seconds": 36_000}
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum_limits.toml")
     print(f"a design from {starts} starts, lengths of {measured} of them measured:")
-    print("workers  seconds  efficiency  of the searches alone  seconds of the caller")
+    print(
+        "workers  seconds  efficiency  of the searches alone  seconds of the caller"
+        "  its share  ms per task"
+    )
     rows = []
     for row in efficiencies(experiment.replace(descent=descent), starts, MOST_WORKERS):
         rows.append(row)
         print(
             f"{row.workers:7d} {row.seconds:8.1f} {row.efficiency:11.3f} {row.of_searches:22.3f} "
-            f"{row.caller:22.1f}",
+            f"{row.caller:22.1f} {row.caller / row.seconds:10.3f} "
+            f"{1e3 * row.caller / row.tasks:12.2f}",
             flush=True,
         )
     save_curve(rows, LEAST_EFFICIENCY, picture)

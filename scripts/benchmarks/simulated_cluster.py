@@ -4,7 +4,8 @@ Each task is carried out once in this process, and the CPU time that it takes is
 result and its length are kept, so that the same work can be scheduled again on 2 or 256 simulated
 workers within seconds. What is simulated is the time alone: the scheduler (`mjfim.parallel`, and
 what decides between slices of searches) is that of the package, and what the caller computes
-between tasks counts with its measured CPU time, during which the workers go on.
+between tasks counts with its measured CPU time, during which the workers go on. So does the time in
+which it pickles orders and unpickles results; what a cluster needs beyond that is the latency.
 """
 
 from __future__ import annotations
@@ -65,6 +66,7 @@ class SimulatedCluster(Executor):
         busy: Length of all tasks together [s].
         caller: CPU time of the caller between the tasks, such as for choosing survivors [s].
         searching: Time from the submission of the first task to the arrival of the last one [s].
+        count: Number of tasks.
     """
 
     def __init__(self, count: int, tasks: MeasuredTasks, latency: float = 0.0) -> None:
@@ -73,11 +75,12 @@ class SimulatedCluster(Executor):
         self.busy = 0.0
         self.caller = 0.0
         self.searching = 0.0
+        self.count = 0
         self._first: float | None = None
         self._tasks = tasks
         self._latency = latency
         self._free_at = [0.0] * count
-        self._running: list[tuple[float, int, Future[Any], Any]] = []
+        self._running: list[tuple[float, int, Future[Any], bytes]] = []
         self._submitted = 0
         self._mark = time.process_time()
 
@@ -90,8 +93,11 @@ class SimulatedCluster(Executor):
         """Submit a task to the worker that is free first."""
         if kwargs:
             raise TypeError("a simulated task takes no keywords")
+        pickle.dumps((fn, args), pickle.HIGHEST_PROTOCOL)
         self.account()
         result, seconds = self._tasks.done(fn, args)
+        sent = pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
+        self.count += 1
         self._mark = time.process_time()
 
         if self._first is None:
@@ -102,7 +108,7 @@ class SimulatedCluster(Executor):
         self.busy += seconds
 
         future: Future[Any] = Future()
-        heapq.heappush(self._running, (end + self._latency, self._submitted, future, result))
+        heapq.heappush(self._running, (end + self._latency, self._submitted, future, sent))
         self._submitted += 1
         return future
 
@@ -113,25 +119,18 @@ class SimulatedCluster(Executor):
         self.caller += mark - self._mark
         self._mark = mark
 
-    def charge(self, seconds: float) -> None:
-        """Move the clock on by work of the caller that is not done again.
-
-        Args:
-            seconds: CPU time that it took before [s].
-        """
-        self.now += seconds
-        self.caller += seconds
-
     def advance(self) -> None:
         """Move the clock on to the end of the next task, which then has its result."""
         self.account()
         if self._running:
-            end, _, future, result = heapq.heappop(self._running)
+            end, _, future, sent = heapq.heappop(self._running)
             self.now = max(self.now, end)
             self.searching = self.now - (self._first or 0.0)
+            self._mark = time.process_time()
             if future.set_running_or_notify_cancel():
-                future.set_result(result)
-        self._mark = time.process_time()
+                future.set_result(pickle.loads(sent))
+        else:
+            self._mark = time.process_time()
 
 
 class _SimulatedQueue:

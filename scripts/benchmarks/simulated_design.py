@@ -36,6 +36,7 @@ class Efficiency:
         of_searches: The same from the first task to the last one, without what the caller does
             before and after them.
         caller: CPU time of the caller, whom all workers wait for if it is busy [s].
+        tasks: Number of tasks.
     """
 
     workers: int
@@ -43,10 +44,11 @@ class Efficiency:
     efficiency: float
     of_searches: float
     caller: float
+    tasks: int
 
 
 def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterator[Efficiency]:
-    """Schedule a design from many starts on 1, 4, 16 and more workers.
+    """Schedule a design from many starts on 1, 2, 4 and more workers.
 
     The searches from the initial controls that the experiment states are carried out once. Every
     further start takes as long as one of them, and finds the same.
@@ -55,7 +57,7 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterat
         experiment: Experiment under hard limits; its number of starts is that of the searches that
             are carried out.
         starts: Number of starts that are scheduled.
-        most: Largest number of workers, a power of 4.
+        most: Largest number of workers, a power of 2.
 
     Yields:
         The efficiency on each number of workers.
@@ -65,7 +67,7 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterat
 
     # One worker carries out all tasks, the others schedule them again.
     alone = _simulated_seconds(task, tasks, starts, 1)
-    for number in (2**k for k in range(0, most.bit_length(), 2)):
+    for number in (2**k for k in range(most.bit_length())):
         found = alone if number == 1 else _simulated_seconds(task, tasks, starts, number)
         yield Efficiency(
             workers=number,
@@ -73,6 +75,7 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterat
             efficiency=alone.whole / (number * found.whole),
             of_searches=found.busy / (number * found.searches),
             caller=found.caller,
+            tasks=found.tasks,
         )
 
 
@@ -85,12 +88,14 @@ class _Times:
         searches: From the first task to the last one.
         busy: All tasks together.
         caller: The caller's own work.
+        tasks: Number of tasks.
     """
 
     whole: float
     searches: float
     busy: float
     caller: float
+    tasks: int
 
 
 def _simulated_seconds(
@@ -110,7 +115,11 @@ def _simulated_seconds(
     ):
         design_module.design_task(task, executor=cluster.workers)
     return _Times(
-        whole=cluster.now, searches=cluster.searching, busy=cluster.busy, caller=cluster.caller
+        whole=cluster.now,
+        searches=cluster.searching,
+        busy=cluster.busy,
+        caller=cluster.caller,
+        tasks=cluster.count,
     )
 
 
