@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -14,10 +13,10 @@ from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.search_slices import SearchSlice, SliceOrder, worker_budget
+from mjfim.excitation.sent_task import SentTask
 from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import FreeState, UnconstrainedSearch
-from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import ModelVariant
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
@@ -124,13 +123,15 @@ def run_free_starts(
         the engine steps of all levels.
     """
     stated = levels[-1].task
+    variants = tuple(level.task.system.variant for level in levels)
+    sent = SentTask.of(stated)
     first = FreeSlice(
-        task_key=uuid.uuid4().hex,
-        experiment=for_workers(stated.experiment, stated.system.source),
+        task_key=sent.key_of(*variants),
+        experiment=sent.experiment,
         start=starts[0],
         basis=levels[-1].basis,
         added_information=stated.added_information,
-        variants=tuple(level.task.system.variant for level in levels),
+        variants=variants,
         budget=budget,
         threads=Workers.of(executor).threads_for(len(starts)),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,9 +14,8 @@ from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult
+from mjfim.excitation.sent_task import SentTask
 from mjfim.excitation.sliced_searches import run_in_slices
-from mjfim.experiment.packing import for_workers
-from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import ModelVariant
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.records.events import DesignEvent
@@ -109,7 +107,7 @@ class LimitedSearches:
             count: Number of searches side by side, which share the threads.
         """
         threads = Workers.of(executor).threads_for(count)
-        sent = replace(search, experiment=self._packed, threads=threads)
+        sent = replace(search, experiment=self._sent.experiment, threads=threads)
         return ConstrainedSlice(search=sent, task_key=self.task_key(search.variant))
 
     def task_key(self, variant: ModelVariant) -> str:
@@ -118,7 +116,7 @@ class LimitedSearches:
         Args:
             variant: The plant.
         """
-        return f"{self._key} {variant}"
+        return self._sent.key_of(variant)
 
     def run(
         self, level: DescentLevel, start: InitialControl, terms: SearchTerms
@@ -145,12 +143,6 @@ class LimitedSearches:
         return found[0] if found else None
 
     @cached_property
-    def _packed(self) -> Experiment:
-        """The experiment for workers, which need no file of the caller."""
-        task = self.stated.task
-        return for_workers(task.experiment, task.system.source)
-
-    @cached_property
-    def _key(self) -> str:
-        """Text that tells the orders of this design from others."""
-        return uuid.uuid4().hex
+    def _sent(self) -> SentTask:
+        """What all orders of this design send."""
+        return SentTask.of(self.stated.task)

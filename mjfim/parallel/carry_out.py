@@ -1,4 +1,4 @@
-"""Independent orders on workers, with their outcomes in the order of the orders."""
+"""Carries out orders that do not depend on each other, and reports them in their order."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def carry_out(
 ) -> Iterator[Outcome[T]]:
     """Carry out independent orders on the workers of an executor.
 
-    The outcomes do not depend on the number of workers, nor on which of them are killed meanwhile:
-    a lost order is done again, up to three times, and a broken pool of processes is made anew. An
-    order must not depend on the others, nor on anything that changes.
+    The outcomes do not depend on the number of workers, nor on which of them are killed meanwhile.
+    A lost order is done again until it has been lost `dispatch.MAX_LOSSES` times, and a broken pool
+    of processes is made anew. An order must not depend on the others, nor on anything that changes.
 
     A request to stop takes effect within `dispatch.GRACE` seconds on every executor. The tasks of a
-    `Pool` see it (`pool_stop_token`) and return what they have, or have offered it
-    (`offer_result`). Those of other executors do not see it, so that orders should be small enough
-    to end within that time.
+    `Pool` see the request (`pool_stop_token`). They return what they have found so far; if they do
+    not return in time, what they have offered counts (`offer_result`). The tasks of other executors
+    do not see the request. So an order should be small enough to end within that time.
 
     Args:
         executor: `Workers`, or an executor that they can wrap.
@@ -40,8 +40,9 @@ def carry_out(
         callback: Called with each outcome as soon as it is there, to show progress.
 
     Yields:
-        The outcome of every order that was not left out, in the given order. That of a lost one
-        has a sentence in place of a result; the caller decides whether that is an error.
+        The outcome of every order that was carried out, in the given order: without gaps, except
+        after a request to stop or the end of the budget. That of a lost one has a sentence in place
+        of a result; the caller decides whether that is an error.
 
     Raises:
         Exception: The error of an order that failed.
