@@ -6,7 +6,6 @@ number of workers and whichever of them are lost. No worker waits for the end of
 
 from __future__ import annotations
 
-import time
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -60,12 +59,13 @@ class _RoundsHere:
 
     def run(self) -> Runs:
         """Run all searches, and return the results."""
+        budget = self.plan.searches.budget
         while (entry := self.rounds.next_entry()) is not None:
-            begun = time.monotonic()
+            begun = budget.seconds_used
             level = self.rounds.level(entry)
             search = self.plan.searches.search(level, entry.start, self.rounds.terms(entry))
             result = yield from _numbered(search.run(level.task), entry.done)
-            seconds = time.monotonic() - begun
+            seconds = budget.seconds_used - begun
             self._late.take(EndedSearch(entry=entry, result=result, seconds=seconds))
         return self.rounds.results()
 
