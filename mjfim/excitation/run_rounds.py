@@ -133,7 +133,9 @@ class _RoundsOnWorkers:
             self._take_judgement(outcome)
         else:
             offset = self._under_way[number].done
-            events = [numbered_from(event, offset) for event in self._slices.take(outcome)]
+            events = self._slices.take(outcome)
+            if offset:
+                events = [numbered_from(event, offset) for event in events]
             self._continue(number)
 
         if self._budget.exhausted is not None:

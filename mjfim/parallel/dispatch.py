@@ -198,13 +198,15 @@ class Dispatch(Generic[Order, T]):
     def _fill(self) -> None:
         """Submit orders while there are workers for them."""
         while len(self._running) < self._workers.window and self._has_waiting():
-            in_isolation = self._waiting[0].needs_isolation or any(
-                work.needs_isolation for work in self._running.values()
-            )
-            if in_isolation and self._running:
+            if self._running and (self._waiting[0].needs_isolation or self._is_isolated):
                 return
 
             self._submit(self._waiting.popleft())
+
+    @property
+    def _is_isolated(self) -> bool:
+        """True where an order runs that has to run alone."""
+        return len(self._running) == 1 and next(iter(self._running.values())).needs_isolation
 
     def _has_waiting(self) -> bool:
         """Check whether an order waits, and ask the source for one where none does."""

@@ -472,7 +472,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the random moments")
     for name, value in vars(QUICK).items():
         parser.add_argument(f"--{name}", type=type(value), help=f"default: {value}")
-    parser.add_argument("--simulated-starts", type=int, default=1024)
+    parser.add_argument("--simulated-starts", type=int, default=4096)
     parser.add_argument("--picture", type=Path, default=Path("out/scale.png"))
     return 0 if run(parser.parse_args()) else 1
 
