@@ -1,6 +1,6 @@
 """Files that a verb reads, looked at before the rooms are imported, which takes a second or more.
 
-A missing file is said at once. The rooms say the same of files that Python programs name.
+A missing file and a mistake in an experiment file are said at once. The rooms say the same of files that Python programs name.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def require_inputs(arguments: Mapping[str, Any]) -> None:
         arguments: Arguments of the verb by their names.
 
     Raises:
-        ExperimentError: The experiment file is missing, or is not TOML.
+        ExperimentError: The experiment file is missing, is not TOML, or has a wrong key or value.
         ModelError: The model is missing.
         RecordingError: A recording or a design is missing, or a path is not UTF-8.
     """
@@ -39,6 +39,12 @@ def require_inputs(arguments: Mapping[str, Any]) -> None:
     for path in (*(arguments.get("recordings") or ()), *(arguments.get("held_out") or ())):
         if path.suffix and not path.exists():
             raise RecordingError(f"{path}: no such file")
+
+    # The tables are checked last, because their module takes longer to import than all of the above.
+    if isinstance(experiment, Path) and not _is_stream(experiment):
+        from mjfim.experiment.schema import Experiment
+
+        Experiment.from_file(experiment)
 
 
 def _is_stream(path: Path) -> bool:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import QUATERNION, split_unit
+from mjfim.plant.state_space import logarithm
 from mjfim.records.labels import Labels
 
 # Angle of a whole turn [rad].
@@ -49,7 +49,7 @@ def rotation_vectors(quaternions: Array) -> Array:
     Returns:
         (n, 3) rotation vectors [rad].
     """
-    vectors = np.array(Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_rotvec())
+    vectors = logarithm(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
     angles = np.linalg.norm(vectors, axis=1)
     for k in range(1, len(vectors)):
         if angles[k] == 0.0:

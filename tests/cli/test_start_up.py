@@ -9,6 +9,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -102,6 +103,24 @@ def test_help_and_misuse_import_nothing_slow() -> None:
     report = imported([*helps, *misuses], SLOW)
     assert [row for row in report if row[2]] == []
     assert [code for _, code, _ in report] == [0] * (1 + len(helps)) + [2] * len(misuses)
+
+
+def test_a_wrong_key_is_said_before_the_engine_is_imported(tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text('model = "gone.xml"\nhorizn = 4.0\n')
+    report = imported(
+        [[verb, str(wrong)] for verb in ("check", "validate", "simulate")],
+        tuple(name for name in SLOW if name != "numpy"),
+    )
+    assert [row for row in report if row[2]] == []
+    assert [code for _, code, _ in report] == [0, 2, 2, 2]
+
+
+@pytest.mark.slow
+def test_a_design_imports_only_the_parts_of_scipy_that_it_needs(tmp_path: Path) -> None:
+    words = ["design", str(MODELS / "cart_pendulum.toml"), "-o", str(tmp_path / "out")]
+    unused = ("scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.stats", "pandas")
+    assert [found for _, _, found in imported([words], unused)] == [[], []]
 
 
 @pytest.mark.slow

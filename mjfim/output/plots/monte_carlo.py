@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError
+from mjfim.output.distributions import normal_density
 from mjfim.output.plots.style import (
     MUTED_COLOUR,
     NORMAL_FONT,
@@ -280,11 +280,6 @@ def _densities(values: Array, limits: tuple[float, float]) -> tuple[Array, Array
     return counts / (count * widths), edges
 
 
-def _normal_density(x: Array, mean: float, std: float) -> Array:
-    """Return the density of a normal distribution at x (n,)."""
-    return np.asarray(norm.pdf(x, loc=mean, scale=std), dtype=np.float64)
-
-
 def _draw_histogram(
     axes: Axes, study: MonteCarloStudy, trajectory: str, index: int, unit: str
 ) -> None:
@@ -305,7 +300,7 @@ def _draw_histogram(
     axes.stairs(heights, edges, color=colour, linewidth=0.8)
     if np.isfinite(std) and std > 0.0:
         x = np.linspace(low, high, CURVE_POINTS)
-        axes.plot(x, _normal_density(x, theta, std), color=TEXT_COLOUR, linewidth=1.4)
+        axes.plot(x, normal_density(x, theta, std), color=TEXT_COLOUR, linewidth=1.4)
     axes.axvline(theta, color=TEXT_COLOUR, linewidth=1.2, linestyle="--")
     axes.set_xlim(low, high)
     axes.locator_params(axis="x", nbins=6)

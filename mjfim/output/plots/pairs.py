@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from mjfim.arrays import Array
+from mjfim.output.distributions import normal_density
 from mjfim.output.plots.check import colour_of_source, duration
 from mjfim.output.plots.style import (
     IDENTIFIED_COLOUR,
@@ -215,7 +215,7 @@ def _shown_parameters(estimates: _Estimates) -> NDArray[np.intp]:
 def _draw_density(axes: Axes, shown: _Estimates, i: int) -> None:
     """Draw the normal density of one parameter."""
     x = np.linspace(-RANGE, RANGE, CURVE_POINTS)
-    density = norm.pdf(x)
+    density = normal_density(x)
     axes.fill_between(x, density, color=shown.colour, alpha=0.25, linewidth=0.0)
     axes.plot(x, density, color=shown.colour)
 

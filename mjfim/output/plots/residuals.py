@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from scipy.stats import chi2
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
+from mjfim.output.distributions import chi_squared_quantiles
 from mjfim.output.plots.recording_fit import shown_outputs
 from mjfim.output.plots.style import (
     GRID_COLOUR,
@@ -175,7 +175,7 @@ def _draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) ->
     # The first and the last frequency have half the density and are left out.
     white_density = 1.0 / max(float(frequencies[-1]), 1e-300)
     f, relative = frequencies[1:-1], density[1:-1] / white_density
-    low, high = freedom / chi2.ppf([0.975, 0.025], freedom)
+    low, high = (freedom / value for value in chi_squared_quantiles((0.975, 0.025), freedom))
     axes.fill_between(
         f, low * relative, high * relative, color=MEASURED_COLOUR, alpha=0.25, linewidth=0.0
     )

@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from scipy.stats import binom
 
 from mjfim.output.plots import style
 from mjfim.output.vocabulary import NOMINAL
@@ -192,6 +191,8 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
 
 def _draw_coverage(axes: Axes, result: Robustness) -> None:
     """Draw how often the interval of each unknown holds the true value."""
+    from scipy.stats import binom  # slow, and only this picture needs it
+
     n = result.runs
     x = np.arange(len(result.names))
     share = 100.0 * result.inside / n

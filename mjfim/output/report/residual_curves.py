@@ -8,6 +8,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.identification.lagged_products import lagged_products
+from mjfim.output.distributions import chi_squared_quantiles
 from mjfim.records.estimate import Estimate
 
 # Largest number of lags of an autocorrelation.
@@ -76,8 +77,6 @@ class Residuals:
 
     def spectrum(self) -> tuple[Array, Array, tuple[float, float]]:
         """Return frequencies [Hz], power over that of white noise, and its range of 95 %."""
-        from scipy.stats import chi2
-
         from mjfim.output.welch import density_of
 
         # At least four segments of the shortest recording make the curve smooth.
@@ -95,5 +94,6 @@ class Residuals:
         # White noise of unit variance has the density 2 / rate on one side. The first and the last
         # frequency have half of it and are left out.
         relative = 0.5 * self.rate * total / segments
-        low, high = chi2.ppf([0.025, 0.975], 2.0 * segments) / (2.0 * segments)
-        return frequencies[1:-1], relative[1:-1], (float(low), float(high))
+        freedom = 2.0 * segments
+        low, high = chi_squared_quantiles((0.025, 0.975), freedom)
+        return frequencies[1:-1], relative[1:-1], (low / freedom, high / freedom)

@@ -13,7 +13,6 @@ from functools import cached_property
 import mujoco
 import numpy as np
 import rerun as rr
-from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 from mjfim.output.rerun.panels import dof_positions, plot_size
@@ -31,6 +30,7 @@ from mjfim.output.rerun.scene import (
 from mjfim.output.rerun.series import Curve, Range, range_with_limits
 from mjfim.output.rerun.shapes import SOLID, DrawnShape, RobotStyle, drawn_shapes
 from mjfim.output.rerun.strips import StripPlot
+from mjfim.plant.state_space import quaternion_product
 from mjfim.records.design import Design
 from mjfim.records.iterates import IterateMotion, IterateMotions
 from mjfim.records.trajectory import Trajectory
@@ -41,6 +41,9 @@ POSES = 4
 # A plot reaches to the limits if its range is then at most this many times as large: less than in
 # plots that show no change of the curves.
 LARGEST_ZOOM = 3.0
+
+# What turns a unit quaternion, wxyz, into its inverse.
+CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 # Thickness of the curve of the initial trajectory relative to that of an iterate.
 INITIAL_WIDTH = 0.6
@@ -186,14 +189,15 @@ def log_poses_of_iterates(
     for body in filter(lambda b: is_moving(model, b), range(1, model.nbody)):
         parts = body_parts(model, root, body)
         place = poses.positions[:, body]
-        turn = Rotation.from_quat(np.roll(poses.quaternions[:, body], -1, axis=1))
+        turn = poses.quaternions[:, body]
         first = rows[:, 0]
-        columns = rr.Transform3D.columns(translation=place[first], quaternion=turn[first].as_quat())
+        columns = rr.Transform3D.columns(translation=place[first], quaternion=_xyzw(turn[first]))
         rec.send_columns(entity_path(parts), [iterations], columns, strict=True)
 
         for shape in drawn_shapes(model, body, style):
-            offset = Rotation.from_quat(np.roll(shape.quaternion, -1))
-            translations, quaternions = _repeated(place, turn, shape.position, offset, rows)
+            translations, quaternions = _repeated(
+                place, turn, shape.position, shape.quaternion, rows
+            )
             _send_instances(rec, parts, shape, iterations, translations, quaternions)
 
     if end is not None:
@@ -232,25 +236,36 @@ def _send_instances(
 
 
 def _repeated(
-    place: Array, turn: Rotation, position: Array, offset: Rotation, rows: Array
+    place: Array, turn: Array, position: Array, offset: Array, rows: Array
 ) -> tuple[Array, Array]:
     """Poses of a shape at several samples, in its own frame at the first of them.
 
     Args:
         place: (samples, 3) origins of the body [m].
-        turn: Its orientations.
+        turn: (samples, 4) its orientations, wxyz.
         position: (3,) origin of the shape in the frame of the body [m].
-        offset: Its orientation there.
+        offset: (4,) its orientation there, wxyz.
         rows: (m, POSES) samples.
 
     Returns:
         (m * POSES, 3) translations [m] and (m * POSES, 4) quaternions, xyzw.
     """
     at, first = rows.ravel(), np.repeat(rows[:, 0], rows.shape[1])
-    origins = place + turn.apply(position)
-    turns = turn * offset
-    back = turns[first].inv()
-    return back.apply(origins[at] - origins[first]), (back * turns[at]).as_quat()
+    origins = place + _turned(position, turn)
+    turns = quaternion_product(turn, offset)
+    back = turns[first] * CONJUGATE
+    return _turned(origins[at] - origins[first], back), _xyzw(quaternion_product(back, turns[at]))
+
+
+def _turned(points: Array, turns: Array) -> Array:
+    """Turn points (..., 3) by unit quaternions (..., 4), wxyz."""
+    real, vector = turns[..., :1], turns[..., 1:]
+    return points + 2.0 * np.cross(vector, np.cross(vector, points) + real * points)
+
+
+def _xyzw(quaternions: Array) -> Array:
+    """Order quaternions (..., 4), wxyz, as Rerun does."""
+    return np.roll(quaternions, -1, axis=-1)
 
 
 def _log_paths(
