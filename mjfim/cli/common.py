@@ -229,8 +229,11 @@ LiveView = Annotated[
     ),
 ]
 
-# Folders that the running verb has claimed; they are given back at its end.
+# What ends with the running verb: folders that it has claimed, and a process that draws.
 _claims = ExitStack()
+
+# True in the program `mjfim`.
+_may_start_processes = False
 
 
 def claim_folder(
@@ -328,6 +331,25 @@ def write_wanted_video(video: Path | None, system: System, result: Filmed) -> No
         errors.print(f"wrote {video}: {written.caption}", markup=False)
 
     write_optional(str(video), write)
+
+
+def permit_processes() -> None:
+    """Let verbs draw in processes of their own from now on, as in the program `mjfim`.
+
+    Where another program calls verbs, as tests do, a process for each call takes too long.
+    """
+    global _may_start_processes
+    _may_start_processes = True
+
+
+def draw_elsewhere() -> None:
+    """Let another process draw the pictures of the running verb, and import what it needs now."""
+    if not _may_start_processes:
+        return
+
+    from mjfim.output.drawing import drawing_elsewhere
+
+    _claims.enter_context(drawing_elsewhere())
 
 
 def keep_result(folder: Path | None = None) -> None:

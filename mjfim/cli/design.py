@@ -25,6 +25,7 @@ from mjfim.cli.common import (
     VideoFile,
     claim_folder,
     claim_video,
+    draw_elsewhere,
     errors,
     is_elsewhere,
     print_result,
@@ -102,6 +103,7 @@ def design(
     executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Design the excitation that gives the most information about the parameters."""
+    draw_elsewhere()
     from mjfim.excitation.design import design_budget, design_task
     from mjfim.excitation.task import DesignTask
     from mjfim.excitation.task_parts import require_design_keys

@@ -25,7 +25,7 @@ from mjfim.cli import (  # noqa: F401 - each registers its verbs
     simulate,
     validate,
 )
-from mjfim.cli.common import app, replace_unencodable_characters
+from mjfim.cli.common import app, permit_processes, replace_unencodable_characters
 
 # Verbs in the order in which the help lists them, which is the order of an experiment.
 ORDER = (
@@ -58,5 +58,6 @@ app.registered_commands.sort(key=lambda command: _place(command.name))
 def main() -> NoReturn:
     """Run the command line, the entry point of `mjfim`."""
     replace_unencodable_characters()
+    permit_processes()
     app(prog_name="mjfim")
     sys.exit(0)

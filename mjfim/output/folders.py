@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.interruption import current_interruption
 from mjfim.output import archive, latex, markdown, plots, video
 from mjfim.output import rerun as rerun_log
+from mjfim.output.drawing import begin_pictures, picture_contents
 from mjfim.output.mjcf.edited_files import copies_of_included_files
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.optional_files import write_guarded, write_optional
@@ -205,27 +207,41 @@ def write_design_folder(
         system: The experiment for which it was made.
         picture_format: Format of the pictures.
     """
-    archive.write_design(folder, design, system)
-    write_tables(folder, design)
+    # Other processes draw the pictures and the video, while this one writes the other files.
+    begin_pictures(design, picture_format)
+    with _video_begun(system, design) as drawn:
+        archive.write_design(folder, design, system)
+        write_tables(folder, design)
 
-    write_optional(REPORT, lambda: write_report(folder, Design))
-    _write_figures(folder, design, picture_format)
-    write_optional("design.rrd", lambda: _write_design_log(folder, design, system))
-    write_optional("the video", lambda: _add_video(folder, design, system))
+        write_optional(REPORT, lambda: write_report(folder, Design))
+        write_optional("design.rrd", lambda: _write_design_log(folder, design, system))
+        _write_figures(folder, design, picture_format)
+        write_optional("the video", lambda: _add_video(folder, design, drawn))
 
 
-def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
-    """Write the report once more, with a video or with the sentence why there is none.
+def _video_begun(
+    system: System, result: Design | Estimate
+) -> AbstractContextManager[video.VideoBegun | None]:
+    """Begin to draw the video of a report; who has pressed Ctrl-C does not wait for one."""
+    return nullcontext() if _is_interrupted() else video.VideoBegun(system, result)
 
-    Who has pressed Ctrl-C does not wait for a video.
-    """
-    interruption = current_interruption()
-    if interruption is not None and interruption.presses:
+
+def _add_video(
+    folder: Path, result: Design | Estimate, begun: video.VideoBegun | None
+) -> None:
+    """Write the report once more, with its video or with the sentence why there is none."""
+    if begun is None or _is_interrupted():
         return
 
     begin_stage("drawing the video of the report")
-    found, sentence = video.video_for_report(system, result)
+    found, sentence = begun.result()
     write_report(folder, type(result), found, sentence, made=result)
+
+
+def _is_interrupted() -> bool:
+    """Whether the user has pressed Ctrl-C."""
+    interruption = current_interruption()
+    return interruption is not None and interruption.presses > 0
 
 
 def _write_design_log(folder: Path, design: Design, system: System) -> None:
@@ -329,10 +345,11 @@ def write_estimate_folder(
     except ModelError as error:
         remarks.append(str(error))
 
-    write_optional(REPORT, lambda: write_report(folder, Estimate, made=estimate))
-    _write_figures(folder, estimate, picture_format)
-    write_optional("estimate.rrd", lambda: _write_estimate_log(folder, estimate, system))
-    write_optional("the video", lambda: _add_video(folder, estimate, system))
+    with _video_begun(system, estimate) as drawn:
+        write_optional(REPORT, lambda: write_report(folder, Estimate, made=estimate))
+        _write_figures(folder, estimate, picture_format)
+        write_optional("estimate.rrd", lambda: _write_estimate_log(folder, estimate, system))
+        write_optional("the video", lambda: _add_video(folder, estimate, drawn))
     return remarks
 
 
@@ -393,7 +410,14 @@ def _write_tables(folder: Path, record: ShownRecord) -> None:
 
 
 def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
-    """Write all figures of a result."""
+    """Write all figures of a result, which another process may have drawn."""
+    contents: dict[str, bytes] = {}
+    write_optional("the pictures", lambda: contents.update(picture_contents(record)))
+    if contents:
+        writers = {name: partial(_write_content, content) for name, content in contents.items()}
+        _write_picture_files(folder, writers, picture_format)
+        return
+
     from mjfim.output.plots.pictures import pictures_of  # imports matplotlib, which is slow
 
     write_pictures(folder, pictures_of(record), picture_format)
@@ -407,12 +431,29 @@ def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureForm
         pictures: Functions that draw, by name of the picture.
         picture_format: Format of the pictures.
     """
-    others = "|".join(other for other in PictureFormat if other is not picture_format)
-    _clear(folder, rf"({'|'.join(re.escape(name) for name in pictures)})\.({others})")
+    writers = {name: partial(_write_picture, draw) for name, draw in pictures.items()}
+    _write_picture_files(folder, writers, picture_format)
 
-    for name, draw in pictures.items():
+
+def _write_picture_files(
+    folder: Path, writers: Mapping[str, Callable[[Path], None]], picture_format: PictureFormat
+) -> None:
+    """Write pictures by functions that get the name of the file.
+
+    Those of an earlier run in another format are removed.
+    """
+    others = "|".join(other for other in PictureFormat if other is not picture_format)
+    _clear(folder, rf"({'|'.join(re.escape(name) for name in writers)})\.({others})")
+
+    for name, write in writers.items():
         file = folder / picture_format.file_of(name)
-        write_optional(file.name, partial(_write_picture, draw, file))
+        write_optional(file.name, partial(write, file))
+
+
+def _write_content(content: bytes, file: Path) -> None:
+    """Write a picture that is drawn."""
+    with replacing(file) as temporary:
+        temporary.write_bytes(content)
 
 
 def _write_picture(draw: DrawPicture, file: Path) -> None:

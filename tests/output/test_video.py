@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.output import vocabulary
-from mjfim.output.video import NoVideoError, picture, rendering
+from mjfim.output.video import NoVideoError, VideoBegun, picture, rendering
 from mjfim.output.video.film import (
     Film,
     film_of_estimate,
@@ -25,7 +25,6 @@ from mjfim.output.video.film import (
 )
 from mjfim.output.video.record import Video, format_of
 from mjfim.output.video.rendering import Effort, back_ends, render
-from mjfim.output.video.results import video_for_report
 from mjfim.records.trajectory import Trajectory
 from tests.support.paths import MODELS
 
@@ -184,14 +183,17 @@ class TestVideo:
         """Nothing is drawn while tests run, see `tests/conftest.py`."""
         system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
         resting = motion(np.array([0.0, 1.0]), np.zeros((2, 2)))
-        assert video_for_report(system, resting) == (
+        with VideoBegun(system, resting) as begun:
+            drawn = begun.result()
+        assert drawn == (
             None,
             "There is no video of the robot: the variable MUJOCO_GL turns drawing off.",
         )
 
         # A motion that diverged cannot be drawn anywhere.
         diverged = motion(np.array([0.0, 1.0]), np.full((2, 2), np.nan))
-        video, sentence = video_for_report(system, diverged)
+        with VideoBegun(system, diverged) as begun:
+            video, sentence = begun.result()
         assert video is None
         assert "positions that are not finite" in sentence
 

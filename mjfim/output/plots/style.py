@@ -577,7 +577,6 @@ def trajectory_handles() -> list[Line2D]:
     ]
 
 
-@own_style
 def save(figure: Figure, path: str | os.PathLike[str], dpi: float | None = None) -> Path:
     """Write a figure in one step: readers find the old file or the complete new one.
 
@@ -600,10 +599,24 @@ def save(figure: Figure, path: str | os.PathLike[str], dpi: float | None = None)
             f"valid: {', '.join(f'.{known}' for known in PictureFormat)}"
         )
 
+    with replacing(target) as temporary:
+        temporary.write_bytes(content(figure, format_name, dpi))
+    return target
+
+
+@own_style
+def content(figure: Figure, format_name: str, dpi: float | None = None) -> bytes:
+    """Return a figure as the content of a file.
+
+    Args:
+        figure: The figure.
+        format_name: Format of the file: png, svg or pdf.
+        dpi: Resolution [pixels/inch]. Default: that of the style sheet.
+    """
     # Files of equal figures are equal, so they do not hold the time at which they were written.
     metadata = DATELESS.get(format_name)
-    with replacing(target) as temporary:
-        figure.savefig(
-            temporary, format=format_name, dpi=dpi or STYLE_SHEET["savefig.dpi"], metadata=metadata
-        )
-    return target
+    stream = io.BytesIO()
+    figure.savefig(
+        stream, format=format_name, dpi=dpi or STYLE_SHEET["savefig.dpi"], metadata=metadata
+    )
+    return stream.getvalue()

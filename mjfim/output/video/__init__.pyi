@@ -1,8 +1,8 @@
+from .begun import VideoBegun
 from .record import NoVideoError, Video
-from .results import video_for_report
 
 __all__ = [
     "NoVideoError",
     "Video",
-    "video_for_report",
+    "VideoBegun",
 ]

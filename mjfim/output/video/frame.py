@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.resources import as_file, files
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,5 +85,8 @@ class FrameLayout:
 
 def _font(name: str, size: int) -> ImageFont.FreeTypeFont:
     """A font that comes with matplotlib, so that it is the same on every computer."""
-    with as_file(files("matplotlib") / "mpl-data" / "fonts" / "ttf" / name) as file:
-        return ImageFont.truetype(file, size)
+    # The package is only looked for, because its import takes longer than a second of film.
+    spec = find_spec("matplotlib")
+    assert spec is not None and spec.origin is not None
+    fonts = Path(spec.origin).parent / "mpl-data" / "fonts" / "ttf"
+    return ImageFont.truetype(fonts / name, size)

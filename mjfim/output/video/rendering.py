@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjfim.budget import StopToken
 from mjfim.output.video.film import FRAME_RATE, Film, speed_text
 from mjfim.output.video.record import MEDIA_TYPES, Format, NoVideoError, Video, require_encoder
 
@@ -40,6 +42,9 @@ PROGRAM = (
 # Time that the other process may need beside drawing: to start, to open a context, and to write
 # the end of the file [s].
 START_SECONDS = 20.0
+
+# Period at which this process looks whether the drawing has to end [s].
+POLL_INTERVAL = 0.1
 
 # Values of the variable MUJOCO_GL that turn drawing off.
 TURNED_OFF = ("disable", "disabled", "off", "false", "0")
@@ -70,26 +75,29 @@ WANTED = Effort(seconds=60.0, fewest_frames=0.0)
 ADDED = Effort(seconds=2.0)
 
 
-def render(film: Film, kind: Format, effort: Effort = WANTED) -> Video:
+def render(
+    film: Film, kind: Format, effort: Effort = WANTED, stop: StopToken | None = None
+) -> Video:
     """Draw a film.
 
     Args:
         film: The film.
         kind: Format of the video.
         effort: What it may cost.
+        stop: Ends the drawing early.
 
     Returns:
         The video.
 
     Raises:
-        NoVideoError: Nothing can be drawn here, or not in time.
+        NoVideoError: Nothing can be drawn here, or not in time, or the drawing was ended.
     """
     require_encoder(kind)
     try:
         with tempfile.TemporaryDirectory(prefix="mjfim-video-") as name:
             folder = Path(name)
             _write_job(folder, film, kind, effort)
-            result = _drawn(folder, effort)
+            result = _drawn(folder, effort, stop or StopToken())
             data = (folder / f"film.{kind}").read_bytes()
     except OSError as error:
         raise NoVideoError(f"its temporary files cannot be written ({error})") from None
@@ -142,11 +150,11 @@ def _write_job(folder: Path, film: Film, kind: Format, effort: Effort) -> None:
     (folder / JOB_FILE).write_text(json.dumps(job), encoding="utf-8")
 
 
-def _drawn(folder: Path, effort: Effort) -> dict[str, Any]:
+def _drawn(folder: Path, effort: Effort, stop: StopToken) -> dict[str, Any]:
     """Let another process draw the film, with the first kind of context that works here."""
     deadline = time.monotonic() + START_SECONDS + 2.0 * effort.seconds
     for back_end in back_ends():
-        _run(folder, back_end, deadline - time.monotonic())
+        _run(folder, back_end, deadline, stop)
 
         # A process that found no context leaves no result.
         found = folder / RESULT_FILE
@@ -174,8 +182,9 @@ def back_ends() -> tuple[str, ...]:
     return (stated,) if stated else BACK_ENDS.get(platform.system(), OTHER_BACK_ENDS)
 
 
-def _run(folder: Path, back_end: str, seconds: float) -> None:
-    """Run the other process to its end, or end it when the time is over."""
+def _run(folder: Path, back_end: str, deadline: float, stop: StopToken) -> None:
+    """Run the other process to its end, or end it when the time is over or at a request."""
+    seconds = deadline - time.monotonic()
     if seconds <= 0.0:
         raise NoVideoError("drawing took too long")
 
@@ -194,8 +203,17 @@ def _run(folder: Path, back_end: str, seconds: float) -> None:
         start_new_session=True,
     ) as process:
         try:
-            process.wait(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            raise NoVideoError(f"drawing did not end within {seconds:.0f} s") from None
+            while not _has_ended(process):
+                if stop.requested:
+                    raise NoVideoError("drawing was ended")
+                if time.monotonic() > deadline:
+                    raise NoVideoError(f"drawing did not end within {seconds:.0f} s")
         finally:
             process.kill()
+
+
+def _has_ended(process: subprocess.Popen[bytes]) -> bool:
+    """Wait a while for the end of a process."""
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=POLL_INTERVAL)
+    return process.returncode is not None

@@ -14,14 +14,12 @@ from mjfim.output.video.film import (
     film_of_trajectories,
 )
 from mjfim.output.video.record import (
-    Format,
     NoVideoError,
     Video,
     format_of,
-    has_encoder,
     require_encoder,
 )
-from mjfim.output.video.rendering import ADDED, WANTED, render
+from mjfim.output.video.rendering import WANTED, render
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Trajectory
@@ -63,27 +61,6 @@ def write_video(path: Path, system: System, result: Filmed) -> Video:
     video = render(film_of(system, result), format_of(path), WANTED)
     video.save(path)
     return video
-
-
-def video_for_report(system: System, result: Filmed) -> tuple[Video | None, str]:
-    """Draw a video for a report, if that takes little time.
-
-    Args:
-        system: The experiment, resolved.
-        result: The result.
-
-    Returns:
-        The video or None, and the sentence that says why there is none.
-    """
-    # Every browser shows both; an mp4 is smaller.
-    kind: Format = "mp4" if has_encoder("mp4") else "webp"
-    try:
-        video = render(film_of(system, result), kind, ADDED)
-        if len(video.data) > ADDED.max_bytes:
-            raise NoVideoError("its file is larger than 2 MB")
-    except NoVideoError as reason:
-        return None, f"There is no video of the robot: {reason}."
-    return video, ""
 
 
 def film_of(system: System, result: Filmed) -> Film:

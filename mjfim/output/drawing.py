@@ -1,0 +1,138 @@
+"""Pictures that another process draws, while this one computes and writes other files.
+
+Matplotlib takes longer to import than a short design takes, and it draws in one thread. The other
+process only draws. This one writes the files, so that interruptions and files of the user are
+treated as everywhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, Future
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mjfim.output.picture_format import PictureFormat
+    from mjfim.records.shown import ShownRecord
+
+# Fewest processors with which another process saves time.
+FEWEST_CORES = 2
+
+
+class DrawingProcess:
+    """A process that has imported what draws, and draws the pictures of one record after the other.
+
+    It ends with the process that has started it, whatever happens to that one.
+    """
+
+    def __init__(self) -> None:
+        from mjfim.parallel import Pool
+
+        self._pool = Pool(1)
+        self._pool.submit(_import_what_draws)
+        self._begun: tuple[ShownRecord, Future[dict[str, bytes]]] | None = None
+
+    def begin(self, record: ShownRecord, picture_format: PictureFormat) -> None:
+        """Begin to draw all pictures of a record.
+
+        Args:
+            record: The record; it is copied to the process.
+            picture_format: Format of the pictures.
+        """
+        self._begun = record, self._pool.submit(_contents, record, picture_format)
+
+    def contents(self, record: ShownRecord) -> dict[str, bytes]:
+        """Wait for the pictures of a record.
+
+        Args:
+            record: The record.
+
+        Returns:
+            The contents of the files by the names of the pictures; empty where drawing was not
+            begun, where a picture could not be drawn, and where the process was ended from outside.
+        """
+        if self._begun is None or self._begun[0] is not record:
+            return {}
+        try:
+            return self._begun[1].result()
+        except BrokenExecutor:
+            return {}
+
+    def end(self) -> None:
+        """End the process at once."""
+        self._pool.end_running()
+
+
+# The process that draws now; None where this process draws itself.
+_process: ContextVar[DrawingProcess | None] = ContextVar("drawing", default=None)
+
+
+@contextmanager
+def drawing_elsewhere() -> Iterator[None]:
+    """Let another process draw the pictures that are begun in the context.
+
+    On a computer with a single processor this has no effect.
+    """
+    from mjfim.parallel import cores
+
+    if cores() < FEWEST_CORES:
+        yield
+        return
+
+    process = DrawingProcess()
+    token = _process.set(process)
+    try:
+        yield
+    finally:
+        _process.reset(token)
+        process.end()
+
+
+def begin_pictures(record: ShownRecord, picture_format: PictureFormat) -> None:
+    """Begin to draw the pictures of a record, if another process draws.
+
+    Args:
+        record: The record.
+        picture_format: Format of the pictures.
+    """
+    process = _process.get()
+    if process is not None:
+        process.begin(record, picture_format)
+
+
+def picture_contents(record: ShownRecord) -> dict[str, bytes]:
+    """Wait for the pictures of a record that were begun.
+
+    Args:
+        record: The record.
+
+    Returns:
+        The contents of the files by the names of the pictures; empty where this process has to draw
+        them, which also shows why one of them cannot be drawn.
+    """
+    process = _process.get()
+    return {} if process is None else process.contents(record)
+
+
+# ---- in the other process
+
+
+def _import_what_draws() -> None:
+    """Import all modules that draw pictures, before there is anything to draw."""
+    from mjfim.own_defaults import ignore_settings_of_this_folder
+
+    ignore_settings_of_this_folder()
+    from mjfim.output.plots import pictures, style  # noqa: F401
+
+
+def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, bytes]:
+    """Draw all pictures of a record; empty where one of them cannot be drawn."""
+    from mjfim.output.plots.pictures import pictures_of
+    from mjfim.output.plots.style import content
+
+    try:
+        return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}
+    except Exception:
+        return {}
