@@ -1,6 +1,7 @@
 """Files that a verb reads, looked at before the rooms are imported, which takes a second or more.
 
-A missing file and a mistake in an experiment file are said at once. The rooms say the same of files that Python programs name.
+A missing file and a mistake in an experiment file are said at once. The rooms say the same of files
+that Python programs name.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def require_inputs(arguments: Mapping[str, Any]) -> None:
         if path.suffix and not path.exists():
             raise RecordingError(f"{path}: no such file")
 
-    # The tables are checked last, because their module takes longer to import than all of the above.
+    # The tables are checked last, because their module takes longest to import.
     if isinstance(experiment, Path) and not _is_stream(experiment):
         from mjfim.experiment.schema import Experiment
 

@@ -226,9 +226,7 @@ def _video_begun(
     return nullcontext() if _is_interrupted() else video.VideoBegun(system, result)
 
 
-def _add_video(
-    folder: Path, result: Design | Estimate, begun: video.VideoBegun | None
-) -> None:
+def _add_video(folder: Path, result: Design | Estimate, begun: video.VideoBegun | None) -> None:
     """Write the report once more, with its video or with the sentence why there is none."""
     if begun is None or _is_interrupted():
         return

@@ -577,6 +577,7 @@ def trajectory_handles() -> list[Line2D]:
     ]
 
 
+@own_style
 def save(figure: Figure, path: str | os.PathLike[str], dpi: float | None = None) -> Path:
     """Write a figure in one step: readers find the old file or the complete new one.
 
@@ -600,23 +601,28 @@ def save(figure: Figure, path: str | os.PathLike[str], dpi: float | None = None)
         )
 
     with replacing(target) as temporary:
-        temporary.write_bytes(content(figure, format_name, dpi))
+        _save(figure, temporary, format_name, dpi)
     return target
 
 
 @own_style
-def content(figure: Figure, format_name: str, dpi: float | None = None) -> bytes:
-    """Return a figure as the content of a file.
+def content(figure: Figure, format_name: str) -> bytes:
+    """Return what `save` writes to a file.
 
     Args:
         figure: The figure.
         format_name: Format of the file: png, svg or pdf.
-        dpi: Resolution [pixels/inch]. Default: that of the style sheet.
     """
-    # Files of equal figures are equal, so they do not hold the time at which they were written.
-    metadata = DATELESS.get(format_name)
     stream = io.BytesIO()
-    figure.savefig(
-        stream, format=format_name, dpi=dpi or STYLE_SHEET["savefig.dpi"], metadata=metadata
-    )
+    _save(figure, stream, format_name)
     return stream.getvalue()
+
+
+def _save(
+    figure: Figure, target: Path | io.BytesIO, format_name: str, dpi: float | None = None
+) -> None:
+    """Draw a figure. Files of equal figures are equal: they do not hold the present time."""
+    metadata = DATELESS.get(format_name)
+    figure.savefig(
+        target, format=format_name, dpi=dpi or STYLE_SHEET["savefig.dpi"], metadata=metadata
+    )

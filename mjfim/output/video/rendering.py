@@ -72,7 +72,7 @@ class Effort:
 
 # Effort of a video that the user asks for, and of one that is added to a report.
 WANTED = Effort(seconds=60.0, fewest_frames=0.0)
-ADDED = Effort(seconds=2.0)
+ADDED = Effort(seconds=1.0)
 
 
 def render(

@@ -1,0 +1,60 @@
+"""Pictures that another process draws are those that this one would draw."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+
+import pytest
+
+from mjfim.output import drawing
+from mjfim.output.drawing import begin_pictures, drawing_elsewhere, picture_contents
+from mjfim.output.picture_format import PictureFormat
+from mjfim.output.plots.pictures import pictures_of
+from mjfim.output.plots.style import content
+from tests.support import results
+
+
+def test_without_another_process_nothing_is_begun() -> None:
+    record = results.check()
+    begin_pictures(record, PictureFormat.PNG)
+    assert picture_contents(record) == {}
+
+
+def test_a_single_processor_starts_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mjfim.parallel.cores", lambda: 1)
+    with drawing_elsewhere():
+        assert drawing._process.get() is None
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_all_to_this_process() -> None:
+    """It draws them again, and so it can say what the fault is."""
+    without_figures: object = object()
+    assert drawing._contents(without_figures, PictureFormat.PNG) == {}  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_another_process_draws_the_same_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mjfim.parallel.cores", lambda: 2)
+    record, format_name = results.check(), PictureFormat.SVG
+    with drawing_elsewhere():
+        begin_pictures(record, format_name)
+        assert picture_contents(results.check()) == {}
+        found = picture_contents(record)
+    here = {name: content(draw(), format_name) for name, draw in pictures_of(record).items()}
+    assert found == here
+
+    # A process that is killed leaves the work to this one.
+    with drawing_elsewhere():
+        (child,) = multiprocessing.active_children()
+        assert child.pid is not None
+        os.kill(child.pid, signal.SIGTERM if os.name == "nt" else signal.SIGKILL)
+        begin_pictures(record, format_name)
+        assert picture_contents(record) in ({}, here)
+
+    deadline = time.monotonic() + 60.0
+    while multiprocessing.active_children() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert multiprocessing.active_children() == []
