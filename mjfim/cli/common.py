@@ -343,13 +343,18 @@ def permit_processes() -> None:
 
 
 def draw_elsewhere() -> None:
-    """Let another process draw the pictures of the running verb, and import what it needs now."""
+    """Let other processes draw the pictures and the video of the running verb's result.
+
+    They import what they need while the verb works.
+    """
     if not _may_start_processes:
         return
 
     from mjfim.output.drawing import drawing_elsewhere
+    from mjfim.output.video.process import process_waiting
 
     _claims.enter_context(drawing_elsewhere())
+    _claims.enter_context(process_waiting())
 
 
 def keep_result(folder: Path | None = None) -> None:

@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.output import vocabulary
-from mjfim.output.video import NoVideoError, VideoBegun, picture, rendering
+from mjfim.output.video import NoVideoError, VideoBegun, picture, process, rendering
 from mjfim.output.video.film import (
     Film,
     film_of_estimate,
@@ -23,8 +23,9 @@ from mjfim.output.video.film import (
     film_speed,
     positions_at,
 )
+from mjfim.output.video.process import back_ends
 from mjfim.output.video.record import Video, format_of
-from mjfim.output.video.rendering import Effort, back_ends, render
+from mjfim.output.video.rendering import Effort, render
 from mjfim.records.trajectory import Trajectory
 from tests.support.paths import MODELS
 
@@ -197,6 +198,24 @@ class TestVideo:
         assert video is None
         assert "positions that are not finite" in sentence
 
+    def test_a_process_that_waits_draws_the_first_film_and_ends(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """One that nobody needs ends with its context."""
+        monkeypatch.setattr(process, "PROGRAM", "import sys; print(sys.stdin.readline())")
+        with process.process_waiting():
+            assert process._waiting == {}  # drawing is turned off while tests run
+
+        monkeypatch.setenv("MUJOCO_GL", "egl")
+        with process.process_waiting():
+            (waiting,) = process._waiting.values()
+            with process.process_for(tmp_path, "egl") as drawing:
+                assert drawing is waiting
+                assert drawing.wait(timeout=60.0) == 0
+        with process.process_waiting():
+            (waiting,) = process._waiting.values()
+        assert waiting.poll() is not None
+
     def test_a_stated_context_is_the_only_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("MUJOCO_GL", "egl")
         assert back_ends() == ("egl",)
@@ -216,7 +235,7 @@ class TestVideo:
     def test_a_driver_that_hangs_is_ended(
         self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(rendering, "PROGRAM", "import time; time.sleep(600.0)")
+        monkeypatch.setattr(process, "PROGRAM", "import time; time.sleep(600.0)")
         monkeypatch.setattr(rendering, "START_SECONDS", 0.1)
         quick = Effort(seconds=0.1)
         with pytest.raises(NoVideoError, match=r"did not end within|took too long"):

@@ -11,7 +11,6 @@ import json
 import os
 import platform
 import subprocess
-import sys
 import tempfile
 import time
 from contextlib import suppress
@@ -24,20 +23,11 @@ import numpy as np
 
 from mjfim.budget import StopToken
 from mjfim.output.video.film import FRAME_RATE, Film, speed_text
+from mjfim.output.video.process import back_ends, process_for
 from mjfim.output.video.record import MEDIA_TYPES, Format, NoVideoError, Video, require_encoder
-
-# Kinds of OpenGL contexts by system, in the order in which they are tried: without a display first.
-BACK_ENDS = {"Linux": ("egl", "osmesa", "glfw")}
-OTHER_BACK_ENDS = ("",)
 
 # Names of the files that the two processes exchange.
 MODEL_FILE, ARRAYS_FILE, JOB_FILE, RESULT_FILE = "model.mjb", "film.npz", "job.json", "result.json"
-
-# Program of the other process. It searches modules in the same places as this one.
-PROGRAM = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from mjfim.output.video.worker import main; main(sys.argv[2])"
-)
 
 # Time that the other process may need beside drawing: to start, to open a context, and to write
 # the end of the file [s].
@@ -46,13 +36,9 @@ START_SECONDS = 20.0
 # Period at which this process looks whether the drawing has to end [s].
 POLL_INTERVAL = 0.1
 
-# Values of the variable MUJOCO_GL that turn drawing off.
-TURNED_OFF = ("disable", "disabled", "off", "false", "0")
-
 # Reasons why there is no video. They are complete parts of a sentence.
 NO_RENDERER = "MuJoCo can draw nothing on this computer, because it has no usable OpenGL"
 NO_RENDERER_ON_LINUX = f"{NO_RENDERER}; the packages libegl1 and libgl1-mesa-dri are enough"
-IS_TURNED_OFF = "the variable MUJOCO_GL turns drawing off"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,38 +156,13 @@ def _drawn(folder: Path, effort: Effort, stop: StopToken) -> dict[str, Any]:
     raise NoVideoError(NO_RENDERER_ON_LINUX if platform.system() == "Linux" else NO_RENDERER)
 
 
-def back_ends() -> tuple[str, ...]:
-    """List the kinds of contexts to try: that of the variable MUJOCO_GL, or those of the system.
-
-    Raises:
-        NoVideoError: The variable turns drawing off.
-    """
-    stated = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if stated in TURNED_OFF:
-        raise NoVideoError(IS_TURNED_OFF)
-    return (stated,) if stated else BACK_ENDS.get(platform.system(), OTHER_BACK_ENDS)
-
-
 def _run(folder: Path, back_end: str, deadline: float, stop: StopToken) -> None:
     """Run the other process to its end, or end it when the time is over or at a request."""
     seconds = deadline - time.monotonic()
     if seconds <= 0.0:
         raise NoVideoError("drawing took too long")
 
-    environment = {**os.environ, "MUJOCO_GL": back_end}
-    if back_end == "":
-        environment.pop("MUJOCO_GL")
-    command = [sys.executable, "-P", "-c", PROGRAM, json.dumps(sys.path), str(folder)]
-
-    # In a session of its own, Ctrl-C reaches only this process, which then ends the other one.
-    with subprocess.Popen(
-        command,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    ) as process:
+    with process_for(folder, back_end) as process:
         try:
             while not _has_ended(process):
                 if stop.requested:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -89,13 +90,17 @@ class Drawing:
         self._painter.close()
 
 
-def main(name: str) -> None:
+def main() -> None:
     """Draw the film of a folder, and write the video and the result there.
 
-    Args:
-        name: The folder.
+    The name of the folder is the first line of standard input, which ends before where there is no
+    film.
     """
-    folder = Path(name)
+    line = sys.stdin.readline()
+    if not line:
+        return
+
+    folder = Path(json.loads(line))
     job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
     with np.load(folder / "film.npz") as stored:
         arrays = dict(stored)
