@@ -412,6 +412,7 @@ def test_a_start_that_cannot_be_shrunk_inside_is_steered(tmp_path: Path) -> None
     assert_ends(task, design)
 
 
+@pytest.mark.slow
 def test_limits_that_no_control_can_keep_end_as_infeasible(tmp_path: Path) -> None:
     """The pendulum falls faster than allowed, whatever the weak motor does; a warning says so."""
     weak = {**HARD, "control": {"force": (-0.05, 0.05)}, "velocity": {"hinge": 0.41}}

@@ -262,7 +262,9 @@ class CtrlC:
         self.checks_of_search = self.checks
 
 
-@pytest.mark.parametrize("number", [1, 4, 7])
+@pytest.mark.parametrize(
+    "number", [1, *(pytest.param(later, marks=pytest.mark.slow) for later in (4, 7))]
+)
 def test_an_interruption_after_the_search_keeps_the_estimate(
     task: DesignTask, recording: Recording, number: int
 ) -> None:

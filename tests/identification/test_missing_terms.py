@@ -38,10 +38,10 @@ def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> 
 @pytest.mark.parametrize(
     ("added", "path", "amount"),
     [
-        ('damping="0.6"', "joint/slide:damping", 0.6),
         ('frictionloss="0.5"', "joint/slide:frictionloss", 0.5),
-        ('stiffness="2"', "joint/slide:stiffness", 2.0),
-        ('armature="0.5"', "joint/slide:armature", 0.5),
+        pytest.param('damping="0.6"', "joint/slide:damping", 0.6, marks=pytest.mark.slow),
+        pytest.param('stiffness="2"', "joint/slide:stiffness", 2.0, marks=pytest.mark.slow),
+        pytest.param('armature="0.5"', "joint/slide:armature", 0.5, marks=pytest.mark.slow),
     ],
 )
 def test_the_missing_term_comes_first_and_in_about_its_size(

@@ -28,7 +28,16 @@ def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N
     return whiteness_of("y", [autoregressive(phi, count, rng) + extra])
 
 
-@pytest.mark.parametrize("lengths", [(40,), (400,), (3000,), (700, 90, 1300), tuple([60] * 30)])
+@pytest.mark.parametrize(
+    "lengths",
+    [
+        (40,),
+        (400,),
+        (3000,),
+        (700, 90, 1300),
+        pytest.param(tuple([60] * 30), marks=pytest.mark.slow),
+    ],
+)
 def test_white_noise_rarely_fails(lengths: tuple[int, ...]) -> None:
     """The rate of false alarms is at most the level, within the scatter of the draws."""
     rng = np.random.default_rng(len(lengths))
