@@ -16,7 +16,7 @@ from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.rounds import Judge, Judgement
 from mjfim.excitation.run_result import RunResult
-from mjfim.excitation.search_slices import SearchSlice
+from mjfim.excitation.search_slices import SealedState, SearchSlice
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.kept import KeptPerThread
 
@@ -28,13 +28,15 @@ class JudgeOrder:
     Attributes:
         judge: Who judges it.
         result: The result, without its history.
-        search: The search on the stated level; its start is that of the round.
+        begun: Control with which the round began.
+        stated: A search on the stated level, of which the worker makes the cost once.
         task_key: Text that is equal for searches on the same task.
     """
 
     judge: Judge
     result: RunResult
-    search: ConstrainedSearch
+    begun: InitialControl
+    stated: SealedState[ConstrainedSearch]
     task_key: str
 
 
@@ -80,11 +82,12 @@ def counted_judgement(
 @one_blas_thread()
 def _judge_in_worker(order: JudgeOrder) -> Judgement:
     """Judge a result in a worker."""
-    task = task_in_worker(order.task_key, order.search)
 
     def made() -> LimitedCost:
         """The cost on the stated plant."""
-        return LimitedCost(level=DescentLevel(task, order.search.combinations))
+        search = order.stated.opened()
+        task = task_in_worker(order.task_key, search)
+        return LimitedCost(level=DescentLevel(task, search.combinations))
 
     cost = _costs.get(order.task_key, made)
-    return counted_judgement(order.judge, cost, order.result, order.search.start)
+    return counted_judgement(order.judge, cost, order.result, order.begun)

@@ -11,14 +11,14 @@ from dataclasses import replace
 from typing import Any
 
 from mjfim.budget import Budget
-from mjfim.excitation.constrained import ConstrainedSlice
+from mjfim.excitation.constrained import ConstrainedSearch, ConstrainedSlice
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.judging import JudgeOrder, counted_judgement, work_of_round
 from mjfim.excitation.merged_results import continued, numbered_from
 from mjfim.excitation.rounds import Entry, Judge, Judgement, RoundPlan
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.running_rounds import EndedSearch, RunningRounds
-from mjfim.excitation.search_slices import SearchSlice
+from mjfim.excitation.search_slices import SealedState, SearchSlice
 from mjfim.excitation.sliced_searches import SlicedSearches
 from mjfim.excitation.winner_repair import SECONDS_AFTER_STOP
 from mjfim.parallel import Dispatch, ExecutorLike, NumberedOrder, Outcome, Workers
@@ -88,6 +88,9 @@ class _RoundsOnWorkers:
         self._budget = plan.searches.budget
         self._late = _LateResults(plan, self.rounds)
         self._slices = SlicedSearches[ConstrainedSlice]()
+
+        # A search on the stated level, which is the same for all judgements.
+        self._stated: SealedState[ConstrainedSearch] | None = None
 
         # Searches that have begun and are not judged, and those of them that have ended.
         self._under_way: dict[int, Entry] = {}
@@ -167,16 +170,17 @@ class _RoundsOnWorkers:
     def _judge_order(self, ended: EndedSearch, judge: Judge) -> JudgeOrder:
         """Order to judge the result of a search."""
         searches = self.plan.searches
-        task = searches.stated.task
-        search = searches.search(
-            searches.stated, ended.entry.start, self.plan.terms(ended.entry, 0.0)
-        )
-        order = searches.order(self._executor, search, self.rounds.expected(0))
+        entry = ended.entry
+        if self._stated is None:
+            search = searches.search(searches.stated, entry.start, self.plan.terms(entry, 0.0))
+            order = searches.order(self._executor, search, self.rounds.expected(0))
+            self._stated = SealedState.of(order.search)
         return JudgeOrder(
             judge=judge,
             result=replace(ended.result, history=()),
-            search=order.search,
-            task_key=searches.task_key(task.system.variant),
+            begun=entry.start,
+            stated=self._stated,
+            task_key=searches.task_key(searches.stated.task.system.variant),
         )
 
     def _take_judgement(self, outcome: Outcome[Judgement]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import pickle
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,10 @@ from mjfim.records.trajectory import Trajectory
 
 # Largest number of iterates of one search whose motions are kept, and number of samples of each.
 MAX_MOTIONS, MOTION_SAMPLES = 40, 200
+
+# Arrays of a motion, and the attribute that holds them as bytes.
+MOTION_ARRAYS = ("t", "qpos", "ctrl")
+SEALED = "_sealed"
 
 # Motions are only drawn, so that half of the digits are enough.
 DrawnArray = NDArray[np.float32]
@@ -31,6 +37,9 @@ def _freeze_drawn(record: object, *names: str) -> None:
 class IterateMotion:
     """Motion of one iterate at `MOTION_SAMPLES` evenly spread samples, n in all.
 
+    It is pickled as bytes, which are read when an array is asked for first: a process that collects
+    the iterates of many searches draws the motions of one of them only.
+
     Attributes:
         t: (n,) times [s].
         qpos: (n, nq) positions [m or rad; unit quaternions for ball and free joints].
@@ -43,6 +52,28 @@ class IterateMotion:
 
     def __post_init__(self) -> None:
         _freeze_drawn(self, "t", "qpos", "ctrl")
+
+    def __reduce__(self) -> tuple[Callable[[bytes], IterateMotion], tuple[bytes]]:
+        """Pickle the arrays as bytes, which are made once."""
+        sealed = self.__dict__.get(SEALED)
+        if sealed is None:
+            arrays = {name: getattr(self, name) for name in MOTION_ARRAYS}
+            sealed = pickle.dumps(arrays, pickle.HIGHEST_PROTOCOL)
+            object.__setattr__(self, SEALED, sealed)
+        return _sealed_motion, (sealed,)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Read the arrays of a motion that comes from another process."""
+            sealed = self.__dict__.get(SEALED)
+            if sealed is None or name not in MOTION_ARRAYS:
+                raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+
+            for key, array in pickle.loads(sealed).items():
+                array.setflags(write=False)
+                object.__setattr__(self, key, array)
+            return self.__dict__[name]
 
     @classmethod
     def of(cls, trajectory: Trajectory | None) -> IterateMotion | None:
@@ -66,6 +97,13 @@ class IterateMotion:
             qpos=trajectory.qpos[rows].astype(np.float32),
             ctrl=trajectory.ctrl[held].astype(np.float32),
         )
+
+
+def _sealed_motion(sealed: bytes) -> IterateMotion:
+    """A motion whose arrays are read later."""
+    motion = object.__new__(IterateMotion)
+    object.__setattr__(motion, SEALED, sealed)
+    return motion
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

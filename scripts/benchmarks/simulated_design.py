@@ -12,6 +12,7 @@ import numpy as np
 
 import mjfim
 from mjfim.excitation import design as design_module
+from mjfim.excitation.constrained import ConstrainedSlice
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.judging import JudgeOrder
 from mjfim.excitation.rounds import Judgement
@@ -138,7 +139,7 @@ class _MeasuredSearches(MeasuredTasks):
     def done(self, fn: Any, args: tuple[Any, ...]) -> tuple[Any, float]:
         """Result of a slice or of a judgement under the name of its start, and its CPU time [s]."""
         found, seconds = super().done(fn, args)
-        name = args[0].search.start.name
+        name = _start(args[0]).name
         renamed = replace(found, result=replace(found.result, name=name))
         if isinstance(found, Judgement) and found.following is not None:
             renamed = replace(renamed, following=replace(found.following, name=name))
@@ -148,13 +149,19 @@ class _MeasuredSearches(MeasuredTasks):
 def _key(args: tuple[Any, ...]) -> Hashable:
     """Return what tells a slice or a judgement from others, apart from copies of its start."""
     (order,) = args
-    search = order.search
-    name, schedule = search.start.name.partition(COPY)[0], search.schedule
-    common = name, str(search.variant), schedule.first, tuple(search.tightening.items())
+    name = _start(order).name.partition(COPY)[0]
     if isinstance(order, JudgeOrder):
-        return (*common, np.asarray(order.result.control).tobytes())
+        return name, repr(order.judge), np.asarray(order.result.control).tobytes()
+
+    search = order.search
+    common = name, str(search.variant), search.schedule.first, tuple(search.tightening.items())
     done = 0 if order.before is None else len(order.before.result.history)
     return (*common, search.start.control.tobytes(), search.max_iterations, done)
+
+
+def _start(order: ConstrainedSlice | JudgeOrder) -> InitialControl:
+    """The start of an order."""
+    return order.begun if isinstance(order, JudgeOrder) else order.search.start
 
 
 def save_curve(rows: Sequence[Efficiency], wanted: float, path: Path) -> None:

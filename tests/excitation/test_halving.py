@@ -112,9 +112,9 @@ class InventedTasks(MeasuredTasks):
 
     def done(self, fn: Any, args: tuple[Any, ...]) -> tuple[Any, float]:
         (order,) = args
-        name = order.search.start.name
-        cost = float(np.random.default_rng(int(name)).uniform())
-        result = RunResult(name=name, control=order.search.start.control, cost=cost)
+        start = order.begun if isinstance(order, JudgeOrder) else order.search.start
+        name, cost = start.name, float(np.random.default_rng(int(start.name)).uniform())
+        result = RunResult(name=name, control=start.control, cost=cost)
         if isinstance(order, JudgeOrder):
             return Judgement(result=result, following=continued(result), cost=cost), 0.1
 
