@@ -54,7 +54,7 @@ def design(
         threads: Threads for simulations; default: one per core.
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
             runs several starts side by side: under hard limits, and without them if there is a
-            start for each worker.
+            start for each worker. It evaluates releases side by side as well.
         stop: Token that ends the search early.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
@@ -120,7 +120,7 @@ def design_task(
     # All parts of the design use the same processes, also those that replace killed ones.
     executor = None if executor is None else Workers.of(executor)
     if task.release is not None:
-        return _design_release(task, task.release, budget, callback)
+        return _design_release(task, task.release, budget, callback, executor)
 
     _require_controls(task)
     require_feasible_start(task)
@@ -169,7 +169,11 @@ def design_task(
 
 
 def _design_release(
-    task: DesignTask, space: ReleaseSpace, budget: Budget, callback: DesignCallback | None
+    task: DesignTask,
+    space: ReleaseSpace,
+    budget: Budget,
+    callback: DesignCallback | None,
+    executor: ExecutorLike | None,
 ) -> Design:
     """Design the initial state of a motion whose control is given. See `design`."""
     require_feasible_start(task)
@@ -182,12 +186,12 @@ def _design_release(
     stage = DescentLevel(task, identifiability.basis)
     first = stage.problem.reevaluated(first)
 
-    search = ReleaseSearch(stage, space, budget, callback)
+    search = ReleaseSearch(stage, space, budget, callback, executor)
     found = search.run()
     interrupted = budget.stop.requested
 
     # The stated release stays where no better one within the limits was found.
-    chosen, played = found.best.point, task
+    chosen, played = found.point, task
     if first.cost < chosen.cost and keeps_limits(limited_cost_of(stage), first):
         chosen = first
     elif chosen.trajectory is not None:

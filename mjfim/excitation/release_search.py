@@ -1,15 +1,15 @@
 """Search for the release, an initial state within ranges, whose motion tells most.
 
 The ranges have few coordinates. A grid of releases over all ranges is simulated first. From the
-best of them, which lie apart, a trust-region method without derivatives (COBYQA) follows; it keeps
-ranges and limits, and tolerates the kinks of the smallest eigenvalue.
+best of them, which lie apart, local searches follow. Both are divided among the workers of an
+executor, if there is one; the result is the same to the last digit.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -17,18 +17,16 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.evaluation import UNSTABLE_GROWTH
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.objective import DIVERGED, DesignPoint
+from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.release_evaluation import Release, ReleaseEvaluation
+from mjfim.excitation.release_following import Following, follow
 from mjfim.excitation.release_space import ReleaseSpace
-from mjfim.optimize.lq import largest_amplification
-from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
+from mjfim.excitation.release_workers import ReleaseWorkers
+from mjfim.parallel import ExecutorLike
 from mjfim.plant.plant import Plant
 from mjfim.records.design import HistoryRow, StartResult, Status, extended
 from mjfim.records.events import DesignCallback, DesignEvent
-from mjfim.records.iterates import IterateMotion
-from mjfim.records.trajectory import Trajectory
 
 # The grid has 2^(5 + d) releases for d coordinates, but no more than 2^9, and the corners of up to
 # four coordinates.
@@ -43,61 +41,6 @@ GRID_TIME_SHARE = 0.5
 LOCAL_SEARCHES = 3
 LEAST_DISTANCE = 0.1
 
-# First radius of the trust region relative to the ranges, and bounds of the last one.
-FIRST_RADIUS = 0.05
-LAST_RADII = (1e-6, 1e-2)
-
-# Relative margin that the search keeps from the limits, so that its result is inside.
-SAFETY = 1e-4
-
-# Objective of a release that diverges, above that of any other.
-WORST = 1e3
-
-# Name of the growth of a small disturbance among the margins.
-GROWTH = "growth"
-
-# Least cost whose logarithm is taken; it avoids the logarithm of zero.
-TINY = 1e-300
-
-
-class _BudgetUsedUpError(Exception):
-    """Ends a local search, whose method has no other way to end at once."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Release:
-    """One release, evaluated.
-
-    Attributes:
-        shares: (d,) place in the ranges.
-        point: Its motion, information and cost.
-        margins: Smallest relative margin of each kind of limit, and of the growth of a small
-            disturbance; empty where it diverges.
-    """
-
-    shares: Array
-    point: DesignPoint
-    margins: dict[str, float]
-
-    @property
-    def margin(self) -> float:
-        """Smallest relative margin; -infinite where the simulation diverges."""
-        if self.point.trajectory is None:
-            return -np.inf
-        return min(self.margins.values(), default=np.inf)
-
-    @property
-    def margins_of_limits(self) -> dict[str, float]:
-        """Smallest relative margin of the limits of each kind."""
-        return {kind: margin for kind, margin in self.margins.items() if kind != GROWTH}
-
-    @property
-    def rank(self) -> tuple[bool, float]:
-        """Order of the releases: those within the limits first, then by cost or violation."""
-        if self.margin >= 0.0:
-            return False, self.point.cost
-        return True, -self.margin
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReleaseResult:
@@ -105,6 +48,7 @@ class ReleaseResult:
 
     Attributes:
         best: The best release.
+        point: Its motion, information and cost.
         plant: Plant whose initial state is that of the release.
         status: How the search ended.
         history: The improvements.
@@ -113,6 +57,7 @@ class ReleaseResult:
     """
 
     best: Release
+    point: DesignPoint
     plant: Plant
     status: Status
     history: tuple[HistoryRow, ...]
@@ -128,6 +73,7 @@ class ReleaseSearch:
         space: Ranges of the release.
         budget: Time of the search and the token that stops it.
         callback: Called with every improvement, or None.
+        executor: Where releases are evaluated; None for this process.
     """
 
     def __init__(
@@ -136,23 +82,21 @@ class ReleaseSearch:
         space: ReleaseSpace,
         budget: Budget,
         callback: DesignCallback | None,
+        executor: ExecutorLike | None = None,
     ) -> None:
         self.stage = stage
         self.space = space
         self.budget = budget
-        self.plant = stage.task.plant
         self.best: Release | None = None
         self.found_by = "grid of releases"
 
+        self._evaluation = ReleaseEvaluation(stage, space, stage.task.plant)
+        self._workers = None if executor is None else ReleaseWorkers(executor, budget)
         self._callback: Callable[[DesignEvent], None] = callback or (lambda event: None)
         self._name = self.found_by
-        self._known: dict[bytes, Release] = {}
+        self._known: set[bytes] = set()
         self._history: list[HistoryRow] = []
         self._steps_before = stage.task.plant.engine_steps
-
-        self._constraints: ConstraintSet | None = None
-        if stage.task.is_limited:
-            self._constraints = constraint_set_of(stage.task)
 
     def run(self) -> ReleaseResult:
         """Search the ranges.
@@ -165,7 +109,7 @@ class ReleaseSearch:
         results = self._local_searches(tried)
 
         best = self.best
-        if best is None or best.point.trajectory is None:
+        if best is None or best.diverges:
             raise SimulationDivergedError("the simulation diverges from every release")
 
         # A release of the grid that no local search improves is the end of these searches.
@@ -177,7 +121,8 @@ class ReleaseSearch:
 
         return ReleaseResult(
             best=best,
-            plant=self._released(best.shares),
+            point=self._evaluation.point(best.shares),
+            plant=self._evaluation.released(best.shares),
             status=status,
             history=tuple(self._history),
             starts=tuple(results.values()),
@@ -186,6 +131,25 @@ class ReleaseSearch:
 
     def _try_grid(self) -> list[Release]:
         """Evaluate the stated release, the corners of the ranges and a Sobol sequence."""
+        tried = []
+        for release in self._evaluated(self._grid()):
+            tried.append(release)
+            self._take(release)
+        return tried
+
+    def _evaluated(self, grid: list[Array]) -> Iterator[Release]:
+        """Evaluate releases in their order, until a share of the time is used."""
+        if self._workers is not None:
+            yield from self._workers.grid(self._evaluation, grid, GRID_TIME_SHARE)
+            return
+
+        for shares in grid:
+            yield self._evaluation.release(shares)
+            if self.budget.exhausted or self.budget.used > GRID_TIME_SHARE:
+                return
+
+    def _grid(self) -> list[Array]:
+        """(d,) place of each release of the grid, the stated one first."""
         d = len(self.space.names)
         stated = self.space.shares_of_stated()
         sequence = scipy.stats.qmc.Sobol(d, scramble=False)
@@ -197,15 +161,7 @@ class ReleaseSearch:
             if stated is not None:
                 corners.sort(key=lambda corner: float(np.abs(corner - stated).sum()))
             grid = [*corners, *grid]
-        if stated is not None:
-            grid.insert(0, stated)
-
-        tried = []
-        for shares in grid:
-            tried.append(self.evaluate(shares))
-            if self.budget.exhausted or self.budget.used > GRID_TIME_SHARE:
-                break
-        return tried
+        return grid if stated is None else [stated, *grid]
 
     def _calibrate(self) -> None:
         """Choose difference steps that suit the best release of the grid.
@@ -213,12 +169,17 @@ class ReleaseSearch:
         The stated release may hardly move, so that its steps are too long for another one.
         """
         best = self.best
-        if best is None or best.point.trajectory is None or self.budget.exhausted:
+        if best is None or self.budget.exhausted:
             return
+        trajectory = self._evaluation.point(best.shares).trajectory
+        if trajectory is None:
+            return
+
         theta = self.stage.task.theta
-        self.plant = self._released(best.shares).calibrated(theta, best.point.trajectory)
+        plant = self._evaluation.released(best.shares).calibrated(theta, trajectory)
+        self._evaluation = ReleaseEvaluation(self.stage, self.space, plant)
         self._known.clear()
-        self.best = self._evaluated(best.shares)
+        self.best = self._evaluation.release(best.shares)
         last = self._history[-1]
         self._history[-1] = self._row(self.best, last.iteration, last.gamma)
 
@@ -228,93 +189,49 @@ class ReleaseSearch:
         starts = _apart(sorted(tried, key=lambda release: release.rank), wanted)
 
         results = {}
-        for number, start in enumerate(starts, start=1):
-            if self.budget.exhausted:
-                break
+        for number, (start, found) in enumerate(self._followed(starts), start=1):
             name = f"grid release {number} of {len(starts)}"
-            results[name] = self._local_search(name, start)
+            results[name] = self._local_result(name, start, found)
         return results
 
-    def _local_search(self, name: str, start: Release) -> StartResult:
-        """Follow one release by COBYQA."""
-        descent = self.stage.task.experiment.descent
-        lowest, highest = LAST_RADII
-        radius = float(np.clip(np.sqrt(descent.tolerance), lowest, highest))
-        reached = [start]
-        status = Status.MAX_ITERATIONS
+    def _followed(self, starts: list[Release]) -> Iterator[tuple[Release, Following]]:
+        """Local searches from some releases that have begun, with their starts."""
+        if self._is_over():
+            return
+        if self._workers is not None:
+            found = self._workers.followed(self._evaluation, starts)
+            yield from ((s, f) for s, f in zip(starts, found, strict=True) if f.tried)
+            return
+
+        evaluate, descent = self._evaluation.release, self.stage.task.experiment.descent
+        for start in starts:
+            if self._is_over():
+                return
+            yield start, follow(evaluate, start, descent, Following(), self._is_over)
+
+    def _is_over(self) -> bool:
+        """True where the time is used up, or after a request to stop."""
+        return self.budget.exhausted is not None
+
+    def _local_result(self, name: str, start: Release, found: Following) -> StartResult:
+        """Take what a local search has tried."""
         count = len(self._known)
         self._name = name
+        for release in found.tried:
+            self._take(release)
 
-        def seen(shares: Array) -> Release:
-            """Evaluate a release inside its ranges, and remember it."""
-            release = self.evaluate(np.clip(shares, 0.0, 1.0))
-            reached.append(release)
-            return release
-
-        constraints = []
-        if start.margins:
-            kinds = tuple(start.margins)
-            constraints = [
-                scipy.optimize.NonlinearConstraint(
-                    lambda x: _margins(seen(x), kinds) - SAFETY, 0.0, np.inf
-                )
-            ]
-        try:
-            found = scipy.optimize.minimize(
-                lambda x: self._objective(seen(x)),
-                start.shares,
-                method="COBYQA",
-                bounds=[(0.0, 1.0)] * len(start.shares),
-                constraints=constraints,
-                options={
-                    "initial_tr_radius": FIRST_RADIUS,
-                    "final_tr_radius": radius,
-                    "maxfev": max(descent.max_iterations, 1),
-                },
-            )
-            if found.success:
-                status = Status.RELEASE_FOUND
-        except _BudgetUsedUpError:
-            pass
-
-        best = min(reached, key=lambda release: release.rank)
+        best = min([start, *found.tried], key=lambda release: release.rank)
+        status = Status.RELEASE_FOUND if found.converged else Status.MAX_ITERATIONS
         return StartResult(
-            name=name, cost=best.point.cost, status=status, iterations=len(self._known) - count
+            name=name, cost=best.cost, status=status, iterations=len(self._known) - count
         )
 
-    def _objective(self, release: Release) -> float:
-        """Objective of the local search, which has no unit."""
-        if self.budget.exhausted:
-            raise _BudgetUsedUpError
-        cost = release.point.cost
-        if not np.isfinite(cost):
-            return WORST
+    def _take(self, release: Release) -> None:
+        """Count a release, and keep and report it if it is the best one."""
+        self._known.add(release.shares.tobytes())
+        if release.diverges or (self.best is not None and release.rank >= self.best.rank):
+            return
 
-        # A logarithmic criterion may be negative; one nat per parameter is its size.
-        if self.stage.problem.information.criterion == "D":
-            return cost / self.stage.problem.size(release.point)
-        return float(np.log(max(cost, TINY)))
-
-    def evaluate(self, shares: Array) -> Release:
-        """Evaluate a release, and keep it if it is the best one.
-
-        Args:
-            shares: (d,) place in the ranges.
-        """
-        key = shares.tobytes()
-        if key in self._known:
-            return self._known[key]
-
-        release = self._evaluated(shares)
-        self._known[key] = release
-        if release.point.trajectory is not None and (
-            self.best is None or release.rank < self.best.rank
-        ):
-            self._keep(release)
-        return release
-
-    def _keep(self, release: Release) -> None:
-        """Keep the best release, and report it."""
         moved = 0.0
         if self.best is not None:
             moved = float(np.abs(release.shares - self.best.shares).max())
@@ -326,12 +243,12 @@ class ReleaseSearch:
 
     def _row(self, release: Release, iteration: int, moved: float) -> HistoryRow:
         """The iterate of a release; `moved`: distance from the one before, in ranges."""
-        task, criterion = self.stage.task, release.point.criterion
+        task = self.stage.task
         return HistoryRow(
             iteration=iteration,
-            cost=release.point.cost,
-            criterion=np.inf if criterion is None else criterion.value,
-            min_eigenvalue=0.0 if criterion is None else float(criterion.eigenvalues[0]),
+            cost=release.cost,
+            criterion=release.criterion,
+            min_eigenvalue=release.min_eigenvalue,
             slope=np.nan,
             gamma=moved,
             seconds=self.budget.seconds_used,
@@ -339,71 +256,15 @@ class ReleaseSearch:
             rate=1.0 / task.dt,
             margin=min(release.margins_of_limits.values(), default=np.nan),
             margins=release.margins_of_limits,
-            motion=IterateMotion.of(release.point.trajectory),
+            motion=release.motion,
         )
-
-    def _released(self, shares: Array) -> Plant:
-        """The plant with the initial state of a release."""
-        return self.plant.with_initial_state(self.space.state(shares))
-
-    def _evaluated(self, shares: Array) -> Release:
-        """Simulate a release, with its limits, its information and its cost."""
-        plant = self._released(shares)
-        moved = self._simulated(plant)
-        if moved is None:
-            return Release(shares=shares, point=DIVERGED, margins={})
-
-        trajectory, margins = moved
-        problem = replace(self.stage.problem, plant=plant)
-        point = problem.point(trajectory, CENTRAL_DIFFERENCES)
-        if point.trajectory is None:
-            return Release(shares=shares, point=DIVERGED, margins={})
-
-        margins = {**margins, GROWTH: self._margin_of_growth(plant, trajectory)}
-        return Release(shares=shares, point=point, margins=margins)
-
-    def _margin_of_growth(self, plant: Plant, trajectory: Trajectory) -> float:
-        """Margin of the growth of a small disturbance; 0 where it grows `UNSTABLE_GROWTH`-fold.
-
-        The criterion favours motions that are close to chaotic, which no feedback could steer.
-        """
-        task = self.stage.task
-        try:
-            A, _, _, _ = plant.derivatives.jacobians(task.theta, trajectory)
-        except SimulationDivergedError:
-            return -1.0
-
-        growth = largest_amplification(A, task.sizes[: task.space.nx])
-        least = np.finfo(float).tiny
-        return float(1.0 - np.log(max(growth, least)) / np.log(UNSTABLE_GROWTH))
-
-    def _simulated(self, plant: Plant) -> tuple[Trajectory, dict[str, float]] | None:
-        """Motion of a plant from its initial state, with the relative margins of its limits."""
-        task, constraints = self.stage.task, self._constraints
-        if constraints is None:
-            try:
-                return plant.simulate(task.theta, task.control), {}
-            except SimulationDivergedError:
-                return None
-
-        found = plant.observe(task.theta, task.control, constraints.observations)
-        if found is None:
-            return None
-        trajectory, observed = found
-        values = constraints.evaluate(trajectory, observed, slopes=False)
-        return trajectory, constraints.relative_margins(values)
-
-
-def _margins(release: Release, kinds: tuple[str, ...]) -> Array:
-    """(k,) relative margins of some kinds of limits; -1 where the simulation diverges."""
-    return np.array([release.margins.get(kind, -1.0) for kind in kinds])
 
 
 def _apart(ranked: list[Release], count: int) -> list[Release]:
     """The first releases of a ranking that lie apart from those before, at most `count`."""
     chosen: list[Release] = []
     for release in ranked:
-        if release.point.trajectory is None:
+        if release.diverges:
             continue
         far = all(np.abs(release.shares - other.shares).max() > LEAST_DISTANCE for other in chosen)
         if far:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError
+from mjfim.excitation import release_search, release_workers
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -79,6 +81,29 @@ def test_a_limit_of_the_velocity_holds_at_every_engine_step(tmp_path: Path) -> N
         mujoco.mj_step(model, data)
         fastest = max(fastest, abs(float(data.qvel[0])))
     assert 5.9 < fastest <= 6.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["threads", "pool"])
+def test_workers_find_the_release_of_one_process(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(release_search, "GRID_EXPONENT", 1)
+    monkeypatch.setattr(release_workers, "RELEASES_PER_ORDER", 2)
+    experiment = short(tmp_path, horizon=0.1, descent={"max_iterations": 6})
+    alone = mjfim.design(experiment, threads=1)
+
+    # Each slice of a local search ends after one release.
+    monkeypatch.setattr(release_workers, "SLICE_SECONDS", 0.0)
+    with ThreadPoolExecutor(2) if kind == "threads" else mjfim.Pool(2) as executor:
+        found = mjfim.design(experiment, threads=1, executor=executor)
+
+    assert found.final.cost == alone.final.cost
+    assert np.array_equal(found.trajectory.qpos, alone.trajectory.qpos)
+    assert [row.cost for row in found.history] == [row.cost for row in alone.history]
+    assert [(s.name, s.cost, s.status, s.iterations) for s in found.starts] == [
+        (s.name, s.cost, s.status, s.iterations) for s in alone.starts
+    ]
 
 
 def test_an_optimum_at_the_end_of_a_range_is_said(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify, identify_system
 from mjfim.records.events import Event, StudyEvent
 from mjfim.records.recording import Recording
+from mjfim.studies import monte_carlo as monte_carlo_module
 from mjfim.studies.monte_carlo import _statistics, monte_carlo, monte_carlo_system
 from tests.support.paths import ROOT
 
@@ -217,8 +218,9 @@ def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experim
 
 @pytest.mark.slow
 def test_a_request_to_stop_keeps_the_finished_trials(
-    design: mjfim.Design, experiment: Experiment
+    design: mjfim.Design, experiment: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(monte_carlo_module, "MIN_CHUNK", 64)
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     token = StopToken()
 
