@@ -20,6 +20,7 @@ from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.release_search import ReleaseSearch
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.sample_workers import SampleWorkers
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start
 from mjfim.experiment.schema import Experiment
@@ -54,7 +55,8 @@ def design(
         threads: Threads for simulations; default: one per core.
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
             runs several starts side by side: under hard limits, and without them if there is a
-            start for each worker. It evaluates releases side by side as well.
+            start for each worker. It evaluates releases, and the samples of `[robust]`, side by
+            side as well.
         stop: Token that ends the search early.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
 
@@ -121,6 +123,10 @@ def design_task(
     executor = None if executor is None else Workers.of(executor)
     if task.release is not None:
         return _design_release(task, task.release, budget, callback, executor)
+
+    # Samples of a robust design are independent of each other, as starts are.
+    if executor is not None and task.samples_of_parameters is not None:
+        task = replace(task, sample_evaluation=SampleWorkers(executor))
 
     _require_controls(task)
     require_feasible_start(task)

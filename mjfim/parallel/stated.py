@@ -91,10 +91,10 @@ class StatedExecutor:
             yield Workers.of(executor)
             return
 
-        # Those of Python would wait for tasks that nobody needs any more, before a result is
+        # Those of this computer would wait for tasks that nobody needs any more, before a result is
         # written.
-        if isinstance(executor, ThreadPoolExecutor | ProcessPoolExecutor):
-            workers = Workers(executor)
+        workers = Workers.of(executor)
+        if workers.is_loky or isinstance(executor, ThreadPoolExecutor | ProcessPoolExecutor):
             try:
                 yield workers
             finally:

@@ -117,6 +117,11 @@ class Workers(Executor):
         return self._client is not None
 
     @property
+    def is_loky(self) -> bool:
+        """True for an executor of loky, also for the copy of loky in joblib."""
+        return "loky" in type(self._executor).__module__.split(".")
+
+    @property
     def is_empty(self) -> bool:
         """True for a Dask cluster without any worker."""
         return self.is_cluster and not self._found_count()
@@ -168,16 +173,17 @@ class Workers(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the executor; the arguments are those of `concurrent.futures.Executor.shutdown`."""
-        # The executor of Dask has no such option: without waiting, it cancels everything.
+        # The executor of Dask has no such option: without waiting, it cancels everything. That of
+        # loky ends its processes instead.
+        name = "kill_workers" if self.is_loky else "cancel_futures"
         is_known = cancel_futures and not self.is_cluster
-        options = {"cancel_futures": True} if is_known else {}
+        options = {name: True} if is_known else {}
         self._executor.shutdown(wait, **options)
 
     @property
     def _is_local(self) -> bool:
         """True where all workers are known to be on this computer, so that they share its cores."""
-        is_loky = "loky" in type(self._executor).__module__.split(".")
-        return is_loky or isinstance(
+        return self.is_loky or isinstance(
             self._executor, Pool | ProcessPoolExecutor | ThreadPoolExecutor
         )
 

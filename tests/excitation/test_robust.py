@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
@@ -257,3 +260,26 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     free = sample_parameters(task.parameters, task.theta, 8, 0)
     assert any(task.parameters.writer.unphysical_bodies(task.plant.source, theta) for theta in free)
     assert len(np.unique(task.samples_of_parameters.thetas, axis=0)) == 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["threads", "pool"])
+@pytest.mark.parametrize("limits", [{}, {"control": {"force": 15.0}}], ids=["free", "limited"])
+def test_workers_evaluate_the_samples_as_one_process_does(
+    kind: str, limits: dict[str, Any], tmp_path: Path
+) -> None:
+    bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.5, 3.5)}}
+    task = cart_task(
+        tmp_path,
+        parameters={**CART_PARAMETERS, **bounded},
+        robust={"samples": 3},
+        limits=limits,
+        descent={"max_iterations": 3},
+    )
+    alone = design_task(task)
+    with ThreadPoolExecutor(2) if kind == "threads" else mjfim.Pool(2) as executor:
+        found = design_task(DesignTask.resolve(task.experiment, threads=1), executor=executor)
+
+    assert found.final.cost == alone.final.cost
+    assert np.array_equal(found.trajectory.ctrl, alone.trajectory.ctrl)
+    assert [row.cost for row in found.history] == [row.cost for row in alone.history]
