@@ -7,12 +7,12 @@ next, if the step is accepted.
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget
+from mjfim.budget import Budget, StopToken
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import for_workers
@@ -21,7 +21,7 @@ from mjfim.experiment.system import System
 from mjfim.information.criteria import Criterion
 from mjfim.information.fisher import FisherInformation
 from mjfim.model.variants import ModelVariant
-from mjfim.parallel import ExecutorLike, Workers, one_blas_thread, results_or_here
+from mjfim.parallel import ExecutorLike, Workers, carry_out, one_blas_thread
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.shared_value import SharedValue
 from mjfim.plant.mixed_derivatives import (
@@ -180,10 +180,13 @@ class SampleWorkers:
 
     Args:
         executor: The workers, or an executor that they can wrap.
+        stop: Token after whose request this process evaluates the samples that are still needed:
+            Ctrl-C in a terminal may have ended the workers.
     """
 
-    def __init__(self, executor: ExecutorLike) -> None:
+    def __init__(self, executor: ExecutorLike, stop: StopToken) -> None:
         self._workers = Workers.of(executor)
+        self._stop = stop
         self._plants: dict[tuple[str, ModelVariant, int], SharedValue[_PlantOrder]] = {}
         self._problems: dict[tuple[int, int], tuple[DesignProblem, SharedValue[_ProblemOrder]]]
         self._problems = {}
@@ -210,7 +213,7 @@ class SampleWorkers:
             return _Found(result=_numbers(point), steps=0)
 
         points = []
-        for found in results_or_here(self._workers, _point_in_worker, orders, Budget(), here):
+        for found in self._all(_point_in_worker, orders, here):
             problem.plant.simulator.add_steps(found.steps)
             if found.result is None:
                 return None
@@ -247,12 +250,28 @@ class SampleWorkers:
             return _Found(result=_slope(problem, order, point), steps=0)
 
         slopes = []
-        for found in results_or_here(self._workers, _slope_in_worker, orders, Budget(), here):
+        for found in self._all(_slope_in_worker, orders, here):
             problem.plant.simulator.add_steps(found.steps)
             if found.result is None:
                 raise ValueError("a diverged sample has no slope")
             slopes.append(found.result)
         return slopes
+
+    def _all(
+        self,
+        function: Callable[[_SampleOrder], _Found[T]],
+        orders: Sequence[_SampleOrder],
+        here: Callable[[_SampleOrder], _Found[T]],
+    ) -> Iterator[_Found[T]]:
+        """Results of all orders, in their order, those of lost workers from this process."""
+        found: dict[int, _Found[T]] = {}
+        if not self._stop.requested:
+            for outcome in carry_out(self._workers, function, orders, Budget(stop=self._stop)):
+                if not outcome.is_lost:
+                    found[outcome.index] = outcome.result
+
+        for index, order in enumerate(orders):
+            yield found[index] if index in found else here(order)
 
     def _shared(
         self, system: System, problem: DesignProblem, tasks: int

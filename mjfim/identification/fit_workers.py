@@ -7,6 +7,7 @@ the estimate is the same to the last digit.
 
 from __future__ import annotations
 
+import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -41,10 +42,12 @@ from mjfim.optimize.levenberg_marquardt import (
 from mjfim.parallel import (
     ExecutorLike,
     Workers,
+    carry_out,
     one_blas_thread,
     pool_stop_token,
     results_or_here,
 )
+from mjfim.parallel.dispatch import GRACE
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.shared_value import SharedValue
 from mjfim.recordings.channels import Channels
@@ -111,6 +114,27 @@ def _counted(problem: FitProblem, work: Callable[[], T]) -> _Found[T]:
 # ---- in the process of the fit
 
 
+class _Watch:
+    """Watches whether workers still do anything after a request to stop.
+
+    Args:
+        workers: The workers.
+    """
+
+    def __init__(self, workers: Workers) -> None:
+        self._workers = workers
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin to wait again, after a worker has done something."""
+        self._begun = time.monotonic()
+
+    @property
+    def is_over(self) -> bool:
+        """True where there is no worker any more, or none has done anything for `GRACE`."""
+        return self._workers.is_empty or time.monotonic() - self._begun > GRACE
+
+
 class FitWorkers:
     """Workers that simulate the batches of a fit, and search from its starts.
 
@@ -154,19 +178,25 @@ class FitWorkers:
             for batch in batches
         ]
 
-        def here(order: BatchOrder[T]) -> _Found[T | None]:
-            """Do the work of a lost worker; its steps are counted by the simulator."""
-            return _Found(result=work(problem, at, order.batch), steps=0)
+        # A pass that begins after the request is one that the result needs. Ctrl-C in a terminal
+        # may have ended the workers, so that this process does what nobody else does.
+        is_needed = self._stop.requested
+        watch = _Watch(self._executor)
+        stop = StopToken(also=lambda: watch.is_over) if is_needed else self._stop
+        found: dict[int, T | None] = {}
+        for outcome in carry_out(self._executor, _work_on_batch, orders, Budget(stop=stop)):
+            watch.restart()
+            if not outcome.is_lost:
+                found[outcome.index] = _counted_here(problem, outcome.result)
+            elif not self._stop.requested:
+                found[outcome.index] = work(problem, at, batches[outcome.index])
 
-        # A pass that begins after the request is one that the result needs.
-        stop = StopToken() if self._stop.requested else self._stop
-        results: Iterator[_Found[T | None]] = results_or_here(
-            self._executor, _work_on_batch, orders, Budget(stop=stop), here
-        )
-        found = [_counted_here(problem, each) for each in results]
-        if len(found) < len(orders):
+        if len(found) < len(orders) and not is_needed:
             raise InterruptedPassError
-        return found
+        for index, batch in enumerate(batches):
+            if index not in found:
+                found[index] = work(problem, at, batch)
+        return [found[index] for index in range(len(batches))]
 
     def solutions(
         self,
