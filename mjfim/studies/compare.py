@@ -28,13 +28,14 @@ from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.parallel import ExecutorLike, Workers, results_or_here
+from mjfim.parallel import ExecutorLike, Workers
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
 from mjfim.records.progress import shown_progress
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.baselines.methods import METHODS, run_baseline
+from mjfim.studies.baselines.parts import PartsOfBaseline
 from mjfim.studies.baselines.titles import TITLES
 
 # Name of the design for the user.
@@ -291,7 +292,8 @@ class _MethodRun:
         Returns:
             The best result; None where no part has a result.
         """
-        count = Workers.of(executor).count
+        workers = Workers.of(executor)
+        count = workers.count
         order = replace(
             self.search,
             experiment=for_workers(self.search.experiment, system.source),
@@ -299,12 +301,7 @@ class _MethodRun:
             threads=1,
         )
         parts = [replace(order, part=(i, count)) for i in range(count)]
-
-        def here(part: BaselineSearch) -> SearchResult:
-            """Run a part whose process was ended from outside."""
-            return run_baseline(part, None, self.stop)
-
-        results = list(results_or_here(executor, run_baseline, parts, Budget(stop=self.stop), here))
+        results = PartsOfBaseline(workers, parts, self.stop).results()
         if not results:
             return None
 

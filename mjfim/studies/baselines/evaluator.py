@@ -6,14 +6,16 @@ kept.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken
+from mjfim.budget import Budget, PausedBudget, StopToken
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.interior_point import MAX_RELAXATION
 from mjfim.excitation.interior_problem import InteriorPoint, InteriorProblem, values_of
@@ -64,6 +66,12 @@ class BaselineSearch:
     added_information: Array | None = None
     threads: int | None = None
 
+    def resolved(self) -> DesignTask:
+        """The task of the experiment."""
+        return DesignTask.resolve(
+            self.experiment, threads=self.threads, added_information=self.added_information
+        )
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SearchResult:
@@ -99,6 +107,27 @@ class SearchResult:
         return cost < self.cost or (not np.isfinite(self.cost) and margin > self.margin)
 
 
+# Smallest number of checks of the budget in a slice, so that also slow evaluations lead further.
+CHECKS_OF_SLICE = 12
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SearchState:
+    """Where a search goes on after a slice. It can be pickled.
+
+    Attributes:
+        best: The best control so far.
+        budget: What is used of its budget.
+        rng: Random numbers.
+        method: State of the method.
+    """
+
+    best: SearchResult
+    budget: PausedBudget
+    rng: np.random.Generator
+    method: Any
+
+
 # Called during a search with the used share of the budget and the best result so far.
 SearchCallback = Callable[[float, SearchResult], None]
 
@@ -111,7 +140,11 @@ class ControlEvaluator:
         search: The order.
         callback: Called whenever the budget is checked, or None.
         stop: Ends the search early.
+        stated: The task of the experiment, if it is resolved already.
+        before: Where a slice of the search begins; None for its begin.
+        slice_seconds: Time after which the slice ends [s]; infinite for the whole search.
         best: The best control so far.
+        method: State of the method where a slice ends; None at the begin.
         protected_checks: Number of checks of the budget for which only the whole budget counts, not
             a share of it.
         task: The task of the experiment; under hard limits, on the plant without clamps.
@@ -125,16 +158,18 @@ class ControlEvaluator:
     search: BaselineSearch
     callback: SearchCallback | None = None
     stop: StopToken | None = None
+    stated: DesignTask | None = None
+    before: SearchState | None = None
+    slice_seconds: float = np.inf
     best: SearchResult = field(default_factory=SearchResult)
+    method: Any = None
     protected_checks: int = 0
 
     def __post_init__(self) -> None:
         order = self.search
         self.budget = Budget(seconds=order.seconds, steps=order.steps, stop=self.stop)
 
-        stated = DesignTask.resolve(
-            order.experiment, threads=order.threads, added_information=order.added_information
-        )
+        stated = order.resolved() if self.stated is None else self.stated
         self.is_limited = stated.is_limited
         self.task = stated.relaxed() if self.is_limited else stated
         self._steps_before = self.task.plant.engine_steps
@@ -143,6 +178,35 @@ class ControlEvaluator:
         self.centre = self.task.centre
         self.exact = DescentLevel(self.task, order.combinations).problem
         self.rng = np.random.default_rng((order.seed, *order.part))
+        self._checks = 0
+        self._slice_end = self.budget.seconds_used + self.slice_seconds
+        if self.before is not None:
+            self._go_on(self.before)
+
+    def _go_on(self, before: SearchState) -> None:
+        """Begin where the slice before has ended."""
+        stop = StopToken() if self.stop is None else self.stop
+        self.budget = before.budget.resumed(stop)
+        self._steps_before -= int(before.budget.steps)
+        self._slice_end = self.budget.seconds_used + self.slice_seconds
+        self.best = before.best
+
+        # A slice that is lost on a thread is done again from the same state.
+        self.method, self.rng = copy.deepcopy((before.method, before.rng))
+
+    def state(self) -> SearchState | None:
+        """Where the search goes on after this slice; None where it has ended."""
+        self._count_steps()
+        if self.budget.exhausted is not None or not self.slice_is_over:
+            return None
+        return SearchState(
+            best=self.best, budget=self.budget.paused(), rng=self.rng, method=self.method
+        )
+
+    @property
+    def slice_is_over(self) -> bool:
+        """True where the slice ends, although the budget may not be exhausted."""
+        return self._checks >= CHECKS_OF_SLICE and self.budget.seconds_used >= self._slice_end
 
     @property
     def used(self) -> float:
@@ -162,9 +226,10 @@ class ControlEvaluator:
         if self.callback is not None:
             self.callback(self.used, self.best)
         self.protected_checks -= 1
+        self._checks += 1
 
         self._count_steps()
-        if self.budget.exhausted:
+        if self.budget.exhausted or self.slice_is_over:
             return True
         return self.protected_checks < 0 and self.budget.used >= limit
 

@@ -18,13 +18,16 @@ from threadpoolctl import threadpool_limits
 from mjfim.arrays import Array
 from mjfim.budget import StopToken
 from mjfim.excitation.bandwidth import bandwidth_basis
+from mjfim.excitation.task import DesignTask
 from mjfim.parallel import pool_stop_token
+from mjfim.parallel.kept import KeptPerThread
 from mjfim.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
 from mjfim.studies.baselines.evaluator import (
     BaselineSearch,
     ControlEvaluator,
     SearchCallback,
     SearchResult,
+    SearchState,
 )
 from mjfim.studies.baselines.parametric import (
     FOURIER_FREQUENCIES,
@@ -81,6 +84,55 @@ class Baseline:
     needs_limits: bool = False
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BaselineSlice:
+    """Order for a slice of a baseline. It can be pickled.
+
+    Attributes:
+        key: Text that is equal for all slices of a baseline, whose task a worker resolves once.
+        search: The search.
+        before: Where it goes on; None for its begin.
+        seconds: Time of the slice [s].
+    """
+
+    key: str
+    search: BaselineSearch
+    before: SearchState | None = None
+    seconds: float = np.inf
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SliceOfBaseline:
+    """What a slice of a baseline has found.
+
+    Attributes:
+        result: The best control so far.
+        state: Where the search goes on; None where it has ended.
+    """
+
+    result: SearchResult
+    state: SearchState | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _RandomState:
+    """Where a random search goes on.
+
+    Attributes:
+        best: (n,) numbers of the best trial; empty before it.
+        cost: Its cost.
+        spread: Standard deviation of changes about it.
+    """
+
+    best: Array
+    cost: float
+    spread: float
+
+
+# The latest tasks of a worker, by the key of their slices.
+_tasks: KeptPerThread[DesignTask] = KeptPerThread(2)
+
+
 def run_baseline(
     search: BaselineSearch,
     callback: SearchCallback | None = None,
@@ -97,13 +149,39 @@ def run_baseline(
     Returns:
         The best control.
     """
-    if stop is None:
-        stop = pool_stop_token()
+    return _run(ControlEvaluator(search=search, callback=callback, stop=_stop_of(stop)))
 
+
+def run_slice(order: BaselineSlice, stop: StopToken | None = None) -> SliceOfBaseline:
+    """Run a slice of a baseline. An executor can call this in a worker process.
+
+    Args:
+        order: The order.
+        stop: Ends the slice early; None for the token of the pool in a worker process.
+
+    Returns:
+        The best control so far, and where the search goes on.
+    """
+    evaluator = ControlEvaluator(
+        search=order.search,
+        stop=_stop_of(stop),
+        stated=_tasks.get(order.key, order.search.resolved),
+        before=order.before,
+        slice_seconds=order.seconds,
+    )
+    return SliceOfBaseline(result=_run(evaluator), state=evaluator.state())
+
+
+def _stop_of(stop: StopToken | None) -> StopToken:
+    """The token that ends a search."""
+    return pool_stop_token() if stop is None else stop
+
+
+def _run(evaluator: ControlEvaluator) -> SearchResult:
+    """Run the baseline of an evaluator."""
     # The matrices are small, so that several threads of the BLAS would only wait for each other.
     with threadpool_limits(1, user_api="blas"):
-        evaluator = ControlEvaluator(search=search, callback=callback, stop=stop)
-        METHODS[search.method].run(evaluator)
+        METHODS[evaluator.search.method].run(evaluator)
         return evaluator.result()
 
 
@@ -118,9 +196,14 @@ def random_search(
     """
     fitter = ExcitationFitter(evaluator)
     excitation, rng = kind(fitter.settings), evaluator.rng
-    best, best_cost, spread = np.zeros(0), np.inf, FIRST_SPREAD
+    state = evaluator.method or _RandomState(best=np.zeros(0), cost=np.inf, spread=FIRST_SPREAD)
+    best, best_cost, spread = state.best, state.cost, state.spread
 
-    while not evaluator.exhausted():
+    while True:
+        evaluator.method = _RandomState(best=best, cost=best_cost, spread=spread)
+        if evaluator.exhausted():
+            return
+
         # The first number is the size, which matters where weights in the cost decide about it.
         numbers = rng.random(1 + excitation.parameter_count)
         is_local = len(best) > 0 and rng.random() > GLOBAL_SHARE

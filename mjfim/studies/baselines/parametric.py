@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 import scipy
@@ -207,7 +208,10 @@ def _runs(
         Runs without end, until the budget is exhausted.
     """
     part, parts = evaluator.search.part
-    for frequency in usual[part::parts]:
+
+    # A slice goes on after the runs of those before it.
+    begun = 0 if evaluator.method is None else len(evaluator.method.runs)
+    for frequency in usual[part::parts][begun:]:
         if evaluator.exhausted():
             return
         basis = basis_of(frequency)
@@ -257,73 +261,125 @@ def optimise_many(
         count: Number of runs that are added in each repetition, where the budget allows it.
         optimise: Optimises one run.
     """
-    search = _SuccessiveSelection(evaluator=evaluator, optimise=optimise)
+    state = evaluator.method or SelectionState()
+    evaluator.method = state
+    search = _SuccessiveSelection(evaluator=evaluator, optimise=optimise, state=state)
     while not evaluator.budget.exhausted:
-        used = evaluator.used
-        rough_end = used + ROUGH_SHARE * (1.0 - used)
-        better_end = used + BETTER_SHARE * (1.0 - used)
-
-        may_continue = (
-            search.optimise_new_runs(runs, count, rough_end)
-            and search.optimise_better_runs(better_end)
-            and search.finish_best_run()
-        )
-        if not may_continue:
+        if state.phase is Phase.ROUGH and not search.optimise_new_runs(runs, count):
             return
+        if state.phase is Phase.BETTER and not search.optimise_better_runs():
+            return
+        if not search.finish_best_run():
+            return
+
+
+class Phase(Enum):
+    """Phase of a selection; the value is what is done in it."""
+
+    ROUGH = "new runs are optimised roughly"
+    BETTER = "the better runs are continued"
+    FINISH = "the best run is optimised to the end"
+
+
+@dataclass(eq=False, kw_only=True)
+class SelectionState:
+    """Where a selection of runs goes on. It can be pickled.
+
+    Attributes:
+        runs: All runs so far.
+        phase: What is done.
+        first: Number of runs at the begin of the first phase.
+        index: Number of runs that are done in this phase.
+        ends: Shares of the budget at which the phases before the last one end; empty before the
+            first phase of a repetition has begun.
+        better: Runs that are continued.
+    """
+
+    runs: list[ParametricRun] = field(default_factory=list)
+    phase: Phase = Phase.ROUGH
+    first: int = 0
+    index: int = 0
+    ends: tuple[float, ...] = ()
+    better: list[ParametricRun] = field(default_factory=list)
+
+    def enter(self, phase: Phase) -> None:
+        """Begin another phase."""
+        self.phase, self.index = phase, 0
 
 
 @dataclass(eq=False, kw_only=True)
 class _SuccessiveSelection:
     """Runs of an optimisation that continues with the better ones. See `optimise_many`.
 
-    Every method returns whether the search may continue: False where the budget is exhausted.
+    Every method returns whether the search may continue: False where the budget is exhausted, or a
+    slice of the search is over. A run that a slice has left is continued by the next one.
 
     Attributes:
         evaluator: Evaluates controls and holds the budget.
         optimise: Optimises one run.
-        runs: All runs so far.
+        state: Where the selection goes on.
     """
 
     evaluator: ControlEvaluator
     optimise: Optimiser
-    runs: list[ParametricRun] = field(default_factory=list)
+    state: SelectionState
 
-    def optimise_new_runs(self, runs: Iterator[ParametricRun], count: int, end: float) -> bool:
+    def optimise_new_runs(self, runs: Iterator[ParametricRun], count: int) -> bool:
         """Add runs and optimise each roughly, until a share of the budget is used."""
-        for i in range(count):
-            run = next(runs, None)
-            if run is None:
-                return False
-            self.runs.append(run)
+        state = self.state
+        if not state.ends:
+            used = self.evaluator.used
+            state.ends = tuple(used + share * (1.0 - used) for share in (ROUGH_SHARE, BETTER_SHARE))
+            state.first = len(state.runs)
+
+        end = state.ends[0]
+        while state.index < count:
+            # The run that the slice before has left is in the list already.
+            place = state.first + state.index
+            if place == len(state.runs):
+                run = next(runs, None)
+                if run is None:
+                    return False
+                state.runs.append(run)
+                self.evaluator.protected_checks = MIN_EVALUATIONS
 
             # The remaining part of the budget is divided among the runs that are still to come.
-            self.evaluator.protected_checks = MIN_EVALUATIONS
             used = self.evaluator.used
-            self._advance(run, ROUGH_MU, used + (end - used) / (count - i))
-
+            self._advance(state.runs[place], ROUGH_MU, used + (end - used) / (count - state.index))
             if self.evaluator.exhausted():
                 return False
+            state.index += 1
             if self.evaluator.used >= end:
                 break
+
+        number = -(-len(state.runs) // SELECTION_RATE)
+        state.better = _cheapest(state.runs, number)
+        state.enter(Phase.BETTER)
         return True
 
-    def optimise_better_runs(self, end: float) -> bool:
+    def optimise_better_runs(self) -> bool:
         """Continue the better ones of all runs, until a share of the budget is used."""
-        number = -(-len(self.runs) // SELECTION_RATE)
-        better = _cheapest(self.runs, number)
-        for i, run in enumerate(better):
+        state, end = self.state, self.state.ends[1]
+        while state.index < len(state.better):
             used = self.evaluator.used
-            self._advance(run, ROUGH_MU, used + (end - used) / (len(better) - i))
+            limit = used + (end - used) / (len(state.better) - state.index)
+            self._advance(state.better[state.index], ROUGH_MU, limit)
             if self.evaluator.exhausted():
                 return False
+            state.index += 1
+
+        state.enter(Phase.FINISH)
         return True
 
     def finish_best_run(self) -> bool:
         """Optimise the best run to the end."""
-        for run in _cheapest(self.runs, 1):
+        for run in _cheapest(self.state.runs, 1):
             self._advance(run, BarrierSchedule().last, 1.0)
             if self.evaluator.exhausted():
                 return False
+
+        self.state.ends = ()
+        self.state.enter(Phase.ROUGH)
         return True
 
     def _advance(self, run: ParametricRun, last: float, limit: float) -> None:
