@@ -43,7 +43,7 @@ def processes(kind: str) -> AbstractContextManager[Any]:
         return executor
 
     client: AbstractContextManager[Any] = pytest.importorskip("distributed").Client(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, set_as_default=False
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", set_as_default=False
     )
     return client
 
