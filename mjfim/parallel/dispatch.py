@@ -223,6 +223,12 @@ class Dispatch(Generic[Order, T]):
         except BrokenExecutor as error:
             future = Future()
             future.set_exception(error)
+        except Exception as error:
+            # Some executors, such as Dask, pickle a task while it is submitted.
+            if not is_refused_by_pickle(error):
+                raise
+            future = Future()
+            future.set_exception(error)
 
         self._running[future] = work
         future.add_done_callback(self._ended.put)

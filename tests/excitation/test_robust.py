@@ -264,7 +264,9 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["threads", "pool"])
-@pytest.mark.parametrize("limits", [{}, {"control": {"force": (-15.0, 15.0)}}], ids=["free", "limited"])
+@pytest.mark.parametrize(
+    "limits", [{}, {"control": {"force": (-15.0, 15.0)}}], ids=["free", "limited"]
+)
 def test_workers_evaluate_the_samples_as_one_process_does(
     kind: str, limits: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -257,6 +257,17 @@ def test_a_function_that_cannot_be_sent_is_explained() -> None:
         list(carry_out(pool, lambda order: order, [1], Budget()))
 
 
+def test_a_task_that_is_refused_while_it_is_submitted_is_explained_as_well() -> None:
+    class Refusing(FakeExecutor):
+        """Pickles a task while it is submitted, as Dask does."""
+
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            raise TypeError("cannot pickle '_thread.lock' object")
+
+    with pytest.raises(ExperimentError, match="at the top of a module"):
+        squares(Refusing(lambda order, count: None))
+
+
 def test_the_number_of_workers_is_stated_or_found() -> None:
     assert Workers(ThreadPoolExecutor(3)).count == 3
     assert Workers(ThreadPoolExecutor(3), count=5).count == 5
