@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from mjfim.excitation.search_slices import SealedState, SearchSlice
 from mjfim.excitation.task import DesignTask
 from mjfim.records.design import Design, Status
 from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
+from tests.support.executors import LosingExecutor, processes
 from tests.support.limits import cart_inside
 
 
@@ -192,25 +192,6 @@ def test_starts_for_which_there_was_no_time_are_named(task: DesignTask) -> None:
 # ---- real searches
 
 
-class LosingThreads(Executor):
-    """Does each task at once, pickled as on its way to another process; loses every fifth one."""
-
-    _max_workers = 3
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
-        self.count += 1
-        future: Future[Any] = Future()
-        if self.count % 5 == 0:
-            future.set_exception(BrokenExecutor())
-        else:
-            fn, args = pickle.loads(pickle.dumps((fn, args)))
-            future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
-        return future
-
-
 def digits(design: Design) -> tuple[Any, ...]:
     """Numbers of a design that have to be equal to the last digit."""
     rows = [replace(row, seconds=0.0, motion=None, steps=0, margins={}) for row in design.history]
@@ -229,4 +210,7 @@ def test_starts_give_the_same_design_on_any_executor(
     for count in (1, 2, 3):
         with ThreadPoolExecutor(count) as threads:
             assert digits(design_task(task, executor=threads)) == serial
-    assert digits(design_task(task, executor=LosingThreads())) == serial
+    losing = LosingExecutor(lambda order, count: count % 5 == 0)
+    assert digits(design_task(task, executor=losing)) == serial
+    with processes("pool") as pool:
+        assert digits(design_task(task, executor=pool)) == serial

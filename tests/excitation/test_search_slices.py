@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import threading
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,12 @@ from mjfim.excitation.free_slices import FreeSlice
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.run_result import RunResult, consume
-from mjfim.excitation.search_slices import SearchSlice, SliceOrder
+from mjfim.excitation.search_slices import SearchSlice
 from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.excitation.task import DesignTask
 from mjfim.records.design import Design, Status
 from mjfim.records.events import DesignEvent
+from tests.support.executors import LosingExecutor
 from tests.support.limits import cart_inside
 
 # Iterations of a search, which pass through several stages of the barrier.
@@ -139,30 +140,6 @@ def run_sliced(
     """Run searches in slices, each of which ends after every second iterate."""
     orders = [ConstrainedSlice(search=each, task_key="short", iterations=2) for each in searches]
     return consume(run_in_slices(executor, orders, run_in_worker, Budget(stop=stop)), callback)
-
-
-class LosingExecutor(Executor):
-    """Does each task at once, and loses some of them.
-
-    Args:
-        is_lost: Given the order and the number of tasks so far, whether it is lost.
-    """
-
-    _max_workers = 2
-
-    def __init__(self, is_lost: Callable[[Any, int], bool]) -> None:
-        self.is_lost = is_lost
-        self.count = 0
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        self.count += 1
-        order = next(each for each in args if isinstance(each, SliceOrder))
-        if self.is_lost(order, self.count):
-            future.set_exception(BrokenExecutor())
-        else:
-            future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
-        return future
 
 
 @pytest.mark.slow
