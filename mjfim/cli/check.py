@@ -17,6 +17,7 @@ from mjfim.cli.common import (
     Threads,
     Verbose,
     claim_folder,
+    draw_elsewhere,
     errors,
     print_result,
     progress,
@@ -63,6 +64,8 @@ def check(
     executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Say which parameters can be identified, how accurately, and which only in combination."""
+    if output is not None:
+        draw_elsewhere()
     from mjfim.cli.announcements import (
         announce_check,
         announce_check_of_recordings,

@@ -342,10 +342,13 @@ def permit_processes() -> None:
     _may_start_processes = True
 
 
-def draw_elsewhere() -> None:
-    """Let other processes draw the pictures and the video of the running verb's result.
+def draw_elsewhere(*, with_video: bool = False) -> None:
+    """Let other processes draw the pictures of the running verb's result.
 
     They import what they need while the verb works.
+
+    Args:
+        with_video: True where a video of the result is drawn, too.
     """
     if not _may_start_processes:
         return
@@ -354,7 +357,8 @@ def draw_elsewhere() -> None:
     from mjfim.output.video.process import process_waiting
 
     _claims.enter_context(drawing_elsewhere())
-    _claims.enter_context(process_waiting())
+    if with_video:
+        _claims.enter_context(process_waiting())
 
 
 def keep_result(folder: Path | None = None) -> None:

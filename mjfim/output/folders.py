@@ -381,6 +381,7 @@ def write_study_folder(
 
 def _write_views(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
     """Write the tables, the report and the figures of a result, from its files and its record."""
+    begin_pictures(record, picture_format)
     write_tables(folder, record)
     write_optional(REPORT, lambda: write_report(folder, type(record)))
     _write_figures(folder, record, picture_format)
