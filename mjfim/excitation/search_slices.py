@@ -8,7 +8,6 @@ costs at most one part.
 from __future__ import annotations
 
 import math
-import pickle
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
@@ -17,6 +16,7 @@ from typing import Generic, TypeVar
 from mjfim.budget import Budget, StopToken
 from mjfim.excitation.run_result import RunResult
 from mjfim.parallel import pool_stop_token
+from mjfim.parallel.sealed import opened, sealed
 from mjfim.records.design import Status
 
 # State from which a search goes on.
@@ -67,11 +67,11 @@ class SealedState(Generic[S]):
         Args:
             state: The state, which can be pickled.
         """
-        return cls(data=pickle.dumps(state, pickle.HIGHEST_PROTOCOL))
+        return cls(data=sealed(state))
 
     def opened(self) -> S:
         """Make a copy of the state, which a search may change."""
-        state: S = pickle.loads(self.data)
+        state: S = opened(self.data)
         return state
 
 

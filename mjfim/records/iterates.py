@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mjfim.parallel.sealed import opened, sealed
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of iterates of one search whose motions are kept, and number of samples of each.
@@ -55,22 +55,21 @@ class IterateMotion:
 
     def __reduce__(self) -> tuple[Callable[[bytes], IterateMotion], tuple[bytes]]:
         """Pickle the arrays as bytes, which are made once."""
-        sealed = self.__dict__.get(SEALED)
-        if sealed is None:
-            arrays = {name: getattr(self, name) for name in MOTION_ARRAYS}
-            sealed = pickle.dumps(arrays, pickle.HIGHEST_PROTOCOL)
-            object.__setattr__(self, SEALED, sealed)
-        return _sealed_motion, (sealed,)
+        data = self.__dict__.get(SEALED)
+        if data is None:
+            data = sealed({name: getattr(self, name) for name in MOTION_ARRAYS})
+            object.__setattr__(self, SEALED, data)
+        return _sealed_motion, (data,)
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
             """Read the arrays of a motion that comes from another process."""
-            sealed = self.__dict__.get(SEALED)
-            if sealed is None or name not in MOTION_ARRAYS:
+            data = self.__dict__.get(SEALED)
+            if data is None or name not in MOTION_ARRAYS:
                 raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
-            for key, array in pickle.loads(sealed).items():
+            for key, array in opened(data).items():
                 array.setflags(write=False)
                 object.__setattr__(self, key, array)
             return self.__dict__[name]
@@ -99,10 +98,10 @@ class IterateMotion:
         )
 
 
-def _sealed_motion(sealed: bytes) -> IterateMotion:
+def _sealed_motion(data: bytes) -> IterateMotion:
     """A motion whose arrays are read later."""
     motion = object.__new__(IterateMotion)
-    object.__setattr__(motion, SEALED, sealed)
+    object.__setattr__(motion, SEALED, data)
     return motion
 
 
