@@ -12,11 +12,13 @@ from mjfim.cli.common import (
     keep_result,
     progress,
 )
+from mjfim.cli.executors import MAX_PARTS, started_if_stated
 from mjfim.errors import ExperimentError, unknown
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.model.limited_elements import KINDS as LIMIT_KINDS
 from mjfim.output.archive import write_design
+from mjfim.parallel.stated import StatedExecutor
 
 # Kinds of limits from which a design can keep a reserve.
 KINDS = (*LIMIT_KINDS, "clearance")
@@ -83,7 +85,10 @@ def tightened(experiment: mjfim.Experiment, reserve: Mapping[str, float]) -> mjf
 
 
 def design_with_reserve(
-    experiment: mjfim.Experiment, reserve: Mapping[str, float], folder: Path
+    experiment: mjfim.Experiment,
+    reserve: Mapping[str, float],
+    folder: Path,
+    place: StatedExecutor,
 ) -> Path:
     """Design with a reserve to the limits, write the design, and print its status and margins.
 
@@ -91,13 +96,19 @@ def design_with_reserve(
         experiment: The experiment.
         reserve: Reserve by kind of limit, as a fraction of half a range.
         folder: Folder for the design.
+        place: Where the design is made.
 
     Returns:
         The folder.
     """
     task = DesignTask.resolve(tightened(experiment, reserve))
-    with progress("designing") as show, stop_on_interrupt() as stop:
-        design = design_task(task, callback=show, budget=design_budget(task, stop))
+    with (
+        started_if_stated(place, MAX_PARTS) as workers,
+        progress("designing") as show,
+        stop_on_interrupt() as stop,
+    ):
+        budget = design_budget(task, stop)
+        design = design_task(task, callback=show, executor=workers, budget=budget)
 
     write_design(folder, design, task.system)
     keep_result(folder)

@@ -133,7 +133,7 @@ def robustness(
 
     if design_folder is None:
         shares = parse_reserve(reserve or DEFAULT_RESERVE)
-        design_folder = design_with_reserve(stated, shares, output / "design")
+        design_folder = design_with_reserve(stated, shares, output / "design", place)
 
     begun = time.perf_counter()
     with started_executor(place, runs, jobs) as workers, progress("playing") as show:

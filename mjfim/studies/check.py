@@ -23,12 +23,14 @@ from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
 from mjfim.identification.fit_memory import require_memory_for_recordings
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.same_data import refuse_same_data
 from mjfim.identification.segments import recorded_release
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest
 from mjfim.information.marginal import shared
+from mjfim.optimize.levenberg_marquardt import completed
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
@@ -79,7 +81,7 @@ def check(
         stop: Ends the check early, as Ctrl-C does; the record then says what is missing.
         progress: False for no sign of progress in a notebook.
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
-            differentiates random motions side by side, where these are needed.
+            differentiates recordings side by side, and random motions where these are needed.
 
     Raises:
         RecordingError: Recordings are unusable, or given together with a trajectory.
@@ -159,6 +161,8 @@ def check_recordings(
     require_memory_for_recordings(system, recordings, fit=False)
     begin_stage("simulating the recordings")
     fit = FitProblem.of(system, recordings, data_only=True)
+    if executor is not None:
+        fit = fit.on_workers(FitWorkers(executor, stop))
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     task = _task_along(recorded_release(system, longest), system, longest.ctrl[:MAX_TESTED_SAMPLES])
 
@@ -167,7 +171,7 @@ def check_recordings(
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
     # Rows of G at the times of the measurements, and the error of their finite differences.
-    recorded = sensitivity_rows(fit, fit.begin(task.theta))
+    recorded = completed(lambda: sensitivity_rows(fit, fit.begin(task.theta)))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
     count = len(recordings)
 

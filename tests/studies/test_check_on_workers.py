@@ -5,9 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import pytest
+
 import mjfim
 from mjfim.budget import StopToken
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification import segment_simulation
 from mjfim.information.identifiability import Identifiability
 from mjfim.studies.probe_workers import ProbeWorkers
 from tests.support.executors import LosingThreads
@@ -44,3 +49,20 @@ def test_random_motions_are_the_same_although_tasks_are_lost() -> None:
     assert alone.along_trajectory.count > 0
     assert alone.along_all.count == 0
     assert found.along_all.smallest == alone.along_all.smallest
+
+
+@pytest.mark.slow
+def test_recordings_tell_the_same_although_tasks_are_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 200)
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
+    task = DesignTask.resolve(experiment, threads=1)
+    recordings = [simulate_system(task.system, task.initial, seed) for seed in range(3)]
+    alone = mjfim.check(experiment, recordings, threads=1)
+
+    with LosingThreads() as threads:
+        found = mjfim.check(experiment, recordings, threads=1, executor=threads)
+
+    assert threads.submitted > 3
+    assert np.array_equal(found.information, alone.information)
