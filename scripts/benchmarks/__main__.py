@@ -25,6 +25,7 @@ BENCHMARKS = {
     "mjx_oracle": "do the derivatives agree with those of MJX by automatic differentiation?",
     "scale_recordings": "how much memory and time do workers need that read many logs?",
     "scale": "do the verbs give the same on a cluster, and how well do they scale?",
+    "rail": "how many passes over its data does a fit with dry friction take?",
     "prove_identification": "do the 95 % intervals hold the true values?",
 }
 
