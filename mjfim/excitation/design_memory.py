@@ -79,10 +79,11 @@ def _moved_samples(system: System) -> int:
 def _engine_steps(system: System) -> int:
     """Numbers per sample of derivatives in closed form, which are kept at every engine step.
 
-    They stand in memory twice while their parts are put together.
+    Those of a motion, of the motion beside it and of the one before stand in memory together with
+    the parts from which the last one is put together.
     """
     nx, nv = system.space.nx, system.space.nv
-    return 2 * system.grid.substeps * (nv * (nx + len(system.controls)) + nx)
+    return 4 * system.grid.substeps * (nv * (nx + len(system.controls)) + nx)
 
 
 def _held(system: System) -> int:

@@ -101,9 +101,7 @@ class AffineForces:
             ctrl: (n, nu) controls.
             fields: The `FORCE_FIELDS` of the engine, each (n, nv).
         """
-        applied, is_free = self._applied(ctrl)
-        points = np.concatenate([np.ones((len(states), 1)), states, applied], axis=1)
-
+        points = self._points(states, ctrl)
         clamped, acts = self._clamped(points)
 
         # The largest terms of the function show the round-off that its sum may have.
@@ -115,7 +113,7 @@ class AffineForces:
         deviation = np.abs(total - sum(fields[name] for name in FORCE_FIELDS))
         agree = (deviation <= LARGEST_DEVIATION * terms.max(axis=0)).all(axis=1)
 
-        slopes = self._slopes(acts, is_free)
+        slopes = self._slopes(acts, self._applied(ctrl)[1])
         return ForceSlopes(slopes=slopes, implicit_damping=self._damping(slopes), agree=agree)
 
     def actuator_slopes(self, states: Array, ctrl: Array) -> Array:
@@ -125,12 +123,25 @@ class AffineForces:
             states: (n, 2 nv) states.
             ctrl: (n, nu) controls.
         """
-        applied, is_free = self._applied(ctrl)
-        points = np.concatenate([np.ones((len(states), 1)), states, applied], axis=1)
-        _, acts = self._clamped(points)
+        _, acts = self._clamped(self._points(states, ctrl))
+        _, is_free = self._applied(ctrl)
         slopes = acts[..., None] * self.actuators[:, 1:]
         slopes[..., slopes.shape[2] - is_free.shape[1] :] *= is_free[:, None]
         return np.asarray(slopes)
+
+    def clamped(self, states: Array, ctrl: Array) -> np.ndarray:
+        """(n, actuators) True where the force of an actuator is clamped.
+
+        Args:
+            states: (n, 2 nv) states.
+            ctrl: (n, nu) controls.
+        """
+        return ~self._clamped(self._points(states, ctrl))[1]
+
+    def _points(self, states: Array, ctrl: Array) -> Array:
+        """(n, 1 + 2 nv + nu) ones, states and controls within their limits."""
+        applied, _ = self._applied(ctrl)
+        return np.concatenate([np.ones((len(states), 1)), states, applied], axis=1)
 
     def _clamped(self, points: Array) -> tuple[Array, np.ndarray]:
         """(n, actuators) forces within their limits, and True where they are not clamped.

@@ -90,9 +90,8 @@ def closed_form_tree(model: Any, least_joints: int = LEAST_JOINTS) -> JointTree 
         or model.opt.density != 0.0
         or model.opt.viscosity != 0.0
     )
-    has_single_controls = model.nu == model.nactuator and (model.actuator_ctrlnum == 1).all()
     if (
-        not has_single_controls
+        not _has_affine_forces(model)
         or model.nv < least_joints
         or model.opt.integrator not in integrators
         or other_forces
@@ -100,6 +99,52 @@ def closed_form_tree(model: Any, least_joints: int = LEAST_JOINTS) -> JointTree 
         return None
 
     return JointTree.of(model)
+
+
+def _has_affine_forces(model: Any) -> bool:
+    """Whether moment arms are constant, and forces affine in (q, v, u), in all states.
+
+    The check of each engine step compares forces, not their slopes: a force that stays zero, or a
+    robot that stays at rest, shows nothing.
+    """
+    direct = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_TENDON)
+    biases = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+    has_affine_actuators = (
+        np.isin(model.actuator_trntype, [int(each) for each in direct]).all()
+        and (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)).all()
+        and np.isin(model.actuator_biastype, [int(each) for each in biases]).all()
+        and model.nu == model.nactuator == model.nout
+        and (model.actuator_ctrlnum == 1).all()
+    )
+
+    # A tendon of joints has constant moment arms; one over sites has not.
+    has_constant_arms = (model.wrap_type == int(mujoco.mjtWrap.mjWRAP_JOINT)).all()
+    other_elements = (
+        model.nhistory > 0
+        or model.nplugin > 0
+        or model.nplastic > 0
+        or model.tendon_actfrclimited.any()
+        or model.tendon_armature.any()
+        or model.actuator_armature.any()
+        or model.actuator_damping.any()
+    )
+    return bool(has_affine_actuators and has_constant_arms) and not (
+        other_elements or _has_polynomial_forces(model)
+    )
+
+
+def _has_polynomial_forces(model: Any) -> bool:
+    """Whether a spring or a damper has a force of higher order."""
+    return any(
+        getattr(model, name).any()
+        for name in (
+            "jnt_stiffnesspoly",
+            "tendon_stiffnesspoly",
+            "dof_dampingpoly",
+            "tendon_dampingpoly",
+            "actuator_dampingpoly",
+        )
+    )
 
 
 def is_inertial(parameter: Parameter) -> bool:

@@ -179,6 +179,9 @@ class ClosedFormDerivatives(DifferenceSteps):
 
             by_both = np.concatenate([moved.A - origin.A, moved.B - origin.B], axis=2)
             mixed[r] = np.swapaxes(by_both, 1, 2) / epsilon
+
+            # A force that reaches its limit between the two is a jump and has no derivative.
+            mixed[r][~_has_same_clamps(origin, moved, trajectory.ctrl)] = 0.0
         return MixedInClosedForm(first=origin, F_mixed=mixed)
 
     def closed_form_observations(
@@ -248,8 +251,9 @@ class ClosedFormDerivatives(DifferenceSteps):
         """
         memory = self.plant.closed_form_memory
         key = np.asarray(theta, dtype=np.float64).tobytes()
-        if key in memory.inertia_change:
-            return memory.inertia_change[key]
+        known = memory.inertia_change.get(key)
+        if known is not None:
+            return known
 
         steps = INERTIA_STEP * self.plant.parameters.magnitude
         change = np.zeros((len(closed.tree.bodies), 10, len(theta)))
@@ -266,3 +270,19 @@ class ClosedFormDerivatives(DifferenceSteps):
             memory.inertia_change.clear()
         memory.inertia_change[key] = change
         return change
+
+
+def _has_same_clamps(origin: SampleJacobians, moved: SampleJacobians, ctrl: Array) -> np.ndarray:
+    """(N,) True for samples in which the same actuators' forces are clamped in both motions.
+
+    Args:
+        origin: Derivatives along a motion.
+        moved: Derivatives along the motion beside it.
+        ctrl: (N, nu) controls of both.
+    """
+    N, points, nx = origin.states.shape
+    held = np.repeat(ctrl, points - 1, axis=0)
+    own, other = (
+        each.forces.clamped(each.states[:, :-1].reshape(-1, nx), held) for each in (origin, moved)
+    )
+    return np.asarray((own == other).reshape(N, -1).all(axis=1))

@@ -158,6 +158,8 @@ class RolloutDerivatives(ClosedFormDerivatives):
             states=states,
             closed_form=None if outputs.needs_sensors else trajectory,
         )
+        # Nothing asks for the gradient along this trajectory on account of a calibration.
+        self.plant.closed_form_memory.latest = None
         if measured is None:
             return None
 

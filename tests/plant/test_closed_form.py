@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
+from mjfim.plant.closed_form import closed_form_tree
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
 from mjfim.records.trajectory import Trajectory
 from tests.support.numerics import make_task
 
@@ -98,7 +101,7 @@ def assert_close(found: Any, expected: Any, accuracy: float) -> None:
 OPTIONS = (
     'integrator="implicitfast"',
     'integrator="Euler"',
-    'integrator="Euler" viscosity="0" gravity="3 -2 -9"',
+    'integrator="Euler" gravity="3 -2 -9"',
 )
 
 
@@ -144,15 +147,60 @@ def test_mixed_derivatives_agree_with_differences(tmp_path) -> None:
     assert sensitivity is not None
     directions = np.random.default_rng(2).standard_normal((2, len(task.theta)))
     directions *= task.parameters.magnitude
-    given = (task.theta, trajectory, sensitivity.psi, directions, CENTRAL_DIFFERENCES)
+    given = (task.theta, trajectory, sensitivity.psi, directions)
 
-    found = task.plant.derivatives.bilinear(*given)
-    expected = with_differences(task).plant.derivatives.bilinear(*given)
+    found = task.plant.derivatives.bilinear(*given, FORWARD_DIFFERENCES)
+    central = task.plant.derivatives.bilinear(*given, CENTRAL_DIFFERENCES)
+    expected = with_differences(task).plant.derivatives.bilinear(*given, CENTRAL_DIFFERENCES)
+
+    # Central differences never come from the closed form.
+    np.testing.assert_array_equal(central.F_mixed, expected.F_mixed)
     assert_close(found.A, expected.A, 1e-6)
     assert_close(found.B, expected.B, 1e-6)
     np.testing.assert_array_equal(found.C, expected.C)
     assert found.h_mixed is None and expected.h_mixed is None
     assert_close(found.F_mixed, expected.F_mixed, 1e-5)
+
+
+def test_numbers_that_are_shown_come_from_differences(tmp_path) -> None:
+    task = tree_task(tmp_path)
+    trajectory = curve(task)
+    shown = task.problem.point(trajectory, CENTRAL_DIFFERENCES)
+    quick = task.problem.point(trajectory)
+    expected = with_differences(task).problem.point(trajectory, CENTRAL_DIFFERENCES)
+    assert shown.information is not None and quick.information is not None
+    assert expected.information is not None
+
+    np.testing.assert_array_equal(shown.information, expected.information)
+    assert not np.array_equal(quick.information, expected.information)
+    assert_close(quick.information, expected.information, 1e-5)
+
+
+def test_a_force_that_reaches_its_limit_is_no_derivative(tmp_path) -> None:
+    task = tree_task(tmp_path)
+    trajectory, derivatives = curve(task), task.plant.derivatives
+    assert closed_form_tree(task.plant.simulator.model) is not None
+    p = len(task.theta)
+    psi = np.zeros((task.samples + 1, task.space.nx, p))
+    given = (task.theta, trajectory, psi, np.eye(p)[:1])
+    before = derivatives.closed_form_mixed(*given)
+    assert before is not None and before.F_mixed[0, 3].any()
+
+    # A speed of the shoulder at which its servo is nearly at the limit, and a direction beyond it.
+    forces, states = before.first.forces, before.first.states[3:4, 0].copy()
+    shoulder, nv = 2, task.space.nv
+    row, limit = forces.actuators[1], 9.0
+    states[0, nv + shoulder] = 0.0
+    without_speed = row @ np.concatenate([[1.0], states[0], trajectory.ctrl[3]])
+    qvel = trajectory.qvel.copy()
+    qvel[3, shoulder] = (limit * (1.0 - 1e-9) - without_speed) / row[1 + nv + shoulder]
+    psi[3, nv + shoulder, 0] = -1.0
+
+    at_limit = replace(trajectory, qvel=qvel)
+    found = derivatives.closed_form_mixed(task.theta, at_limit, psi, np.eye(p)[:1])
+    assert found is not None
+    assert not found.F_mixed[0, 3].any()
+    assert found.F_mixed[0, 5].any()
 
 
 def test_the_steps_of_differences_are_calibrated_in_closed_form(tmp_path) -> None:
@@ -210,6 +258,35 @@ def test_the_gradient_does_not_compute_known_derivatives_again(tmp_path) -> None
     again = task.problem.expand(point)
     np.testing.assert_array_equal(again.A, known.A)
     np.testing.assert_array_equal(again.b, known.b)
+
+
+# Actuators whose force or moment arm is another function of the state, and other elements.
+OTHERS = (
+    '<general joint="elbow" gaintype="affine" gainprm="0 0 -1"/>',
+    '<motor site="tip" gear="1 0 0 0 0 0"/>',
+    '<motor tendon="cable"/>',
+    '<motor joint="elbow" armature="0.1"/>',
+    '<motor joint="elbow" damping="0.1"/>',
+)
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_other_actuators_have_no_closed_form(other: str) -> None:
+    text = TREE.format(option="", joint="", load="")
+    assert closed_form_tree(mujoco.MjModel.from_xml_string(text)) is not None
+    text = text.replace("</actuator>", f"{other}</actuator>")
+    text = text.replace('<body name="load"', '<site name="tip" pos="0 0 .3"/><body name="load"')
+    text = text.replace('<body name="base"', '<site name="wall" pos="1 0 1"/><body name="base"')
+    cable = '<spatial name="cable"><site site="wall"/><site site="tip"/></spatial>'
+    text = text.replace("<actuator>", f"<tendon>{cable}</tendon><actuator>")
+    assert closed_form_tree(mujoco.MjModel.from_xml_string(text)) is None
+
+
+@pytest.mark.parametrize("spring", ['stiffness="1 2"', 'damping="1 2"'])
+def test_springs_and_dampers_of_higher_order_have_no_closed_form(spring: str) -> None:
+    text = TREE.format(option="", joint="", load="")
+    text = text.replace('stiffness="30" damping="1"', spring)
+    assert closed_form_tree(mujoco.MjModel.from_xml_string(text)) is None
 
 
 @pytest.mark.parametrize(
