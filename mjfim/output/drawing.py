@@ -62,7 +62,7 @@ class DrawingProcess:
 
     def end(self) -> None:
         """End the process at once."""
-        self._pool.end_running()
+        self._pool.end_running(wait=True)
 
 
 # The process that draws now; None where this process draws itself.

@@ -65,10 +65,14 @@ class _Processes(ProcessPoolExecutor):
         future.add_done_callback(self._end_if_broken)
         return future
 
-    def end(self) -> None:
-        """End the processes at once, whether or not their tasks have ended."""
+    def end(self, *, wait: bool = False) -> None:
+        """End the processes at once, whether or not their tasks have ended.
+
+        Args:
+            wait: Return after they have ended.
+        """
         self._release()
-        self.shutdown(wait=False, cancel_futures=True)
+        self.shutdown(wait=wait, cancel_futures=True)
 
     def _end_if_broken(self, future: Future[Any]) -> None:
         """End the other processes at once after one of them was ended from outside."""
@@ -151,9 +155,14 @@ class Pool(Executor):
         self._processes.stop.value = False
         self._close_listener()
 
-    def end_running(self) -> None:
-        """End the processes at once with their tasks; the next task starts new processes."""
-        self._processes.end()
+    def end_running(self, *, wait: bool = False) -> None:
+        """End the processes at once with their tasks; the next task starts new processes.
+
+        Args:
+            wait: Return after they have ended. A program that ends at once has to wait: Python's
+                own end of a program may otherwise print an error (a write to a closed pipe).
+        """
+        self._processes.end(wait=wait)
         self._has_ended = True
         self._close_listener()
 
