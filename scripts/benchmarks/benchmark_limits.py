@@ -25,6 +25,7 @@ import mjfim
 from mjfim.budget import stop_on_interrupt
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
+from mjfim.records.events import DesignEvent
 from scripts.benchmarks.run_in_subprocess import run_in_subprocess
 
 # Top folder of the repository.
@@ -35,6 +36,9 @@ EXPERIMENT = ROOT / "models" / "cart_pendulum_limits.toml"
 
 # Times at which the results are compared, besides the end [s].
 MARKS = (5.0, 10.0, 20.0, 40.0)
+
+# Sample rate of the experiment, at which each sample is one engine step [Hz].
+RATE = 100.0
 
 # Best known lambda_min.
 BEST = 403.4
@@ -87,11 +91,19 @@ def run_mjfim(seconds: float, seed: int) -> SolverResult:
     best = 0.0
     margin = 0.0
 
+    def watch(event: DesignEvent) -> None:
+        """Keep iterates on the stated plant, whose samples are engine steps, inside the limits."""
+        row = event.row
+        if row.rate == RATE and row.margin >= 0.0:
+            known = max((value for _, value in history), default=0.0)
+            if row.min_eigenvalue > known:
+                history.append((time.perf_counter() - clock, row.min_eigenvalue))
+
     with mjfim.Pool() as executor, stop_on_interrupt() as stop:
         while not stop.requested and (left := seconds - (time.perf_counter() - clock)) > 1.0:
             descent = {"seed": seed, "seconds": left}
             experiment = Experiment.from_file(EXPERIMENT).replace(descent=descent)
-            design = mjfim.design(experiment, executor=executor)
+            design = mjfim.design(experiment, executor=executor, callback=watch)
             seed += 1
             starts += len(design.starts)
 
