@@ -24,6 +24,7 @@ from mjfim.excitation.sample_workers import SampleWorkers
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start
 from mjfim.experiment.schema import Experiment
+from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
@@ -104,6 +105,7 @@ def design_task(
     initial_control: Array | None = None,
     executor: ExecutorLike | None = None,
     budget: Budget | None = None,
+    identifiability: Identifiability | None = None,
 ) -> Design:
     """Design the control of a task that is resolved already. See `design`.
 
@@ -113,6 +115,7 @@ def design_task(
         initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's.
         executor: Runs several starts side by side.
         budget: Time of the design and the token that stops it; default: `[descent] seconds`.
+        identifiability: What can be identified, as `designable` finds it, where that is known.
 
     Returns:
         The design.
@@ -139,8 +142,9 @@ def design_task(
         initial_control = _checked_control(task, initial_control)
     starts = list(initial_controls_of(task, initial_control))
     begin = _point_of_given(task, first, initial_control)
-    identifiability = identifiability_along(task, begin)
-    require_designable(task, identifiability)
+    if identifiability is None:
+        identifiability = identifiability_along(task, begin)
+        require_designable(task, identifiability)
 
     stage = DescentLevel(task, identifiability.basis)
     first, begin = stage.problem.reevaluated(first), stage.problem.reevaluated(begin)

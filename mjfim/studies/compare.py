@@ -28,6 +28,7 @@ from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
@@ -124,7 +125,8 @@ def compare_task(
         raise ExperimentError("compare: seconds must be positive and finite, and steps positive")
 
     chosen = (*chosen_methods(task, methods), DESIGN)
-    evaluation = MethodEvaluation(task, _identifiable_combinations(task))
+    identifiability = _identifiability(task)
+    evaluation = MethodEvaluation(task, identifiability.basis)
     search = BaselineSearch(
         experiment=task.experiment,
         method=DESIGN,
@@ -147,6 +149,7 @@ def compare_task(
                 callback=callback,
                 executor=workers,
                 stop=token,
+                identifiability=identifiability,
             )
             row = run.design(evaluation) if method == DESIGN else run.baseline(evaluation)
 
@@ -213,8 +216,8 @@ def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str
     return chosen
 
 
-def _identifiable_combinations(task: DesignTask) -> Array | None:
-    """(t, s) identifiable combinations, or None where all parameters are identifiable.
+def _identifiability(task: DesignTask) -> Identifiability:
+    """Find what can be identified, before the time of any method begins.
 
     Raises:
         MjfimError: No design is possible, as `mjfim.design` raises it.
@@ -222,7 +225,7 @@ def _identifiable_combinations(task: DesignTask) -> Array | None:
     identifiability = designable(task)
     if task.is_limited:
         require_feasible_start(task)
-    return identifiability.basis
+    return identifiability
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -236,6 +239,7 @@ class _MethodRun:
         callback: Called with the progress, or None.
         executor: The method is divided among its workers; None for this process.
         stop: Ends the method early.
+        identifiability: What can be identified; no method has to find it within its budget.
     """
 
     search: BaselineSearch
@@ -244,6 +248,7 @@ class _MethodRun:
     callback: Callback | None
     executor: ExecutorLike | None
     stop: StopToken
+    identifiability: Identifiability
 
     @property
     def title(self) -> str:
@@ -337,6 +342,7 @@ class _MethodRun:
                 callback=watch,
                 executor=self.executor,
                 budget=design_budget(task, watch.design_stop),
+                identifiability=self.identifiability,
             )
         except SimulationDivergedError:
             nothing = SearchResult(seconds=watch.budget.seconds_used, steps=watch.steps)

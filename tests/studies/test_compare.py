@@ -18,6 +18,7 @@ from matplotlib.image import imread
 import mjfim
 from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, NoResultError
+from mjfim.excitation import design as design_module
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
@@ -95,6 +96,17 @@ def test_each_method_has_its_budget_and_the_design_comes_last() -> None:
     assert c.rows[2].steps < 2.0 * 100_000  # its survey, and looking at the result, come on top
     assert c.steps == 100_000
     assert not c.interrupted
+
+
+@pytest.mark.slow
+def test_no_method_has_to_find_what_can_be_identified(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("it is known before the time of the design begins")
+
+    monkeypatch.setattr(design_module, "identifiability_along", refuse)
+    c = mjfim.compare(pendulum(), seconds=1e9, steps=3000, methods=["chirp"])
+    assert [r.method for r in c.rows] == ["chirp", DESIGN]
+    assert c.rows[1].sound
 
 
 def test_rows_hold_the_numbers_of_their_controls() -> None:
