@@ -162,8 +162,9 @@ class ConstrainedSlice(SliceOrder[SearchState]):
         return self.search.start.name
 
 
-# Number of tasks that a worker keeps for later slices: those of all levels of a design.
-KEPT_TASKS = 5
+# Number of tasks that a worker keeps for later slices: those of all levels of a design, and that of
+# the stated level with the threads of later rounds.
+KEPT_TASKS = 6
 _tasks = KeptPerThread[DesignTask](KEPT_TASKS)
 
 

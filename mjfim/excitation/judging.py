@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mjfim.excitation.constrained import (
-    ConstrainedSearch,
     ConstrainedSlice,
     run_in_worker,
     task_in_worker,
@@ -16,9 +15,10 @@ from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.rounds import Judge, Judgement
 from mjfim.excitation.run_result import RunResult
-from mjfim.excitation.search_slices import SealedState, SearchSlice
+from mjfim.excitation.search_slices import SearchSlice
 from mjfim.parallel import one_blas_thread
 from mjfim.parallel.kept import KeptPerThread
+from mjfim.parallel.shared_value import SharedValue
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,15 +29,15 @@ class JudgeOrder:
         judge: Who judges it.
         result: The result, without its history.
         begun: Control with which the round began.
-        stated: A search on the stated level, of which the worker makes the cost once.
-        task_key: Text that is equal for searches on the same task.
+        stated: Order for a search on the stated level, of which the worker makes the cost once.
+            Each worker receives it once, by the means of its executor: some of them also send
+            functions that have no name.
     """
 
     judge: Judge
     result: RunResult
     begun: InitialControl
-    stated: SealedState[ConstrainedSearch]
-    task_key: str
+    stated: SharedValue[ConstrainedSlice]
 
 
 # Cost on the stated plant that a worker keeps.
@@ -85,9 +85,9 @@ def _judge_in_worker(order: JudgeOrder) -> Judgement:
 
     def made() -> LimitedCost:
         """The cost on the stated plant."""
-        search = order.stated.opened()
-        task = task_in_worker(order.task_key, search)
-        return LimitedCost(level=DescentLevel(task, search.combinations))
+        stated = order.stated.value
+        task = task_in_worker(stated.task_key, stated.search)
+        return LimitedCost(level=DescentLevel(task, stated.search.combinations))
 
-    cost = _costs.get(order.task_key, made)
+    cost = _costs.get(order.stated.digest, made)
     return counted_judgement(order.judge, cost, order.result, order.begun)

@@ -16,7 +16,6 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult
 from mjfim.excitation.sent_task import SentTask
 from mjfim.excitation.sliced_searches import run_in_slices
-from mjfim.model.variants import ModelVariant
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.records.events import DesignEvent
 
@@ -108,15 +107,10 @@ class LimitedSearches:
         """
         threads = Workers.of(executor).threads_for(count)
         sent = replace(search, experiment=self._sent.experiment, threads=threads)
-        return ConstrainedSlice(search=sent, task_key=self.task_key(search.variant))
 
-    def task_key(self, variant: ModelVariant) -> str:
-        """Text that is equal for orders on the same plant of this design.
-
-        Args:
-            variant: The plant.
-        """
-        return self._sent.key_of(variant)
+        # A worker keeps the plant together with its threads, of which later rounds have more.
+        key = f"{self._sent.key_of(search.variant)} {threads}"
+        return ConstrainedSlice(search=sent, task_key=key)
 
     def run(
         self, level: DescentLevel, start: InitialControl, terms: SearchTerms

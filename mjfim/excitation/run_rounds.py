@@ -6,22 +6,24 @@ number of workers and whichever of them are lost. No worker waits for the end of
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Any
 
 from mjfim.budget import Budget
-from mjfim.excitation.constrained import ConstrainedSearch, ConstrainedSlice
+from mjfim.excitation.constrained import ConstrainedSlice
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.judging import JudgeOrder, counted_judgement, work_of_round
 from mjfim.excitation.merged_results import continued, numbered_from
 from mjfim.excitation.rounds import Entry, Judge, Judgement, RoundPlan
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.running_rounds import EndedSearch, RunningRounds
-from mjfim.excitation.search_slices import SealedState, SearchSlice
+from mjfim.excitation.search_slices import SearchSlice
 from mjfim.excitation.sliced_searches import SlicedSearches
 from mjfim.excitation.winner_repair import SECONDS_AFTER_STOP
 from mjfim.parallel import Dispatch, ExecutorLike, NumberedOrder, Outcome, Workers
+from mjfim.parallel.shared_value import SharedValue
 from mjfim.records.events import DesignEvent
 
 
@@ -89,8 +91,8 @@ class _RoundsOnWorkers:
         self._late = _LateResults(plan, self.rounds)
         self._slices = SlicedSearches[ConstrainedSlice]()
 
-        # A search on the stated level, which is the same for all judgements.
-        self._stated: SealedState[ConstrainedSearch] | None = None
+        # Order for a search on the stated level, which is the same for all judgements.
+        self._stated: SharedValue[ConstrainedSlice] | None = None
 
         # Searches that have begun and are not judged, and those of them that have ended.
         self._under_way: dict[int, Entry] = {}
@@ -174,13 +176,12 @@ class _RoundsOnWorkers:
         if self._stated is None:
             search = searches.search(searches.stated, entry.start, self.plan.terms(entry, 0.0))
             order = searches.order(self._executor, search, self.rounds.expected(0))
-            self._stated = SealedState.of(order.search)
+            self._stated = SharedValue(uuid.uuid4().hex, order)
         return JudgeOrder(
             judge=judge,
             result=replace(ended.result, history=()),
             begun=entry.start,
             stated=self._stated,
-            task_key=searches.task_key(searches.stated.task.system.variant),
         )
 
     def _take_judgement(self, outcome: Outcome[Judgement]) -> None:
