@@ -12,7 +12,7 @@ LEAST_SHARE = 0.5
 
 
 class RoundTimes:
-    """Divides the time that is left among the searches that have not begun.
+    """Divides the time that is left among the searches that have not ended.
 
     What a search leaves of its time is for those that begin after it.
 
@@ -36,7 +36,8 @@ class RoundTimes:
         Args:
             number: Number of the round.
             share: Share of the time that is left for the round, if this is its first search.
-            count: Number of searches of the round that have not begun, with this one.
+            count: Number of searches of the round that have not ended, with this one: those that
+                have not begun, and those that workers have taken or wait to begin.
         """
         turns = self._turns(count)
         used = self._budget.seconds_used

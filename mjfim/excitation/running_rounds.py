@@ -52,6 +52,9 @@ class RunningRounds:
         self._pending: list[tuple[int, float, int, Entry]] = []
         self._pending_in: Counter[int] = Counter()
         self._begun: Counter[int] = Counter()
+
+        # Number of the begun searches of each round that have ended.
+        self._over: Counter[int] = Counter()
         self._results: dict[int, RunResult] = {}
         self._entries: dict[int, EndedSearch] = {}
         self._judgements: dict[int, Judgement] = {}
@@ -100,7 +103,11 @@ class RunningRounds:
             entry: The start.
         """
         number = entry.round
-        count = max(self._pending_in[number] + 1, self.expected(number) - self._begun[number])
+
+        # Workers take searches before they have time for them, so that those under way count too.
+        under_way = self._begun[number] - self._over[number]
+        left = self.expected(number) - self._over[number]
+        count = max(self._pending_in[number] + 1 + under_way, left)
         self._begun[number] += 1
         seconds = self._times.seconds(number, self._plan.rounds[number].share, count)
         return self._plan.terms(entry, seconds)
@@ -113,6 +120,7 @@ class RunningRounds:
             judgement: What its result is worth on the stated plant.
         """
         entry = ended.entry
+        self._over[entry.round] += 1
         self._keep(ended, judgement.result)
         self._entries[entry.number] = ended
         self._judgements[entry.number] = judgement
@@ -135,6 +143,7 @@ class RunningRounds:
             ended: The search.
             result: What counts as its result.
         """
+        self._over[ended.entry.round] += 1
         self._keep(ended, result)
         self.drop(ended.entry)
 
