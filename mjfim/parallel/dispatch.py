@@ -134,7 +134,6 @@ class Dispatch(Generic[Order, T]):
         self._workers = workers
         self._function = function
         self._budget = budget
-        self._has_arrived = False
         self._waiting: deque[_Work[Order]] = deque()
         self._running: dict[Future[T | AbsentValue], _Work[Order]] = {}
         self._ended: SimpleQueue[Future[T | AbsentValue]] = SimpleQueue()
@@ -165,7 +164,8 @@ class Dispatch(Generic[Order, T]):
 
         After a request to stop nothing more is begun, and what has ended within `GRACE` seconds is
         reported. If the caller ends the iteration, what runs is stopped. So is what still runs long
-        after the time of the budget is over, as a task that hangs, if there is any outcome.
+        after the time of the budget is over, as a task that hangs or a cluster that has gone, if
+        the workers have ended any task before, of this or of earlier work.
 
         Yields:
             The outcome of every order, in the order of arrival.
@@ -183,7 +183,7 @@ class Dispatch(Generic[Order, T]):
 
                 outcome = self._next_outcome()
                 if outcome is not None:
-                    self._has_arrived = True
+                    self._workers.has_answered = True
                     yield outcome
                 elif self._is_overdue():
                     self._abandon()
@@ -286,12 +286,12 @@ class Dispatch(Generic[Order, T]):
         limit = budget.deadline - budget.begun
         if budget.seconds_used - limit <= max(LONGEST_OVERTIME, OVERTIME_SHARE * limit):
             return False
-        if not self._has_arrived and self._workers.is_empty:
+        if not self._workers.has_answered and self._workers.is_empty:
             raise ExperimentError(
                 "executor: the cluster had no workers until the time was over; start workers, and "
                 "wait for them before, as with client.wait_for_workers(1)"
             )
-        return self._has_arrived
+        return self._workers.has_answered
 
     def _abandon(self) -> None:
         """End all tasks at once; what they have found is lost."""

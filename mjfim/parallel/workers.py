@@ -60,6 +60,9 @@ class Workers(Executor):
     Raises:
         ExperimentError: The object cannot run tasks or is wrapped already, or a number is not
             positive.
+
+    Attributes:
+        has_answered: Whether any task has ended so far.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class Workers(Executor):
         self._stated_threads = threads
         self._known_count = 0
         self._count_until = 0.0
+        self.has_answered = False
 
     @classmethod
     def of(cls, executor: ExecutorLike) -> Workers:
