@@ -155,7 +155,10 @@ class LimitedSearch:
 
             # Descend from there.
             start = InitialControl(name=result.name, control=best.begin)
-            descended, *_ = yield from self._descend([start], done=done)
+            found = yield from self._descend([start], done=done)
+            if not found:
+                return result
+            descended = found[0]
             before, best = best, self._best_inside(descended.control, best) or best
             is_descent_useful = _is_progress(before, best)
             result = append_run(result, descended)
