@@ -129,7 +129,7 @@ def design_task(
 
     # Samples of a robust design are independent of each other, as starts are.
     if executor is not None and task.samples_of_parameters is not None:
-        task = replace(task, sample_evaluation=SampleWorkers(executor, budget.stop))
+        task = replace(task, sample_evaluation=SampleWorkers(executor, budget))
 
     _require_controls(task)
     require_feasible_start(task)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken
+from mjfim.budget import Budget
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.packing import for_workers
@@ -21,7 +21,7 @@ from mjfim.experiment.system import System
 from mjfim.information.criteria import Criterion
 from mjfim.information.fisher import FisherInformation
 from mjfim.model.variants import ModelVariant
-from mjfim.parallel import ExecutorLike, Workers, carry_out, one_blas_thread
+from mjfim.parallel import Dispatch, ExecutorLike, Workers, one_blas_thread
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.shared_value import SharedValue
 from mjfim.plant.mixed_derivatives import (
@@ -180,13 +180,14 @@ class SampleWorkers:
 
     Args:
         executor: The workers, or an executor that they can wrap.
-        stop: Token after whose request this process evaluates the samples that are still needed:
-            Ctrl-C in a terminal may have ended the workers.
+        budget: Time of the design, after which workers that do not answer are given up. After a
+            request of its token, this process evaluates the samples that are still needed: Ctrl-C
+            in a terminal may have ended the workers.
     """
 
-    def __init__(self, executor: ExecutorLike, stop: StopToken) -> None:
+    def __init__(self, executor: ExecutorLike, budget: Budget) -> None:
         self._workers = Workers.of(executor)
-        self._stop = stop
+        self._budget = budget
         self._plants: dict[tuple[str, ModelVariant, int], SharedValue[_PlantOrder]] = {}
         self._problems: dict[tuple[int, int], tuple[DesignProblem, SharedValue[_ProblemOrder]]]
         self._problems = {}
@@ -265,8 +266,12 @@ class SampleWorkers:
     ) -> Iterator[_Found[T]]:
         """Results of all orders, in their order, those of lost workers from this process."""
         found: dict[int, _Found[T]] = {}
-        if not self._stop.requested:
-            for outcome in carry_out(self._workers, function, orders, Budget(stop=self._stop)):
+        if not self._budget.stop.requested:
+            # All samples are needed, also when the time is over, so that none is left out then.
+            dispatch = Dispatch[_SampleOrder, _Found[T]](self._workers, function, self._budget)
+            for index, order in enumerate(orders):
+                dispatch.add(index, order)
+            for outcome in dispatch.arrivals():
                 if not outcome.is_lost:
                     found[outcome.index] = outcome.result
 
