@@ -24,12 +24,14 @@ from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.round_times import LEAST_SHARE, RoundTimes
 from mjfim.excitation.rounds import Judgement
 from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.running_rounds import RunningRounds
 from mjfim.excitation.search_slices import SealedState, SearchSlice
 from mjfim.excitation.task import DesignTask
 from mjfim.records.design import Design, Status
 from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
 from tests.support.executors import LosingExecutor, processes
 from tests.support.limits import cart_inside
+from tests.support.numerics import CART_PARAMETERS
 
 
 def promoted(costs: Sequence[float], arrivals: Sequence[int]) -> list[int]:
@@ -156,6 +158,31 @@ def test_invented_results_are_the_same_on_any_number_of_workers(task: DesignTask
 # ---- the time of a search
 
 
+def test_searches_that_wait_on_workers_share_the_time_of_their_round(task: DesignTask) -> None:
+    """Two workers take all four searches at once, each of which does two of them."""
+    with ThreadPoolExecutor(2) as threads:
+        plan = multistart_of(task, 4, threads)
+        timed = replace(plan, searches=replace(plan.searches, budget=Budget(seconds=3600.0)))
+        rounds = RunningRounds(timed, timed.starts)
+        seconds = []
+        while (entry := rounds.next_entry()) is not None:
+            seconds.append(rounds.terms(entry).seconds)
+    assert seconds == pytest.approx([seconds[0]] * 4, rel=1e-3)
+
+
+def test_a_worker_keeps_plants_with_different_threads_apart(task: DesignTask) -> None:
+    with ThreadPoolExecutor(4) as threads:
+        plan = multistart_of(task, 4, threads)
+        searches = plan.searches
+        rounds = RunningRounds(plan, plan.starts)
+        entry = rounds.next_entry()
+        assert entry is not None
+        search = searches.search(searches.stated, entry.start, rounds.terms(entry))
+        many, few = (searches.order(threads, search, count) for count in (1, 4))
+    assert (many.search.threads, few.search.threads) == (4, 1)
+    assert many.task_key != few.task_key
+
+
 def test_what_a_search_leaves_of_its_time_is_for_those_after_it() -> None:
     now = [0.0]
     budget = Budget(seconds=110.0)
@@ -214,3 +241,23 @@ def test_starts_give_the_same_design_on_any_executor(
     assert digits(design_task(task, executor=losing)) == serial
     with processes("pool") as pool:
         assert digits(design_task(task, executor=pool)) == serial
+
+
+@pytest.mark.slow
+def test_threads_design_with_a_parameter_that_is_a_local_function(tmp_path: Path) -> None:
+    """Results are judged on the stated plant, so that workers need the whole experiment."""
+
+    def weigh(spec: Any, value: float) -> None:
+        """Set the mass; this function cannot be pickled."""
+        spec.body("bob").mass = value
+
+    mass = {"function": weigh, "guess": 2.0, "unit": "kg"}
+    task = cart_inside(
+        tmp_path,
+        horizon=0.3,
+        parameters={**CART_PARAMETERS, "m": mass},
+        descent={"starts": 2, "max_iterations": 3},
+    )
+    serial = digits(design_task(task))
+    with ThreadPoolExecutor(2) as threads:
+        assert digits(design_task(task, executor=threads)) == serial

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -11,10 +14,12 @@ from mjfim.excitation import random_search
 from mjfim.excitation.controls_within_limits import ControlsWithinLimits, LimitedCost
 from mjfim.excitation.design import design_task
 from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.limited_search import LimitedSearch
 from mjfim.excitation.random_search import RandomSearch
-from mjfim.excitation.run_result import consume
+from mjfim.excitation.run_result import RunResult, Runs, consume
 from mjfim.excitation.short_steps import ShortSteps
 from mjfim.excitation.task import DesignTask
+from mjfim.records.events import DesignEvent
 from tests.support.stiff_servos import dry_arm_experiment, stiff_arm_task
 
 
@@ -99,3 +104,29 @@ def test_a_design_with_dry_friction_is_far_better_than_its_start(tmp_path: Path)
     assert not design.initial_violations
     assert design.within_limits
     assert design.final.eigenvalues[0] > 500.0 * design.initial.eigenvalues[0]
+
+
+def test_a_descent_that_did_not_begin_leaves_the_result_of_the_random_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Workers may return nothing, as after a request to stop."""
+    better: Any = SimpleNamespace(cost=1.0, begin=None)
+    changed = RunResult(name="changed", cost=1.0)
+
+    def none(*args: Any, **kwargs: Any) -> Runs:
+        yield from ()
+        return []
+
+    def change(*args: Any) -> Generator[DesignEvent, None, tuple[RunResult, Any]]:
+        yield from ()
+        return changed, better
+
+    best = SimpleNamespace(cost=2.0)
+    monkeypatch.setattr(LimitedSearch, "_best_inside", lambda *args: best)
+    monkeypatch.setattr(LimitedSearch, "_changed", change)
+    monkeypatch.setattr(LimitedSearch, "_descend", none)
+    monkeypatch.setattr(LimitedSearch, "_max_iterations", 10)
+    nothing: Any = None
+    search = LimitedSearch(limited=nothing, is_rough=True, executor=None, budget=Budget())
+    steps = search._helped_by_chance(nothing, RunResult(name="before"), None)
+    assert consume(steps, None) is changed

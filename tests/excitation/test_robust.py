@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from scipy.stats import norm
 
 import mjfim
+from mjfim.budget import Budget
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
@@ -19,6 +21,7 @@ from mjfim.excitation.robust import ParameterSamples
 from mjfim.excitation.task import DesignTask
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import Parameter, ParameterSet
+from mjfim.parallel import dispatch
 from tests.support.numerics import CART_PARAMETERS, Array, body_task, cart_task
 
 KINDS = {
@@ -285,3 +288,26 @@ def test_workers_evaluate_the_samples_as_one_process_does(
     assert found.final.cost == alone.final.cost
     assert np.array_equal(found.trajectory.ctrl, alone.trajectory.ctrl)
     assert [row.cost for row in found.history] == [row.cost for row in alone.history]
+
+
+def test_a_cluster_that_does_not_answer_ends_a_robust_design(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dispatch, "GRACE", 0.02)
+    monkeypatch.setattr(dispatch, "LONGEST_OVERTIME", 0.02)
+    monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.01)
+
+    class Empty(Executor):
+        """A Dask cluster without workers, on which nothing begins."""
+
+        _client = SimpleNamespace(nthreads=lambda: {})
+
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            return Future()
+
+    bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.5, 3.5)}}
+    task = cart_task(
+        tmp_path, parameters={**CART_PARAMETERS, **bounded}, robust={"samples": 3}, horizon=0.1
+    )
+    with pytest.raises(ExperimentError, match="had no workers"):
+        design_task(task, executor=Empty(), budget=Budget(seconds=0.0))

@@ -238,6 +238,26 @@ def test_a_cluster_without_workers_is_an_error_when_the_time_is_over(
         list(carry_out(Idle(FakeClient()), square, range(2), Budget(seconds=0.0)))
 
 
+def test_a_cluster_that_vanishes_after_a_result_ends_the_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A verb uses several dispatches; what the earlier ones have found must not be lost."""
+    monkeypatch.setattr(dispatch, "GRACE", 0.05)
+    monkeypatch.setattr(dispatch, "LONGEST_OVERTIME", 0.05)
+    monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.02)
+
+    class Vanishing(FakeDaskExecutor):
+        """A cluster whose workers end after the first task."""
+
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            return Future() if self.submitted else super().submit(fn, *args)
+
+    monkeypatch.setattr(FakeClient, "nthreads", lambda self: {})
+    workers = Workers(Vanishing(FakeClient()))
+    assert [each.result for each in carry_out(workers, square, [3], Budget(seconds=0.0))] == [9]
+    assert list(carry_out(workers, square, range(2), Budget(seconds=0.0))) == []
+
+
 def test_without_time_the_first_order_is_carried_out_and_the_rest_is_left_out() -> None:
     executor = FakeExecutor(lambda order, times: None)
     found = list(carry_out(executor, square, range(9), Budget(seconds=0.0)))
