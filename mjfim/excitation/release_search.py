@@ -140,7 +140,14 @@ class ReleaseSearch:
     def _evaluated(self, grid: list[Array]) -> Iterator[Release]:
         """Evaluate releases in their order, until a share of the time is used."""
         if self._workers is not None:
-            yield from self._workers.grid(self._evaluation, grid, GRID_TIME_SHARE)
+            count = 0
+            for release in self._workers.grid(self._evaluation, grid, GRID_TIME_SHARE):
+                yield release
+                count += 1
+
+            # After a request to stop before the first result there is at least this one.
+            if not count:
+                yield self._evaluation.release(grid[0])
             return
 
         for shares in grid:

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.budget import Budget, StopToken
 from mjfim.errors import ExperimentError
 from mjfim.excitation import release_search, release_workers
+from mjfim.excitation.design import design_task
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -104,6 +106,17 @@ def test_workers_find_the_release_of_one_process(
     assert [(s.name, s.cost, s.status, s.iterations) for s in found.starts] == [
         (s.name, s.cost, s.status, s.iterations) for s in alone.starts
     ]
+
+
+@pytest.mark.slow
+def test_a_request_to_stop_before_the_first_release_leaves_the_stated_one(tmp_path: Path) -> None:
+    task = DesignTask.resolve(short(tmp_path, horizon=0.1), threads=1)
+    stop = StopToken()
+    stop.request()
+    with ThreadPoolExecutor(2) as executor:
+        design = design_task(task, executor=executor, budget=Budget(stop=stop))
+    assert np.isfinite(design.final.cost)
+    assert len(design.history) == 1
 
 
 def test_an_optimum_at_the_end_of_a_range_is_said(tmp_path: Path) -> None:
