@@ -29,6 +29,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import verify
 from mjfim.information.smoothness import roughness
+from mjfim.interruption import hurried
 from mjfim.parallel import ExecutorLike, LostWorkError
 from mjfim.records.design import Status
 
@@ -177,13 +178,23 @@ class ControlSearch:
         """Results of which the first and the best ones are evaluated on the unmodified plant.
 
         The costs of the others are those of the searches. After a request to stop, these may be
-        costs on a coarse level, of controls that were not verified.
+        costs on a coarse level, of controls that were not verified. Further ones are then evaluated
+        until one keeps all limits.
         """
         by_cost = sorted(range(len(results)), key=lambda index: results[index].cost)
-        evaluated = {0, *by_cost[:EVALUATED_LIMITED]}
+        first, others = by_cost[:EVALUATED_LIMITED], by_cost[EVALUATED_LIMITED:]
+        wanted = {0, *first} & set(by_cost)
+        evaluated = {index: self._on_stated_plant(results[index]) for index in sorted(wanted)}
+
         is_stopped = self.budget.stop.requested
+        for index in others if is_stopped else []:
+            if hurried() or any(result.is_feasible for result in evaluated.values()):
+                break
+            if index not in evaluated:
+                evaluated[index] = self._on_stated_plant(results[index])
+
         return [
-            self._on_stated_plant(result)
+            evaluated[index]
             if index in evaluated
             else replace(result, is_feasible=bool(np.isfinite(result.cost)) and not is_stopped)
             for index, result in enumerate(results)

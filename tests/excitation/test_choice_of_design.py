@@ -10,8 +10,14 @@ import numpy as np
 import pytest
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget, StopToken
 from mjfim.excitation import control_search
-from mjfim.excitation.control_search import EVALUATED_STOPPED, choose
+from mjfim.excitation.control_search import (
+    EVALUATED_LIMITED,
+    EVALUATED_STOPPED,
+    ControlSearch,
+    choose,
+)
 from mjfim.excitation.run_result import RunResult
 from mjfim.parallel import LostWorkError
 from mjfim.records.design import Status
@@ -71,3 +77,25 @@ def test_a_design_all_of_whose_workers_are_lost_says_so() -> None:
     results = [RunResult(name=name, status=Status.LOST) for name in ("first", "second")]
     with pytest.raises(LostWorkError, match="the workers of all starts were lost"):
         choose(SEARCH, [INITIAL], results, False)
+
+
+def test_a_control_within_limits_is_found_behind_many_others_after_a_request_to_stop() -> None:
+    evaluated: list[str] = []
+
+    def on_stated_plant(result: RunResult) -> RunResult:
+        """Evaluate a result; that of the start `10` alone keeps all limits."""
+        evaluated.append(result.name)
+        return replace(result, is_feasible=result.name == "10")
+
+    stop = StopToken()
+    search: Any = SimpleNamespace(budget=Budget(stop=stop), _on_stated_plant=on_stated_plant)
+    results = [RunResult(name=f"{i}", cost=float(i)) for i in range(14)]
+    ControlSearch._evaluated(search, results)
+    assert evaluated == [f"{i}" for i in range(EVALUATED_LIMITED)]
+
+    evaluated.clear()
+    stop.request()
+    found = ControlSearch._evaluated(search, results)
+    assert evaluated == [f"{i}" for i in range(11)]
+    assert [result.name for result in found if result.is_feasible] == ["10"]
+    assert ControlSearch._evaluated(search, []) == []
