@@ -486,7 +486,14 @@ def simulation(sizes: Sizes, measured: int, starts: int, picture: Path) -> bool:
         )
     save_curve(rows, LEAST_EFFICIENCY, picture)
     print(f"the curve is in {picture}")
-    return rows[-1].efficiency >= LEAST_EFFICIENCY
+    last = rows[-1]
+    return judge(
+        "design",
+        f"efficiency on {last.workers} simulated workers",
+        f"{last.efficiency:.3f}",
+        f">= {LEAST_EFFICIENCY}",
+        good=last.efficiency >= LEAST_EFFICIENCY,
+    )
 
 
 def _duration(verb: Verb, client: Any) -> float:
