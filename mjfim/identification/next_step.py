@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import evenly_spread_indices
+from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import NextStepLength, UnknownValues
@@ -15,12 +15,19 @@ from mjfim.optimize.levenberg_marquardt import NextStepLength, UnknownValues
 TESTED_SHARE = 0.1
 MIN_TESTED_SEGMENTS = 15
 
+# Smallest information of the tested segments about a parameter, as a share of what as many segments
+# hold on average. With less, the test says nothing about the parameter.
+FAIR_SHARE = 0.5
+
+# Multiples of the golden ratio, modulo 1, spread evenly without a period.
+GOLDEN_RATIO = 0.6180339887498949
+
 
 def next_step_on_part(problem: FitProblem) -> NextStepLength | None:
     """Make the test of a search over all segments of a problem.
 
-    Some segments, evenly spread, are linearised anew. How much their gradients differ from those
-    that the old linearisation predicts shows how far the next step would lead.
+    Some segments, spread over the data, are linearised anew. How much their gradients differ from
+    those that the old linearisation predicts shows how far the next step would lead.
 
     Args:
         problem: Problem of all segments.
@@ -29,9 +36,10 @@ def next_step_on_part(problem: FitProblem) -> NextStepLength | None:
         The test; None where there are too few segments for it.
     """
     count = len(problem.segments)
-    tested = evenly_spread_indices(count, int(TESTED_SHARE * count))
-    if len(tested) < MIN_TESTED_SEGMENTS:
+    wanted = int(TESTED_SHARE * count)
+    if wanted < MIN_TESTED_SEGMENTS:
         return None
+    tested = spread_over_data(count, wanted)
     part = problem.of_segments(tested)
 
     def length(condensed: Condensed, step: Step, at: UnknownValues) -> float:
@@ -39,6 +47,8 @@ def next_step_on_part(problem: FitProblem) -> NextStepLength | None:
         # A bound that stops the step leaves a gradient, which is no sign of another step.
         values = problem.common_values(at)
         if (values <= problem.lower).any() or (values >= problem.upper).any():
+            return np.inf
+        if _holds_too_little(condensed, tested, len(problem.layout.shared)):
             return np.inf
         anew = part.condense(replace(at, private=at.private[tested]))
         if anew is None:
@@ -50,10 +60,47 @@ def next_step_on_part(problem: FitProblem) -> NextStepLength | None:
         rows = condensed.common_rows
         of_priors = rows[:, :-1].T @ (rows[:, :-1] @ step.common + rows[:, -1])
         gradient = predicted.sum(axis=0) + of_priors + change * (count / len(tested))
-        try:
-            move = np.linalg.solve(condensed.information(), gradient)
-        except np.linalg.LinAlgError:
-            return np.inf
-        return float(np.sqrt(max(gradient @ move, 0.0)))
+        return _length_of_step(condensed, gradient)
 
     return length
+
+
+def spread_over_data(count: int, wanted: int) -> np.ndarray:
+    """Indices of some segments: one of each of equal stretches of the data, the first one included.
+
+    The place inside the stretch varies, so that segments of recordings of equal length are not all
+    taken at the same time of their recording.
+
+    Args:
+        count: Number of segments.
+        wanted: Number of stretches, at most `count`.
+
+    Returns:
+        (wanted,) ascending indices; fewer where stretches of less than two segments share one.
+    """
+    stretch = np.arange(wanted)
+    place = stretch * GOLDEN_RATIO % 1.0
+    return np.unique(((stretch + place) * (count / wanted)).astype(np.intp))
+
+
+def _holds_too_little(condensed: Condensed, tested: np.ndarray, shared: int) -> bool:
+    """Whether some segments hold too little information about one of the shared parameters."""
+    count = condensed.segment_count
+    J = condensed.reduced_rows()[:, :shared].reshape(count, -1, shared)
+    squares = np.sum(J**2, axis=1)
+    fair = squares.sum(axis=0) * (len(tested) / count)
+    return bool((squares[tested].sum(axis=0) < FAIR_SHARE * fair).any())
+
+
+def _length_of_step(condensed: Condensed, gradient: Array) -> float:
+    """Length of the step [standard deviations] that a gradient (c,) causes.
+
+    It is infinite where round-off of the information hides it.
+    """
+    scaled, scale = scaled_to_unit_diagonal(condensed.information())
+    gradient = gradient / scale
+    try:
+        square = float(gradient @ np.linalg.solve(scaled, gradient))
+    except np.linalg.LinAlgError:
+        return np.inf
+    return float(np.sqrt(square)) if square >= 0.0 else np.inf

@@ -239,6 +239,7 @@ class FitSearch:
                 break
             longer = problem.with_longer_differences(factor)
             settings = self._final_settings(longer, ROUGH_ITERATIONS)
+            settings = replace(settings, next_step_length=None)
             phase = "all data, longer differences"
             try:
                 found = self.minimise(longer, solution.unknowns, settings, phase)
@@ -270,11 +271,14 @@ class FitSearch:
         samples = problem.sample_count * 2 * len(self.task.system.parameters)
         if samples < SAMPLES_OF_MUCH_DATA:
             return settings
+
+        # A search over a part of the data has led near the minimum, where there is such a part.
+        begins_near = len(quick_subset(problem)) < len(problem.segments)
         return replace(
             settings,
             tolerance=FINAL_TOLERANCE_OF_MUCH_DATA,
             relinearise_at_end=False,
-            next_step_length=next_step_on_part(problem),
+            next_step_length=next_step_on_part(problem) if begins_near else None,
         )
 
     def with_initial_states(

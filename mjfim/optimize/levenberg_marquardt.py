@@ -372,10 +372,12 @@ class _Search:
         self._report(trial.step)
 
         if converged:
-            return self._finished()
+            return self._finished(trial.step)
         if self._needs_no_relinearisation(trial, predicted):
             self.condensed = self.condensed.after(trial.step)
-            return self._solution("converged: the step vanished", success=True)
+            return self._solution(
+                "converged: a part of the data shows that the next step would vanish", success=True
+            )
 
         self._relax_damping(trial.ratio)
         return self._linearise()
@@ -559,11 +561,10 @@ class _Search:
         self.condensed = condensed
         return None
 
-    def _finished(self) -> Solution:
+    def _finished(self, step: Step) -> Solution:
         """Solution after the last step, linearised there where the settings ask for it."""
-        if self.settings.relinearise_at_end:
-            self.condensed = self.problem.condense(self.unknowns) or self.condensed
-
+        anew = self.problem.condense(self.unknowns) if self.settings.relinearise_at_end else None
+        self.condensed = self.condensed.after(step) if anew is None else anew
         return self._solution("converged: the step vanished", success=True)
 
     def _without_progress(self, predicted: Step) -> Solution:

@@ -14,9 +14,9 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import next_step, searches
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.next_step import next_step_on_part
+from mjfim.identification.next_step import next_step_on_part, spread_over_data
 from mjfim.identification.task import FitTask
-from mjfim.optimize.condensed_least_squares import Condensed
+from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from tests.support.paths import MODELS
 
@@ -99,6 +99,82 @@ def test_a_search_from_far_away_linearises_again(task: FitTask) -> None:
     found = minimise(counting, problem.begin(task.start), settings, Budget())
     assert found is not None and found.success
     assert counting.linearisations > 1
+
+
+def first_step(problem: FitProblem, at: UnknownValues) -> tuple[Condensed, Step]:
+    """The linearisation at some unknowns, and the undamped step from there."""
+    condensed = problem.condense(at)
+    assert condensed is not None
+    free = np.full(condensed.common_count, np.inf)
+    return condensed, condensed.step(0.0, condensed.column_norms, -free, free)
+
+
+@pytest.mark.slow
+def test_the_length_is_that_of_the_step_that_follows(
+    task: FitTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(next_step, "TESTED_SHARE", 1.0)
+    problem = task.problem()
+    estimate = next_step_on_part(problem)
+    assert estimate is not None
+
+    at = problem.begin(task.start)
+    lengths = []
+    for _ in range(3):
+        condensed, step = first_step(problem, at)
+        at = problem.moved(at, step, 1.0)
+        _, following = first_step(problem, at)
+        lengths.append((estimate(condensed, step, at), following.common_length))
+
+    # Far away, the old information differs from that at the end of the step.
+    found, true = lengths[0]
+    assert true > 1.0 and found > 0.1 * true
+    near = [pair for pair in lengths if 1e-3 < pair[1] < 1.0]
+    assert near
+    for found, true in near:
+        assert found == pytest.approx(true, rel=0.3)
+
+
+@pytest.mark.slow
+def test_segments_without_information_about_a_parameter_tell_nothing(task: FitTask) -> None:
+    problem = task.problem()
+    estimate = next_step_on_part(problem)
+    assert estimate is not None
+    begin = problem.begin(task.start)
+    condensed, step = first_step(problem, begin)
+    at = problem.moved(begin, step, 1.0)
+    assert np.isfinite(estimate(condensed, step, at))
+
+    # The first parameter acts in the other segments only.
+    count = len(problem.segments)
+    tested = spread_over_data(count, count // 2)
+    blocks = np.array(condensed.blocks)
+    of_tested = np.isin(condensed.segment_of_block, tested)
+    blocks[of_tested, :, condensed.private_count] = 0.0
+    assert estimate(replace(condensed, blocks=blocks), step, at) == np.inf
+
+
+@pytest.mark.parametrize(("count", "wanted"), [(150, 15), (1000, 100), (205, 20), (40, 20)])
+def test_each_stretch_of_the_data_is_tested_once(count: int, wanted: int) -> None:
+    tested = spread_over_data(count, wanted)
+    assert len(tested) == wanted
+    assert tested[0] == 0 and tested[-1] < count
+    assert (np.abs(tested - np.arange(wanted) * count / wanted) <= count / wanted).all()
+
+    # Recordings of ten segments are tested at all their times.
+    assert set(spread_over_data(1000, 100) % 10) == set(range(10))
+
+
+@pytest.mark.slow
+def test_without_a_search_over_a_part_the_search_does_not_begin_near_the_minimum(
+    task: FitTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: FitProblem) -> None:
+        raise AssertionError("the search begins at the stated start")
+
+    monkeypatch.setattr(searches, "next_step_on_part", refuse)
+    monkeypatch.setattr(searches, "SAMPLES_OF_MUCH_DATA", 100)
+    assert mjfim.identify(task.system.experiment, task.recordings, threads=1).success
 
 
 def test_few_segments_are_not_tested(task: FitTask, monkeypatch: pytest.MonkeyPatch) -> None:

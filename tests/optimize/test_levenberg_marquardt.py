@@ -224,6 +224,19 @@ def test_the_minimum_agrees_with_scipy(name: str) -> None:
     assert found.cost == pytest.approx(p.cost(found.unknowns), rel=1e-12)
 
 
+def test_the_residuals_of_the_linearisation_are_those_of_the_estimate() -> None:
+    """Also where the last step was taken without a linearisation at its end."""
+    p = problem(*decays(), lower=[0.0, -2.0])
+    start = UnknownValues(theta=np.array([1.0, 0.4]), private=np.ones((3, 1)))
+    found = solved(p, start, SearchSettings(tolerance=1e-2, relinearise_at_end=False))
+    assert found.success
+    free = np.full(2, FREE)
+    last = found.condensed.step(0.0, found.condensed.column_norms, -free, free)
+    assert last.common_length < 1e-6
+    squares = float(np.sum(found.condensed.triangles[:, :, -1] ** 2))
+    assert 0.5 * squares == pytest.approx(found.cost, rel=1e-4)
+
+
 def test_gauss_newton_finds_the_minimum_and_ignores_bounds() -> None:
     """Steps that would raise the cost are halved."""
     p = problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0])
