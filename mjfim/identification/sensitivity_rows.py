@@ -56,18 +56,26 @@ def _condensed_sensitivity(problem: FitProblem, at: UnknownValues) -> dict[int, 
 
     Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes.
     """
-    batches = problem.simulation.batches(
-        derivatives=True, central=True, step=SENSITIVITY_STEP, by_all_parameters=True
+    batches = list(
+        problem.simulation.batches(
+            derivatives=True, central=True, step=SENSITIVITY_STEP, by_all_parameters=True
+        )
     )
     condensed: dict[int, Array] = {}
-    for found in problem.of_batches(sensitivities_of_batch, batches, at):
+    results = problem.of_batches(sensitivities_of_batch, batches, at)
+    for batch, found in zip(batches, results, strict=True):
         if found is None:
-            name = problem.recordings[0].name
             raise SimulationDivergedError(
-                f"{name}: the simulation diverges under the recorded control"
+                f"{_names(problem, batch)}: the simulation diverges under the recorded control"
             )
         condensed.update(found)
     return condensed
+
+
+def _names(problem: FitProblem, batch: SegmentBatch) -> str:
+    """Names of the recordings of a batch, one of which diverges."""
+    recordings = {problem.segments[segment].recording for segment in batch.segments}
+    return " or ".join(problem.recordings[index].name for index in sorted(recordings))
 
 
 def sensitivities_of_batch(
