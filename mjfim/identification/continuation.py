@@ -179,10 +179,9 @@ def _start_from_segments(
     for length in all_lengths:
         if search.interrupted():
             break
-        part = _segment_problem(task, system, length)
+        part = _segment_problem(problem, task, system, length)
         if part is None:
             continue
-        part = replace(part, workers=problem.workers)
         part = part.pinned(theta[places], _of_parameters(null_space, places))
         iterations = _iterations(problem, part, len(all_lengths))
         found = _fit_segments(search, part, theta[places], length, iterations)
@@ -245,14 +244,25 @@ def _free_system(system: System) -> System | None:
     return found.released(system.nominal_initial_state)
 
 
-def _segment_problem(task: FitTask, system: System, length: float) -> FitProblem | None:
-    """The problem of segments of a length [s]; None where a recording cannot be cut so."""
+def _segment_problem(
+    problem: FitProblem, task: FitTask, system: System, length: float
+) -> FitProblem | None:
+    """The problem of segments of a length [s]; None where a recording cannot be cut so.
+
+    It shares the workers and the recordings of the problem of the whole recordings.
+    """
     fit = system.experiment.fit.model_copy(update={"segments": length})
     experiment = system.experiment.model_copy(update={"fit": fit})
     try:
-        return FitProblem.of(replace(system, experiment=experiment), task.recordings)
+        part = FitProblem.of(replace(system, experiment=experiment), task.recordings)
     except RecordingError:
         return None
+
+    # Workers then receive no recording twice.
+    part = replace(part, workers=problem.workers)
+    if part.system.dt != problem.system.dt:
+        return part
+    return replace(part, simulation=replace(part.simulation, recordings=problem.recordings))
 
 
 def _of_parameters(null_space: NullSpace, places: np.ndarray) -> NullSpace:

@@ -14,6 +14,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording, align
@@ -27,7 +28,7 @@ from mjfim.identification.unknowns import UnknownLayout
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.parallel.kept import KeptPerThread
-from mjfim.parallel.shared_value import SharedValue, keep_value, require_values
+from mjfim.parallel.shared_value import AbsentValueError, SharedValue, keep_value, require_values
 from mjfim.plant.noise import Noise
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.log_file import FileContent
@@ -100,14 +101,14 @@ class RecordingOrder:
     def of(
         cls,
         recording: AlignedRecording,
-        channels: Channels,
+        channels: Channels | None,
         arrays: RecordingFiles | None = None,
     ) -> RecordingOrder:
         """Order a recording.
 
         Args:
             recording: The recording.
-            channels: How workers read logs.
+            channels: How workers read logs; None where they need not read this one.
             arrays: Its arrays as files of the caller.
 
         Raises:
@@ -115,11 +116,11 @@ class RecordingOrder:
         """
         size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
         file = recording.file
-        is_read_alike = file is not None and file.is_read_by(channels)
+        content = None
+        if file is not None and channels is not None and file.is_read_by(channels):
+            content = file.content
         return cls(
-            value=SharedRecording(uuid.uuid4().hex, recording, size),
-            file=file.content if file is not None and is_read_alike else None,
-            arrays=arrays,
+            value=SharedRecording(uuid.uuid4().hex, recording, size), file=content, arrays=arrays
         )
 
     @property
@@ -144,8 +145,20 @@ class RecordingOrder:
             return self.arrays.mapped()
         if self.file is None:
             return self.value.value
-        recording = align(system, read_recording(self.file.path, system.channels))
+        recording = self._read(self.file, system)
         keep_value(self.value, recording)
+        return recording
+
+    def _read(self, file: FileContent, system: System) -> AlignedRecording:
+        """The recording from its file. Raises AbsentValueError if the file changes meanwhile."""
+        try:
+            recording = align(system, read_recording(file.path, system.channels))
+        except RecordingError:
+            if file.is_here:
+                raise
+            raise AbsentValueError(self.value.digest) from None
+        if not file.is_here:
+            raise AbsentValueError(self.value.digest)
         return recording
 
 
@@ -189,6 +202,12 @@ class PartOrder:
             segments=segments,
             masks={i: problem.masks[each.recording][each.rows] for i, each in segments.items()},
         )
+
+    @property
+    def size(self) -> int:
+        """About the memory that it takes [bytes], without the problem and the recordings."""
+        masks = sum(mask.nbytes for mask in self.masks.values())
+        return masks + sum(segment.start.nbytes for segment in self.segments.values())
 
     def made(self) -> FitProblem:
         """Make the problem; recordings and segments that are not needed are empty."""

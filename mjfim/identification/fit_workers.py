@@ -154,10 +154,10 @@ class FitWorkers:
             FitProblem, dict[tuple[int, ...], SharedValue[PartOrder]]
         ] = WeakKeyDictionary()
 
-        # Variants of a problem have the same systems and recordings.
+        # Variants of a problem have the same systems and recordings. Orders hold them, so that they
+        # are kept as long as this object.
         self._systems: dict[tuple[int, int], tuple[System, SharedValue[SystemOrder]]] = {}
-        self._recordings: WeakKeyDictionary[AlignedRecording, RecordingOrder]
-        self._recordings = WeakKeyDictionary()
+        self._recordings: dict[AlignedRecording, RecordingOrder] = {}
         self._folder = RecordingFolder()
 
     def of_batches(
@@ -236,7 +236,7 @@ class FitWorkers:
             part = PartOrder.of(
                 problem, segments, shared, lambda each: self._recording_order(each, channels)
             )
-            known[key] = SharedValue(uuid.uuid4().hex, part)
+            known[key] = SharedValue(uuid.uuid4().hex, part, part.size)
         return known[key]
 
     def _problem_order(self, problem: FitProblem, threads: int) -> SharedValue[ProblemOrder]:
@@ -275,10 +275,20 @@ class FitWorkers:
     def _recording_order(self, recording: AlignedRecording, channels: Channels) -> RecordingOrder:
         """A recording, which each worker reads or receives once."""
         if recording not in self._recordings:
-            size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
-            files = self._folder.written(recording) if size > MIN_FILE_BYTES else None
-            self._recordings[recording] = RecordingOrder.of(recording, channels, files)
+            self._recordings[recording] = self._ordered(recording, channels)
         return self._recordings[recording]
+
+    def _ordered(self, recording: AlignedRecording, channels: Channels) -> RecordingOrder:
+        """Order a recording, with the files that workers may need."""
+        if self._executor.shares_memory:
+            return RecordingOrder.of(recording, None)
+
+        size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
+        files = self._folder.written(recording) if size > MIN_FILE_BYTES else None
+
+        # Workers of this computer find these files, so that nobody reads the log again.
+        is_found = files is not None and self._executor.is_local
+        return RecordingOrder.of(recording, None if is_found else channels, files)
 
 
 def _counted_here(problem: FitProblem, found: _Found[T]) -> T:

@@ -21,6 +21,9 @@ from mjfim.identification.aligned_recording import AlignedRecording
 # Arrays of a recording, each of which is a file.
 ARRAYS = ("t", "y", "ctrl")
 
+# Largest share of the free room of a disk that a recording takes.
+ROOM_SHARE = 0.5
+
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFiles:
@@ -52,10 +55,14 @@ class RecordingFiles:
         # Workers find a folder only when it is complete.
         folder = parent / uuid.uuid4().hex
         unfinished = folder.with_suffix(".part")
-        unfinished.mkdir()
-        for array in ARRAYS:
-            np.save(unfinished / f"{array}.npy", getattr(recording, array), allow_pickle=False)
-        unfinished.rename(folder)
+        try:
+            unfinished.mkdir()
+            for array in ARRAYS:
+                np.save(unfinished / f"{array}.npy", getattr(recording, array), allow_pickle=False)
+            unfinished.rename(folder)
+        except OSError:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise
         return cls(folder=folder, name=recording.name, dt=recording.dt, on_grid=recording.on_grid)
 
     @property
@@ -93,6 +100,12 @@ class RecordingFolder:
             if self._path is None:
                 self._path = Path(tempfile.mkdtemp(prefix="mjfim-recordings-"))
                 weakref.finalize(self, shutil.rmtree, self._path, ignore_errors=True)
+
+            # Others who write to the same disk keep at least half of the room.
+            size = sum(getattr(recording, array).nbytes for array in ARRAYS)
+            if size > ROOM_SHARE * shutil.disk_usage(self._path).free:
+                self._is_full = True
+                return None
             return RecordingFiles.written(self._path, recording)
         except OSError:
             self._is_full = True

@@ -138,7 +138,7 @@ class Workers(Executor):
     @property
     def local_count(self) -> int:
         """Number of tasks that run at once and are known to be on this computer, at least 1."""
-        return self.count if self._is_local else 1
+        return self.count if self.is_local else 1
 
     @property
     def window(self) -> float:
@@ -154,7 +154,7 @@ class Workers(Executor):
         """
         if self._stated_threads is not None:
             return self._stated_threads
-        return max(self.count // max(tasks, 1), 1) if self._is_local else 1
+        return max(self.count // max(tasks, 1), 1) if self.is_local else 1
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Submit a task; the arguments are those of `concurrent.futures.Executor.submit`.
@@ -185,7 +185,12 @@ class Workers(Executor):
         self._executor.shutdown(wait, **options)
 
     @property
-    def _is_local(self) -> bool:
+    def shares_memory(self) -> bool:
+        """True for threads of this process, which have all that it has."""
+        return isinstance(self._executor, ThreadPoolExecutor)
+
+    @property
+    def is_local(self) -> bool:
         """True where all workers are known to be on this computer, so that they share its cores."""
         return self.is_loky or isinstance(
             self._executor, Pool | ProcessPoolExecutor | ThreadPoolExecutor

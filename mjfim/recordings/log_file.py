@@ -79,9 +79,13 @@ class LogFile:
         """
         self.require_unchanged()
         try:
-            return FileContent(path=self.state.path, sha256=_hash_of(self.state))
+            content = FileContent(path=self.state.path, sha256=_hash_of(self.state))
         except OSError:
             return None
+
+        # Something may have written to it while it was read for the hash.
+        self.require_unchanged()
+        return content
 
     def require_unchanged(self) -> None:
         """Raise RecordingError if the file has changed since it was read, and exists still."""

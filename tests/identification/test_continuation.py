@@ -10,9 +10,11 @@ import pytest
 import mjfim
 from mjfim.budget import StopToken
 from mjfim.experiment.system import System
+from mjfim.identification import continuation
 from mjfim.identification.continuation import MIN_ROWS, segment_lengths
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
+from mjfim.identification.task import FitTask
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
@@ -160,6 +162,17 @@ def test_a_request_to_stop_during_the_restart_keeps_the_best_result(tmp_path: Pa
     found = identify_system(system, [swings(system, 12.0)], start=start, callback=press, stop=stop)
     assert found.interrupted
     assert found.restart is not None and found.restart.cost <= found.restart.cost_before
+
+
+def test_segments_share_the_recordings_of_the_whole_problem(tmp_path: Path) -> None:
+    """Workers then receive them once."""
+    system = pendulum(tmp_path, 4.0)
+    task = FitTask.resolve(system.experiment, [swings(system, 4.0)], threads=1)
+    problem = task.problem()
+    part = continuation._segment_problem(problem, task, task.system, 1.0)
+    assert part is not None
+    assert len(part.segments) == 4
+    assert all(a is b for a, b in zip(part.recordings, problem.recordings, strict=True))
 
 
 def test_segments_are_shares_of_the_recording_with_enough_rows(tmp_path: Path) -> None:

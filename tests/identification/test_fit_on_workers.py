@@ -169,6 +169,12 @@ def test_an_order_holds_the_segments_of_its_batch_alone(
     order = BatchOrder.of(part, FitProblem.blocks_of_batch, batch, at)
 
     assert set(part.value.segments) == set(batch.segments)
+
+    # Workers forget it by its size.
+    rows = sum(
+        problem.segments[i].rows.stop - problem.segments[i].rows.start for i in batch.segments
+    )
+    assert part.size >= rows * len(problem.system.outputs)
     assert len(order.at.private) == len(batch.segments)
     assert len(part.value.made().segments) == len(problem.segments)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pickle
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -16,13 +18,16 @@ from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
-from mjfim.identification import fit_workers, segment_simulation
+from mjfim.identification import fit_orders, fit_workers, recording_files, segment_simulation
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.fit_orders import RecordingOrder, SharedRecording
-from mjfim.identification.recording_files import RecordingFolder
+from mjfim.identification.fit_workers import FitWorkers
+from mjfim.identification.recording_files import RecordingFiles, RecordingFolder
+from mjfim.identification.task import FitTask
 from mjfim.output.archive import write_recording
 from mjfim.parallel import shared_value
 from mjfim.parallel.shared_value import AbsentValueError, require_values
+from mjfim.recordings import log_file
 from mjfim.recordings.read import read_recording
 from tests.support.executors import processes
 from tests.support.paths import MODELS
@@ -140,7 +145,12 @@ def test_a_worker_maps_the_arrays_of_the_caller(system: System, logs: list[Path]
 def test_without_room_recordings_are_sent(
     system: System, logs: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: Any, **__: Any) -> None:
+    """What was written until the disk was full is removed."""
+    parts: list[Path] = []
+
+    def full(path: Path, *_: Any, **__: Any) -> None:
+        path.write_bytes(b"begun")
+        parts.append(path)
         raise OSError("no space left on device")
 
     monkeypatch.setattr(np, "save", full)
@@ -148,6 +158,75 @@ def test_without_room_recordings_are_sent(
     folder = RecordingFolder()
     assert folder.written(recording) is None
     assert folder.written(recording) is None
+    assert len(parts) == 1
+    assert not parts[0].parent.exists()
+
+
+def test_half_of_the_room_is_left_to_others(
+    system: System, logs: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = align(system, read_recording(logs[0], system.channels))
+    size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
+    room = SimpleNamespace(free=2 * size - 1)
+    monkeypatch.setattr(recording_files.shutil, "disk_usage", lambda _: room)
+    assert RecordingFolder().written(recording) is None
+    room.free += 1
+    assert isinstance(RecordingFolder().written(recording), RecordingFiles)
+
+
+def test_a_log_that_changes_while_its_hash_is_computed_is_an_error(
+    system: System, logs: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = align(system, read_recording(logs[0], system.channels))
+
+    def changing(_: Any) -> str:
+        with logs[0].open("a", encoding="utf-8") as stream:
+            stream.write("\n")
+        return "0" * 64
+
+    monkeypatch.setattr(log_file, "_hash_of", changing)
+    with pytest.raises(RecordingError, match="has changed since it was read"):
+        RecordingOrder.of(recording, system.channels)
+
+
+@pytest.mark.usefixtures("elsewhere")
+@pytest.mark.parametrize("is_readable", [True, False])
+def test_a_log_that_changes_while_a_worker_reads_it_is_sent(
+    system: System, logs: list[Path], is_readable: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = align(system, read_recording(logs[0], system.channels))
+    order = in_a_worker(RecordingOrder.of(recording, system.channels))
+    assert order.is_here
+
+    def changing(path: Path, channels: Any) -> Any:
+        found = read_recording(path, channels)
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write("\n")
+        if not is_readable:
+            raise RecordingError("the last row has too few values")
+        return found
+
+    monkeypatch.setattr(fit_orders, "read_recording", changing)
+    with pytest.raises(AbsentValueError):
+        order.made(system)
+    assert not order.is_here
+
+
+@pytest.mark.parametrize("shares_memory", [True, False])
+def test_workers_read_no_file_that_they_do_not_need(
+    system: System, logs: list[Path], shares_memory: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads have the recordings already, and processes of this computer map them."""
+    monkeypatch.setattr(fit_workers, "MIN_FILE_BYTES", 0)
+    recordings = [read_recording(path, system.channels) for path in logs]
+    problem = FitTask.resolve(system.experiment, recordings, threads=1).problem()
+    kind = ThreadPoolExecutor if shares_memory else ProcessPoolExecutor
+    with kind(1) as executor:
+        part = FitWorkers(executor).part_of(problem, range(len(problem.segments)), 1)
+    assert len(part.value.recordings) == 2
+    for order in part.value.recordings.values():
+        assert order.file is None
+        assert (order.arrays is None) == shares_memory
 
 
 @pytest.mark.slow
