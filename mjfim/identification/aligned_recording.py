@@ -35,9 +35,6 @@ MIN_ROWS = 3
 # Number of samples that are simulated to find the sign of a quaternion at the first row.
 SAMPLES_FOR_SIGN = 4
 
-# Number of rows after which the recorded motion ends that is animated beside the fitted one.
-MAX_MOTION_ROWS = 200_000
-
 # Smallest norm of an interpolated quaternion in a denominator.
 SMALLEST_NORM = 1e-12
 
@@ -356,22 +353,26 @@ def _quaternion_outputs(system: System) -> list[list[int]]:
     return [columns for columns in found if len(columns) == 4]
 
 
-def measured_trajectory(system: System, recording: Recording) -> Trajectory | None:
+def measured_trajectory(
+    system: System, recording: Recording, end: float = np.inf
+) -> Trajectory | None:
     """The recorded motion as a trajectory, for animations.
 
-    Missing positions are interpolated linearly. Velocities that were not measured are NaN. A long
-    recording ends after `MAX_MOTION_ROWS` rows.
+    Missing positions are interpolated linearly. Velocities that were not measured are NaN.
 
     Args:
         system: System that was recorded.
         recording: Recording in SI units.
+        end: Time since the first row at which the trajectory ends, if the recording is longer [s].
 
     Returns:
         The trajectory; None where not every position was measured.
     """
     model = system.model
     measured = outputs_by_state(model, system.outputs)
-    recording = recording.first_rows(MAX_MOTION_ROWS)
+    last = end + GRID_TOLERANCE * system.dt
+    rows = int(np.searchsorted(recording.t - recording.t[0], last, side="right"))
+    recording = recording.first_rows(max(rows, 2))
 
     qpos = np.empty((len(recording.t), model.nq))
     for q in range(model.nq):

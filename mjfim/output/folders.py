@@ -355,7 +355,7 @@ def _write_estimate_log(folder: Path, estimate: Estimate, system: System) -> Non
     """Write the Rerun file of an estimate, if it holds a motion."""
     labels = labels_of_system(system)
     if estimate.motion is not None:
-        measured = measured_trajectory(system, estimate.recordings[0])
+        measured = measured_trajectory(system, estimate.recordings[0], float(estimate.motion.t[-1]))
         model = system.model_at(estimate.theta)
         target = folder / "estimate.rrd"
         rerun_log.log_estimate(target, model, estimate, measured, estimate.motion, labels)

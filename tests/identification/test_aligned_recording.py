@@ -5,6 +5,7 @@ The control keeps its impulse, measured values stay unchanged, and messages name
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ import pytest
 
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
-from mjfim.identification import aligned_recording
 from mjfim.identification.aligned_recording import (
     AlignedRecording,
     align,
@@ -307,13 +307,13 @@ def test_an_aligned_recording_does_not_change(task: DesignTask) -> None:
     np.testing.assert_array_equal(plain.y, before)
 
 
-def test_a_long_measured_motion_ends_early(
-    task: DesignTask, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nobody watches an hour; the rows before are the same."""
-    whole = measured_trajectory(task.system, log(task))
-    monkeypatch.setattr(aligned_recording, "MAX_MOTION_ROWS", 20)
-    part = measured_trajectory(task.system, log(task))
+def test_a_long_measured_motion_ends_with_the_fitted_one(task: DesignTask) -> None:
+    """The rows before are the same, also those of a clock that does not begin at zero."""
+    recording = log(task)
+    whole = measured_trajectory(task.system, recording)
+    end = float(recording.t[19] - recording.t[0])
+    late = replace(recording, t=recording.t + 100.0)
+    part = measured_trajectory(task.system, late, end)
     assert whole is not None and part is not None
     assert len(part.t) == 20 and len(part.ctrl) == 19
     np.testing.assert_array_equal(part.qpos, whole.qpos[:20])

@@ -105,6 +105,18 @@ class TestFilm:
             "Only the first 40 s are shown; 60 s follow."
         )
 
+    def test_the_rest_of_a_recording_that_is_longer_than_the_motion_is_said(
+        self, swing: mujoco.MjModel
+    ) -> None:
+        for seconds, recorded, text in (
+            (10.0, 60.0, "Only the first 10 s are shown; 50 s follow."),
+            (100.0, 160.0, "Only the first 40 s are shown; 120 s follow."),
+        ):
+            film = film_of_estimate(swing, swinging(seconds), swinging(seconds), recorded)
+            assert film.caption.endswith(text)
+        film = film_of_estimate(swing, swinging(10.0), swinging(10.0), 10.0001)
+        assert "follow" not in film.caption
+
     def test_initial_is_beside_designed(self, swing: mujoco.MjModel) -> None:
         named = {"initial": swinging(4.0), "final": swinging(4.0, 1.0)}
         film = film_of_trajectories(swing, named)

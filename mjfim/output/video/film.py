@@ -175,7 +175,10 @@ def film_of_trajectories(model: mujoco.MjModel, named: dict[str, Trajectory]) ->
 
 
 def film_of_estimate(
-    model: mujoco.MjModel, identified: Trajectory, measured: Trajectory | None
+    model: mujoco.MjModel,
+    identified: Trajectory,
+    measured: Trajectory | None,
+    recorded: float = 0.0,
 ) -> Film:
     """Film the measured robot as a ghost over the identified one.
 
@@ -183,11 +186,18 @@ def film_of_estimate(
         model: The identified model.
         identified: Motion of the identified model.
         measured: Measured motion; None where positions were not measured.
+        recorded: Duration of the recording, of which the motions may show a part [s].
     """
     motions = [(vocabulary.IDENTIFIED, identified)]
     if measured is not None:
         motions.append((vocabulary.MEASURED, measured))
-    return _film(model, [motions])
+    film = _film(model, [motions])
+
+    # Both may end up to one sample apart.
+    missing = recorded - float(identified.t[-1] - identified.t[0])
+    if missing <= float(identified.t[1] - identified.t[0]):
+        return film
+    return replace(film, left_out=film.left_out + missing)
 
 
 def _film(model: mujoco.MjModel, motions: Sequence[Sequence[tuple[Term, Trajectory]]]) -> Film:

@@ -80,5 +80,7 @@ def film_of(system: System, result: Filmed) -> Film:
 
     if result.motion is None:
         raise NoVideoError("the estimate holds no motion of a recording")
-    measured = measured_trajectory(system, result.recordings[0])
-    return film_of_estimate(system.model_at(result.theta), result.motion, measured)
+    recording = result.recordings[0]
+    measured = measured_trajectory(system, recording, float(result.motion.t[-1]))
+    duration = float(recording.t[-1] - recording.t[0])
+    return film_of_estimate(system.model_at(result.theta), result.motion, measured, duration)
