@@ -124,15 +124,18 @@ class _Part:
     Attributes:
         recordings: Indices of the recordings that contain the part.
         masks: (M, ny) for every recording, True for the values of the part.
+        note: What the name of the part adds where only some of its segments are predicted.
     """
 
     recordings: tuple[int, ...]
     masks: list[np.ndarray]
+    note: str = ""
 
 
 def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> Iterator[Prediction]:
     """Prediction of every part of the data by a fit to the others."""
     # With much data, a subset of evenly spread segments is enough.
+    whole = problem
     count = len(problem.segments)
     if problem.sample_count > MAX_SAMPLES and count > 1:
         wanted = max(MAX_SAMPLES * count // problem.sample_count, 2)
@@ -141,7 +144,10 @@ def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> I
         at = replace(at, private=at.private[subset])
 
     guess = problem.system.parameters.guess
-    parts = list(_parts(problem))
+    parts = [
+        replace(part, note=_note_of_subset(part.recordings, problem, whole))
+        for part in _parts(problem)
+    ]
     for k, part in enumerate(parts):
         begin_stage("predicting each part from the others", k, len(parts))
         others = problem.masked([~mask for mask in part.masks])
@@ -178,6 +184,15 @@ def _parts(problem: FitProblem) -> Iterator[_Part]:
         yield _Part(recordings=indices, masks=_masks_of(problem.masks, indices))
 
 
+def _note_of_subset(recordings: Sequence[int], subset: FitProblem, whole: FitProblem) -> str:
+    """How many segments of some recordings are in a subset; empty where all of them are."""
+    tested, count = (
+        sum(segment.recording in recordings for segment in problem.segments)
+        for problem in (subset, whole)
+    )
+    return "" if tested == count else f" ({tested} of {count} segments)"
+
+
 def _masks_of(masks: Sequence[np.ndarray], recordings: Sequence[int]) -> list[np.ndarray]:
     """The masks of some recordings; False for all values of the others."""
     return [mask if i in recordings else np.zeros_like(mask) for i, mask in enumerate(masks)]
@@ -190,6 +205,7 @@ def _prediction(
     name = ", ".join(problem.recordings[i].name for i in part.recordings)
     if len(problem.recordings) == 1 and not held_out:
         name = f"last {100 * PREDICTED_SHARE:.0f} % of {name}"
+    name += part.note
 
     guess = problem.system.parameters.guess
 

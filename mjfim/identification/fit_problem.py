@@ -561,7 +561,7 @@ class FitProblem:
         """Results of a work on batches, in the order of the batches.
 
         Args:
-            work: `losses_of_batch` or `blocks_of_batch`.
+            work: Function of the problem, the unknowns and a batch, such as `blocks_of_batch`.
             batches: The batches.
             at: The unknowns.
         """

@@ -13,6 +13,7 @@ import uuid
 import weakref
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from mjfim.identification.aligned_recording import AlignedRecording
 
 # Arrays of a recording, each of which is a file.
 ARRAYS = ("t", "y", "ctrl")
+
+# Windows removes no file that is mapped into memory, so that arrays are read there.
+MAP_MODE: Literal["r"] | None = None if os.name == "nt" else "r"
 
 # Largest share of the free room of a disk that a recording takes.
 ROOM_SHARE = 0.5
@@ -72,12 +76,14 @@ class RecordingFiles:
 
     def mapped(self) -> AlignedRecording:
         """The recording, whose arrays are read from the files when they are used."""
-        arrays = {
-            array: np.load(self.folder / f"{array}.npy", mmap_mode="r", allow_pickle=False).view(
-                np.ndarray
-            )
-            for array in ARRAYS
-        }
+        arrays = {}
+        for array in ARRAYS:
+            path = self.folder / f"{array}.npy"
+            loaded = np.load(path, mmap_mode=MAP_MODE, allow_pickle=False)
+
+            # Arrays that nobody can change are not copied.
+            loaded.setflags(write=False)
+            arrays[array] = loaded.view(np.ndarray)
         return AlignedRecording(name=self.name, dt=self.dt, on_grid=self.on_grid, **arrays)
 
 

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.identification import cross_validation
 from mjfim.identification.dense_residuals import dense_residuals
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
@@ -67,6 +69,22 @@ def test_without_held_out_recordings_each_is_predicted_by_the_others(
 
     # The fit to the other recordings does not explain the offset of this one.
     assert (found.predictions[2].identified.rms > 0.15).all()
+
+
+@pytest.mark.slow
+def test_predictions_of_some_segments_say_how_many(
+    base: mjfim.Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = base.replace(horizon=1.0, fit={"segments": 0.25, "start": "measured"})
+    task = DesignTask.resolve(experiment, threads=1)
+    problem = FitProblem.of(task.system, [recorded(task, seed) for seed in range(2)])
+    at = problem.begin(task.theta)
+    everything = cross_validation.predict_unfitted(problem, at, None, Budget())
+    assert [found.name for found in everything] == ["simulated"] * 2
+
+    monkeypatch.setattr(cross_validation, "MAX_SAMPLES", problem.sample_count // 2)
+    some = cross_validation.predict_unfitted(problem, at, None, Budget())
+    assert [found.name for found in some] == ["simulated (2 of 4 segments)"] * 2
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -120,8 +121,12 @@ def test_a_file_that_workers_would_read_otherwise_is_sent(system: System, logs: 
     assert RecordingOrder.of(align(system, simulated), system.channels).file is None
 
 
-def test_a_worker_maps_the_arrays_of_the_caller(system: System, logs: list[Path]) -> None:
+@pytest.mark.parametrize("mode", ["r", None])
+def test_a_worker_maps_the_arrays_of_the_caller(
+    system: System, logs: list[Path], mode: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They are not copied, and an empty control is an array as well."""
+    monkeypatch.setattr(recording_files, "MAP_MODE", mode)
     read = align(system, read_recording(logs[0], system.channels))
     for recording in (read, replace(read, ctrl=np.zeros((len(read.t) - 1, 0)))):
         folder = RecordingFolder()
@@ -168,7 +173,7 @@ def test_half_of_the_room_is_left_to_others(
     recording = align(system, read_recording(logs[0], system.channels))
     size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
     room = SimpleNamespace(free=2 * size - 1)
-    monkeypatch.setattr(recording_files.shutil, "disk_usage", lambda _: room)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: room)
     assert RecordingFolder().written(recording) is None
     room.free += 1
     assert isinstance(RecordingFolder().written(recording), RecordingFiles)
