@@ -80,9 +80,6 @@ class RecordingFiles:
         for array in ARRAYS:
             path = self.folder / f"{array}.npy"
             loaded = np.load(path, mmap_mode=MAP_MODE, allow_pickle=False)
-
-            # Arrays that nobody can change are not copied.
-            loaded.setflags(write=False)
             arrays[array] = loaded.view(np.ndarray)
         return AlignedRecording(name=self.name, dt=self.dt, on_grid=self.on_grid, **arrays)
 
