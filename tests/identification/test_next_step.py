@@ -126,13 +126,11 @@ def test_the_length_is_that_of_the_step_that_follows(
         _, following = first_step(problem, at)
         lengths.append((estimate(condensed, step, at), following.common_length))
 
-    # Far away, the old information differs from that at the end of the step.
-    found, true = lengths[0]
-    assert true > 1.0 and found > 0.1 * true
-    near = [pair for pair in lengths if 1e-3 < pair[1] < 1.0]
-    assert near
-    for found, true in near:
-        assert found == pytest.approx(true, rel=0.3)
+    # The information at the begin of the step differs little from that at its end.
+    relevant = [(found, true) for found, true in lengths if true > 1e-3]
+    assert relevant
+    for found, true in relevant:
+        assert found == pytest.approx(true, rel=0.4)
 
 
 @pytest.mark.slow
