@@ -14,6 +14,7 @@ import pytest
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken
+from mjfim.excitation.designable import designable
 from mjfim.excitation.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -207,6 +208,7 @@ def test_a_budget_of_steps_makes_it_repeatable() -> None:
 
 def test_workers_share_the_steps() -> None:
     search = order(pendulum(), "steps", steps=40_000)
+    task = DesignTask.resolve(search.experiment)
     with ThreadPoolExecutor(2) as executor:
         run = _MethodRun(
             search=search,
@@ -215,6 +217,7 @@ def test_workers_share_the_steps() -> None:
             callback=None,
             executor=executor,
             stop=StopToken(),
+            identifiability=designable(task),
         )
         result = run.divided_baseline(executor, System.resolve(search.experiment))
     assert result is not None
