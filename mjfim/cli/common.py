@@ -345,7 +345,7 @@ def permit_processes() -> None:
 def draw_elsewhere(*, with_video: bool = False) -> None:
     """Let other processes draw the pictures of the running verb's result.
 
-    They import what they need while the verb works.
+    They import what they need while the verb works. On a single processor, they would delay it.
 
     Args:
         with_video: True where a video of the result is drawn, too.
@@ -353,11 +353,12 @@ def draw_elsewhere(*, with_video: bool = False) -> None:
     if not _may_start_processes:
         return
 
-    from mjfim.output.drawing import drawing_elsewhere
+    from mjfim.output.drawing import FEWEST_CORES, drawing_elsewhere
     from mjfim.output.video.process import process_waiting
+    from mjfim.parallel import cores
 
     _claims.enter_context(drawing_elsewhere())
-    if with_video:
+    if with_video and cores() >= FEWEST_CORES:
         _claims.enter_context(process_waiting())
 
 

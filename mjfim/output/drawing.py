@@ -8,8 +8,8 @@ treated as everywhere else.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor, Future
-from contextlib import contextmanager
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 # Fewest processors with which another process saves time.
 FEWEST_CORES = 2
+
+# Errors of a computer that cannot start another process, as without shared semaphores or memory.
+NO_PROCESS = (ImportError, MemoryError, OSError, RuntimeError)
 
 
 class DrawingProcess:
@@ -31,7 +34,12 @@ class DrawingProcess:
         from mjfim.parallel import Pool
 
         self._pool = Pool(1)
-        self._pool.submit(_import_what_draws)
+        try:
+            self._pool.submit(_import_what_draws)
+        except NO_PROCESS:
+            self._pool.end_running()
+            raise
+
         self._begun: tuple[ShownRecord, Future[dict[str, bytes]]] | None = None
 
     def begin(self, record: ShownRecord, picture_format: PictureFormat) -> None:
@@ -51,14 +59,14 @@ class DrawingProcess:
 
         Returns:
             The contents of the files by the names of the pictures; empty where drawing was not
-            begun, where a picture could not be drawn, and where the process was ended from outside.
+            begun, where a picture could not be drawn, where the record could not be sent to the
+            process, and where the process was ended from outside.
         """
         if self._begun is None or self._begun[0] is not record:
             return {}
-        try:
-            return self._begun[1].result()
-        except BrokenExecutor:
-            return {}
+
+        future = self._begun[1]
+        return {} if future.exception() is not None else future.result()
 
     def end(self) -> None:
         """End the process at once."""
@@ -73,21 +81,31 @@ _process: ContextVar[DrawingProcess | None] = ContextVar("drawing", default=None
 def drawing_elsewhere() -> Iterator[None]:
     """Let another process draw the pictures that are begun in the context.
 
-    On a computer with a single processor this has no effect.
+    This has no effect on a computer with a single processor, or that cannot start another process.
     """
-    from mjfim.parallel import cores
-
-    if cores() < FEWEST_CORES:
+    process = _started()
+    if process is None:
         yield
         return
 
-    process = DrawingProcess()
     token = _process.set(process)
     try:
         yield
     finally:
         _process.reset(token)
         process.end()
+
+
+def _started() -> DrawingProcess | None:
+    """Start the process; None where it saves no time, or cannot be started."""
+    from mjfim.parallel import cores
+
+    if cores() < FEWEST_CORES:
+        return None
+    try:
+        return DrawingProcess()
+    except NO_PROCESS:
+        return None
 
 
 def begin_pictures(record: ShownRecord, picture_format: PictureFormat) -> None:
@@ -98,7 +116,12 @@ def begin_pictures(record: ShownRecord, picture_format: PictureFormat) -> None:
         picture_format: Format of the pictures.
     """
     process = _process.get()
-    if process is not None:
+    if process is None:
+        return
+
+    # The data of the result are written after this. Whatever happens to the other process, they
+    # must be, and this one draws the pictures then.
+    with suppress(*NO_PROCESS):
         process.begin(record, picture_format)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import welch
+import scipy
 
 from mjfim.arrays import Array
 
@@ -31,6 +31,6 @@ def density_of(x: Array, rate: float, length: int) -> tuple[Array, Array]:
     for first in range(0, count, SEGMENTS_AT_ONCE):
         segments = min(SEGMENTS_AT_ONCE, count - first)
         part = x[first * step : (first + segments - 1) * step + length]
-        frequencies, density = welch(part, rate, nperseg=length, detrend=False)
+        frequencies, density = scipy.signal.welch(part, rate, nperseg=length, detrend=False)
         total += segments * density
     return frequencies, total / count

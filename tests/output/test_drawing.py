@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import time
+from concurrent.futures import Future
+from typing import Any
 
 import pytest
 
@@ -33,6 +36,60 @@ def test_a_picture_that_cannot_be_drawn_leaves_all_to_this_process() -> None:
     """It draws them again, and so it can say what the fault is."""
     without_figures: object = object()
     assert drawing._contents(without_figures, PictureFormat.PNG) == {}  # type: ignore[arg-type]
+
+
+class FaultyPool:
+    """A pool that fails at its second task, or whose second task fails."""
+
+    def __init__(self, raised: Exception | None, failed: Exception | None) -> None:
+        self._raised = raised
+        self._failed = failed
+        self._tasks = 0
+
+    def submit(self, *_: Any) -> Future[Any]:
+        """Submit a task."""
+        self._tasks += 1
+        if self._tasks > 1 and self._raised is not None:
+            raise self._raised
+
+        future: Future[Any] = Future()
+        future.set_exception(self._failed)
+        return future
+
+    def end_running(self) -> None:
+        """There is nothing to end."""
+
+
+@pytest.mark.parametrize(
+    ("raised", "failed"),
+    [(OSError("no memory"), None), (None, pickle.PicklingError("record"))],
+)
+def test_a_process_that_fails_leaves_the_pictures_to_this_one(
+    raised: Exception | None, failed: Exception | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The data of a result are written after its pictures are begun, so nothing is raised."""
+    monkeypatch.setattr("mjfim.parallel.cores", lambda: 2)
+    monkeypatch.setattr("mjfim.parallel.Pool", lambda count: FaultyPool(raised, failed))
+    record = results.check()
+    with drawing_elsewhere():
+        assert drawing._process.get() is not None
+        begin_pictures(record, PictureFormat.PNG)
+        assert picture_contents(record) == {}
+
+
+@pytest.mark.parametrize("error", [ImportError, NotImplementedError, OSError])
+def test_a_computer_that_can_start_no_process_draws_here(
+    error: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some systems have no shared semaphores."""
+
+    def fail(count: int) -> Any:
+        raise error("no semaphores")
+
+    monkeypatch.setattr("mjfim.parallel.cores", lambda: 2)
+    monkeypatch.setattr("mjfim.parallel.Pool", fail)
+    with drawing_elsewhere():
+        assert drawing._process.get() is None
 
 
 @pytest.mark.slow

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,6 +15,7 @@ from PIL import Image
 
 import mjfim
 from mjfim.arrays import Array
+from mjfim.cli import common
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.output import vocabulary
@@ -26,6 +30,7 @@ from mjfim.output.video.film import (
 from mjfim.output.video.process import back_ends
 from mjfim.output.video.record import Video, format_of
 from mjfim.output.video.rendering import Effort, render
+from mjfim.output.video.worker import counted_seconds
 from mjfim.records.trajectory import Trajectory
 from tests.support.paths import MODELS
 
@@ -227,6 +232,66 @@ class TestVideo:
         with process.process_waiting():
             (waiting,) = process._waiting.values()
         assert waiting.poll() is not None
+
+    def test_a_process_that_was_ended_from_outside_is_replaced(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """One that has failed is not: it shows that this kind of context does not work."""
+        monkeypatch.setenv("MUJOCO_GL", "egl")
+        for program, is_replaced in (("raise SystemExit(3)", True), ("raise ValueError", False)):
+            monkeypatch.setattr(process, "PROGRAM", program)
+            with process.process_waiting():
+                (waiting,) = process._waiting.values()
+                waiting.wait(timeout=60.0)
+                with process.process_for(tmp_path, "egl") as drawing:
+                    assert (drawing is not waiting) == is_replaced
+
+    def test_without_another_process_there_is_no_video(
+        self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def fail(*_: Any, **__: Any) -> Any:
+            raise OSError("no memory")
+
+        monkeypatch.setenv("MUJOCO_GL", "egl")
+        monkeypatch.setattr("mjfim.output.video.process.subprocess.Popen", fail)
+        with process.process_waiting():
+            assert process._waiting == {}
+            reason = r"the process that draws it cannot be started \(no memory\)"
+            with pytest.raises(NoVideoError, match=reason):
+                render(film_of_estimate(swing, swinging(1.0), None), "gif")
+
+    @pytest.mark.parametrize(("cores", "begun"), [(1, []), (2, ["pictures", "video"])])
+    def test_a_single_processor_lets_no_process_wait(
+        self, cores: int, begun: list[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        started: list[str] = []
+
+        @contextmanager
+        def waiting() -> Iterator[None]:
+            started.append("video")
+            yield
+
+        def pictures() -> None:
+            started.append("pictures")
+
+        monkeypatch.setattr("mjfim.parallel.cores", lambda: cores)
+        monkeypatch.setattr(common, "_may_start_processes", True)
+        monkeypatch.setattr(process, "process_waiting", waiting)
+        monkeypatch.setattr("mjfim.output.drawing.DrawingProcess", pictures)
+        with ExitStack() as claims:
+            monkeypatch.setattr(common, "_claims", claims)
+            common.draw_elsewhere(with_video=True)
+        assert started == begun
+
+    @pytest.mark.parametrize(
+        ("wall", "processor", "counted"),
+        [(1.0, 0.9, 0.9), (1.0, 1.9, 1.0), (2.0, 0.04, 1.0)],
+        ids=["others use the processor", "two processors draw", "a graphics card draws"],
+    )
+    def test_waiting_for_a_graphics_card_counts(
+        self, wall: float, processor: float, counted: float
+    ) -> None:
+        assert counted_seconds(wall, processor) == pytest.approx(counted)
 
     def test_a_stated_context_is_the_only_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("MUJOCO_GL", "egl")

@@ -11,7 +11,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from mjfim.output.video.record import NoVideoError
@@ -25,6 +25,15 @@ PROGRAM = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
     "from mjfim.output.video.worker import main; main()"
 )
+
+# How many times its stated time a film may take until nobody waits for it any more.
+PATIENCE = 2.0
+
+# Exit code after an error of Python, as where a kind of context is not installed.
+ERROR_CODE = 1
+
+# On Windows, Ctrl-C does not reach a process that has a group of its own.
+OWN_GROUP = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 
 # Values of the variable MUJOCO_GL that turn drawing off.
 TURNED_OFF = ("disable", "disabled", "off", "false", "0")
@@ -50,20 +59,18 @@ def back_ends() -> tuple[str, ...]:
 
 @contextmanager
 def process_waiting() -> Iterator[None]:
-    """Let a process wait for the first film that is drawn in the context, at whose end it ends."""
-    try:
-        first = back_ends()[0]
-    except NoVideoError:
-        yield
-        return
+    """Let a process wait for the first film that is drawn in the context, at whose end it ends.
 
-    with _started(first) as process:
-        _waiting[first] = process
-        try:
-            yield
-        finally:
-            _waiting.clear()
-            process.kill()
+    This has no effect where drawing is turned off, or no process can be started.
+    """
+    with ExitStack() as at_end:
+        with suppress(NoVideoError):
+            first = back_ends()[0]
+            process = at_end.enter_context(_started(first))
+            at_end.callback(process.kill)
+            at_end.callback(_waiting.clear)
+            _waiting[first] = process
+        yield
 
 
 def process_for(folder: Path, back_end: str) -> subprocess.Popen[bytes]:
@@ -72,8 +79,15 @@ def process_for(folder: Path, back_end: str) -> subprocess.Popen[bytes]:
     Args:
         folder: The folder.
         back_end: Kind of OpenGL context; empty for that of the system.
+
+    Raises:
+        NoVideoError: No process can be started.
     """
-    process = _waiting.pop(back_end, None) or _started(back_end)
+    process = _waiting.pop(back_end, None)
+
+    # A process that was ended from outside says nothing about the kind of context.
+    if process is None or process.poll() not in (None, ERROR_CODE):
+        process = _started(back_end)
     assert process.stdin is not None
 
     # A process that has ended already leaves no result, as one that finds no context.
@@ -83,18 +97,27 @@ def process_for(folder: Path, back_end: str) -> subprocess.Popen[bytes]:
 
 
 def _started(back_end: str) -> subprocess.Popen[bytes]:
-    """Start a process, which waits for the name of a folder."""
+    """Start a process, which waits for the name of a folder.
+
+    Raises:
+        NoVideoError: No process can be started.
+    """
     environment = {**os.environ, "MUJOCO_GL": back_end}
     if back_end == "":
         environment.pop("MUJOCO_GL")
 
-    # In a session of its own, Ctrl-C reaches only this process, which then ends the other one.
-    return subprocess.Popen(
-        [sys.executable, "-P", "-c", PROGRAM, json.dumps(sys.path)],
-        env=environment,
-        bufsize=0,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    # With a session or a group of the other process, Ctrl-C reaches only this one, which then ends
+    # the other one.
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-c", PROGRAM, json.dumps(sys.path)],
+            env=environment,
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            creationflags=OWN_GROUP,
+        )
+    except OSError as error:
+        raise NoVideoError(f"the process that draws it cannot be started ({error})") from None

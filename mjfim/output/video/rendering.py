@@ -23,7 +23,7 @@ import numpy as np
 
 from mjfim.budget import StopToken
 from mjfim.output.video.film import FRAME_RATE, Film, speed_text
-from mjfim.output.video.process import back_ends, process_for
+from mjfim.output.video.process import PATIENCE, back_ends, process_for
 from mjfim.output.video.record import MEDIA_TYPES, Format, NoVideoError, Video, require_encoder
 
 # Names of the files that the two processes exchange.
@@ -138,7 +138,7 @@ def _write_job(folder: Path, film: Film, kind: Format, effort: Effort) -> None:
 
 def _drawn(folder: Path, effort: Effort, stop: StopToken) -> dict[str, Any]:
     """Let another process draw the film, with the first kind of context that works here."""
-    deadline = time.monotonic() + START_SECONDS + 2.0 * effort.seconds
+    deadline = time.monotonic() + START_SECONDS + PATIENCE * effort.seconds
     for back_end in back_ends():
         _run(folder, back_end, deadline, stop)
 

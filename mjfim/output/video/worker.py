@@ -16,6 +16,7 @@ from mjfim.arrays import Array
 from mjfim.output.video.encoding import ENCODERS, SMALLEST_STEP, Frames
 from mjfim.output.video.frame import FrameLayout
 from mjfim.output.video.picture import QUALITIES, Image, PaintedRobot, Painter, Quality
+from mjfim.output.video.process import PATIENCE
 
 # Frames that are drawn to measure how long one takes; before the first one, shaders are compiled.
 MEASURED_FRAMES = 2
@@ -70,11 +71,7 @@ class Drawing:
         return self._layout.width, self._layout.height
 
     def seconds_per_frame(self) -> float:
-        """Measure how long a frame takes [s].
-
-        Time in which other programs use the processor does not count, nor that of several
-        processors which draw together.
-        """
+        """Measure how long a frame takes [s], see `counted_seconds`."""
         self.image(0)
         last = len(self._arrays["t"]) - 1
 
@@ -82,12 +79,29 @@ class Drawing:
         begun = [clock() for clock in clocks]
         for k in range(MEASURED_FRAMES):
             self.image(last * k // MEASURED_FRAMES)
-        spent = [clock() - start for clock, start in zip(clocks, begun, strict=True)]
-        return min(spent) / MEASURED_FRAMES
+        wall, processor = (clock() - start for clock, start in zip(clocks, begun, strict=True))
+        return counted_seconds(wall, processor) / MEASURED_FRAMES
 
     def close(self) -> None:
         """Close the context."""
         self._painter.close()
+
+
+def counted_seconds(wall: float, processor: float) -> float:
+    """Count the time of drawing that does not depend on what else the computer does.
+
+    Time in which other programs use the processor does not count, nor that of several processors
+    which draw together. Waiting for a graphics card looks like the former, so that at least the
+    share counts with which the film ends while somebody waits for it.
+
+    Args:
+        wall: Time that has passed [s].
+        processor: Time of all processors together [s].
+
+    Returns:
+        The time that counts [s].
+    """
+    return max(min(wall, processor), wall / PATIENCE)
 
 
 def main() -> None:
