@@ -56,7 +56,7 @@ class FaultyPool:
         future.set_exception(self._failed)
         return future
 
-    def end_running(self) -> None:
+    def end_running(self, *, wait: bool = False) -> None:
         """There is nothing to end."""
 
 
