@@ -66,7 +66,7 @@ class CoarseToFine(LimitedRounds):
         return [*coarse, Round(level=self.searches.stated)]
 
     def terms(self, entry: Entry, seconds: float) -> SearchTerms:
-        """What the search of a start may use, see `RoundPlan`."""
+        """Return the limits of the search of a start, see `RoundPlan`."""
         stage = self.rounds[entry.round]
         share = 1.0 if stage.level is self.searches.stated else ROUND_SHARE
         left = max(self.max_iterations - entry.done, 1)

@@ -200,7 +200,7 @@ def run_in_worker(order: ConstrainedSlice) -> SearchSlice[SearchState]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Begun:
-    """What the parts of a search before have found.
+    """Result and state that earlier parts of a search have left.
 
     Attributes:
         result: The result so far.

@@ -1,4 +1,4 @@
-"""What a design needs: parameters that have an effect, and a start that shows it."""
+"""Requirements of a design: parameters that have an effect, and a start that shows it."""
 
 from __future__ import annotations
 

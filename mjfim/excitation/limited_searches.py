@@ -22,7 +22,7 @@ from mjfim.records.events import DesignEvent
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchTerms:
-    """What a search may use.
+    """Limits of the effort of a search.
 
     Attributes:
         schedule: Stages of the barrier.
@@ -138,5 +138,5 @@ class LimitedSearches:
 
     @cached_property
     def _sent(self) -> SentTask:
-        """What all orders of this design send."""
+        """Task that all orders of this design send."""
         return SentTask.of(self.stated.task)

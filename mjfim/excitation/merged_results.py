@@ -23,7 +23,7 @@ def continued(result: RunResult) -> InitialControl:
 
 
 def numbered_from(event: DesignEvent, offset: int) -> DesignEvent:
-    """The same iterate with a number that counts from the first one of its start.
+    """Return the iterate with a number that counts from the first one of its start.
 
     Args:
         event: An iterate of a later run.

@@ -63,7 +63,7 @@ class Multistart(LimitedRounds):
         return [first, Round(level=self.searches.stated)]
 
     def terms(self, entry: Entry, seconds: float) -> SearchTerms:
-        """What the search of a start may use, see `RoundPlan`."""
+        """Return the limits of the search of a start, see `RoundPlan`."""
         stage = self.rounds[entry.round]
         iterations = self.max_iterations - max(entry.done - 1, 0)
         if entry.round < len(self.rounds) - 1:

@@ -1,4 +1,4 @@
-"""What the rounds of a design under hard limits from several starts consist of."""
+"""Rounds of a design under hard limits from several starts, and what each of them may use."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Entry:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Judgement:
-    """What a result of a round is worth on the stated plant.
+    """Cost of a result of a round on the stated plant, and the control that follows from it.
 
     Attributes:
         result: The result, whose cost is that on the stated plant.
@@ -123,7 +123,7 @@ class RoundPlan(ABC):
 
     @abstractmethod
     def terms(self, entry: Entry, seconds: float) -> SearchTerms:
-        """What the search of a start may use.
+        """Return the limits of the search of a start.
 
         Args:
             entry: The start.
@@ -132,7 +132,7 @@ class RoundPlan(ABC):
 
     @abstractmethod
     def judge(self, entry: Entry) -> Judge | None:
-        """Who judges the result of a start; None where its cost is that on the stated plant."""
+        """Return the judge of a start; None where its cost is that on the stated plant."""
 
     @abstractmethod
     def late(self, entry: Entry, result: RunResult, *, is_tried: bool) -> RunResult:

@@ -36,7 +36,7 @@ class EndedSearch:
 
 
 class RunningRounds:
-    """Which start takes part in which round, and what has been found so far.
+    """Rounds under way: the starts that take part in each, and their results so far.
 
     Starts of a lower round go first, because the longest way lies before them, and among those of
     one round the one of lowest cost.
@@ -97,7 +97,7 @@ class RunningRounds:
         return None
 
     def terms(self, entry: Entry) -> SearchTerms:
-        """What a search may use that begins now.
+        """Return the limits of a search that begins now.
 
         Args:
             entry: The start.

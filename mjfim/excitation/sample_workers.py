@@ -111,7 +111,7 @@ class _SampleOrder:
 
     @property
     def key(self) -> tuple[str, bytes, bytes, bool]:
-        """What identifies the evaluated sample."""
+        """Key of the evaluated sample in a cache."""
         return self.problem.digest, self.theta.tobytes(), self.ctrl.tobytes(), self.central
 
 

@@ -1,4 +1,4 @@
-"""What the orders of one design send to the workers: its experiment, which needs no file there."""
+"""Task of a design as its orders send it to the workers, where it needs no file."""
 
 from __future__ import annotations
 

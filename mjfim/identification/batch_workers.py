@@ -1,4 +1,4 @@
-"""What a fit asks of the workers that do a part of its work."""
+"""Requests of a fit to the workers that do a part of its work."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ _worker_systems: KeptPerThread[System] = KeptPerThread(KEPT_PROBLEMS)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProblemOrder:
-    """What all parts of a problem have in common. It can be pickled.
+    """Description of a problem that all its parts share. It can be pickled.
 
     Attributes:
         system: The system.

@@ -240,14 +240,14 @@ class FitWorkers:
         return known[key]
 
     def _problem_order(self, problem: FitProblem, threads: int) -> SharedValue[ProblemOrder]:
-        """What all parts of a problem have in common, made once."""
+        """Return the order that all parts of a problem share, which is made once."""
         known = self._orders.setdefault(problem, {})
         if threads not in known:
             known[threads] = SharedValue(uuid.uuid4().hex, self._made(problem, threads))
         return known[threads]
 
     def _made(self, problem: FitProblem, threads: int) -> ProblemOrder:
-        """Describe what all parts of a problem have in common."""
+        """Make the order that all parts of a problem share."""
         rows = [segment.rows.stop - segment.rows.start for segment in problem.segments]
         return ProblemOrder(
             system=self._shared_system(problem.system, threads),

@@ -1,4 +1,4 @@
-"""What the table and the figure of a campaign show of its parameters."""
+"""Parameters of a campaign as its table and its figure show them."""
 
 from __future__ import annotations
 

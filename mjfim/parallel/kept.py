@@ -41,7 +41,7 @@ class Kept(Generic[T]):
 
 
 class KeptPerThread(threading.local, Kept[T]):
-    """What the tasks of a worker have in common, made by the first of them.
+    """Objects that the tasks of a worker share, made by the first of them.
 
     A worker process does one task after the other; a worker of several threads, as of Dask, has
     objects of each thread.

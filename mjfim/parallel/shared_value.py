@@ -217,7 +217,7 @@ def owned_value(digest: str) -> SentValue:
 
 @dataclass(frozen=True, kw_only=True)
 class AbsentValue:
-    """What a worker returns in place of a result where values are absent.
+    """Answer of a worker that lacks shared values, in place of a result.
 
     Attributes:
         digests: Hashes of the values.

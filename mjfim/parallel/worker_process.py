@@ -1,4 +1,4 @@
-"""What a process of a `Pool` does beside its tasks: it follows the pool, and offers its results."""
+"""Duties of a process of a `Pool` beside its tasks: it follows the pool, and offers its results."""
 
 from __future__ import annotations
 

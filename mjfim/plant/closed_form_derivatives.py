@@ -85,7 +85,7 @@ class ObservedInClosedForm:
 
 
 class ClosedFormMemory:
-    """What the derivatives in closed form of one plant and of its variants have in common.
+    """Joints and latest derivatives, shared by the closed forms of a plant and of its variants.
 
     Attributes:
         tree: Joints of the model; None where there is no closed form.

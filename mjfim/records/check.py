@@ -108,7 +108,7 @@ class Roughness:
     causes: tuple[str, ...]
 
     def __str__(self) -> str:
-        """What disagrees, where and why; the cause is in the part that short forms keep."""
+        """Return a sentence of size, place and cause; short forms keep the part with the cause."""
         # Two digits, and no power of ten for some hundred percent.
         size = "an unlimited amount"
         if np.isfinite(self.error):

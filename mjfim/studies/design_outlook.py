@@ -1,4 +1,4 @@
-"""What a design would say about its initial control: whether it refuses it, and its limits."""
+"""Answer of a design to its initial control: whether it refuses it, and the limits it violates."""
 
 from __future__ import annotations
 

@@ -266,7 +266,7 @@ def _trial_bytes(system: System, samples: int) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan:
-    """How many trials each trajectory has, and where they run.
+    """Number of trials of each trajectory, and the executor that runs them.
 
     Attributes:
         trials: Number of repetitions.

@@ -141,7 +141,7 @@ def estimates_here(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _TrialStudy:
-    """What all chunks of a trajectory have in common. It can be pickled.
+    """Study that all chunks of a trajectory belong to. It can be pickled.
 
     Attributes:
         key: Unique text by which a worker recognises the study.

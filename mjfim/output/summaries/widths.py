@@ -1,4 +1,4 @@
-"""What fits into the width of a table."""
+"""Names and columns that fit into the width of a table."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class FilmCamera:
 
     @property
     def scale(self) -> float:
-        """How large what the camera looks at is in the picture [pixels/m]."""
+        """Pixels per metre [1/m] at the point to which the camera looks."""
         distance = float(np.linalg.norm(self.offset))
         return self.size[1] / (2.0 * distance * float(np.tan(self.field_of_view / 2.0)))
 

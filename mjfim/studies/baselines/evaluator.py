@@ -113,7 +113,7 @@ CHECKS_OF_SLICE = 12
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SearchState:
-    """Where a search goes on after a slice. It can be pickled.
+    """State from which a search goes on after a slice. It can be pickled.
 
     Attributes:
         best: The best control so far.

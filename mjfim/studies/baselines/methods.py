@@ -103,7 +103,7 @@ class BaselineSlice:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SliceOfBaseline:
-    """What a slice of a baseline has found.
+    """Result of a slice of a baseline.
 
     Attributes:
         result: The best control so far.
@@ -116,7 +116,7 @@ class SliceOfBaseline:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _RandomState:
-    """Where a random search goes on.
+    """State from which a random search goes on.
 
     Attributes:
         best: (n,) numbers of the best trial; empty before it.

@@ -283,7 +283,7 @@ class Phase(Enum):
 
 @dataclass(eq=False, kw_only=True)
 class SelectionState:
-    """Where a selection of runs goes on. It can be pickled.
+    """State from which a selection of runs goes on. It can be pickled.
 
     Attributes:
         runs: All runs so far.

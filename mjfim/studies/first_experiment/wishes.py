@@ -1,4 +1,4 @@
-"""What a user may want of a first experiment; everything else follows from the model."""
+"""Wishes of a user for a first experiment; everything else follows from the model."""
 
 from __future__ import annotations
 
