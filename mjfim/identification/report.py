@@ -34,7 +34,13 @@ from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution
 from mjfim.recordings.plausibility import plausibility_remarks
-from mjfim.records.estimate import Estimate, MissingTerm, Prediction, Restart
+from mjfim.records.estimate import (
+    MAX_NOMINAL_ROWS,
+    Estimate,
+    MissingTerm,
+    Prediction,
+    Restart,
+)
 from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
 
@@ -52,10 +58,6 @@ MIN_SHARE_WITHIN_SAMPLES = 0.05
 
 # Number of samples after which the motion that an estimate holds for animations ends.
 MAX_MOTION_SAMPLES = 200_000
-
-# Number of rows of all recordings above which an estimate does not hold the outputs of the model at
-# the initial guess.
-MAX_NOMINAL_ROWS = 1_000_000
 
 # Relative rounding of the ratio of two periods.
 ROUNDING = 1e-6

@@ -170,32 +170,6 @@ class _Windows:
     squares: Array
 
 
-def find_worst_residual(
-    outputs: Sequence[str],
-    recordings: Sequence[str],
-    times: Sequence[Array],
-    whitened: Sequence[Array],
-) -> WorstResidual | None:
-    """The output and the interval in which residuals are largest.
-
-    An interval is one window or several neighbouring ones. It is the whole recording where no
-    window has clearly larger residuals than the others.
-
-    Args:
-        outputs: Names of the ny outputs.
-        recordings: Names of the recordings.
-        times: (M,) times of the rows of every recording [s].
-        whitened: (M, ny) whitened residuals of every recording, NaN where not measured.
-
-    Returns:
-        The interval; None without residuals.
-    """
-    found = LargestResidual()
-    for j, output in enumerate(outputs):
-        found = found.with_output(output, recordings, times, [z[:, j] for z in whitened])
-    return found.interval
-
-
 @dataclass(frozen=True, kw_only=True)
 class LargestResidual:
     """The interval in which residuals are largest, among those of some outputs.

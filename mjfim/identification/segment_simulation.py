@@ -187,40 +187,6 @@ class SegmentSimulation:
             states[gap] = states[np.flatnonzero(~gap)[0]]
         return plant.trajectory(states, ctrl)
 
-    def rows(
-        self,
-        at: UnknownValues,
-        *,
-        derivatives: bool,
-        central: bool | None = None,
-        step: float = SENSITIVITY_STEP,
-        by_all_parameters: bool = False,
-    ) -> Iterator[SegmentRows | None]:
-        """Simulate all segments in batches, each batch over one interval of time after the other.
-
-        Args:
-            at: The unknowns.
-            derivatives: Whether to compute derivatives.
-            central: True for two-sided differences; default: two-sided unless there is much data.
-            step: Relative step of two-sided differences.
-            by_all_parameters: Whether to differentiate also by parameters without common columns.
-
-        Yields:
-            Predictions of some rows of one segment. Where a simulation diverges, None is the last
-            item.
-        """
-        batches = self.batches(
-            derivatives=derivatives,
-            central=central,
-            step=step,
-            by_all_parameters=by_all_parameters,
-        )
-        for batch in batches:
-            for found in self.rows_of_batch(at, batch):
-                yield found
-                if found is None:
-                    return
-
     def batches(
         self,
         *,

@@ -16,6 +16,10 @@ from mjfim.records.serialization import SavedRecord
 from mjfim.records.shown import ShownRecord
 from mjfim.records.trajectory import Trajectory
 
+# Number of rows of all recordings above which an estimate does not hold the outputs of the model at
+# the initial guess.
+MAX_NOMINAL_ROWS = 1_000_000
+
 # Half width of a 95 % interval of a normal distribution [standard deviations].
 NORMAL_95 = 1.96
 
@@ -166,6 +170,22 @@ class Estimate(ShownRecord):
         """
         is_single = self.sizes == np.abs(self.theta)
         return np.where(is_single, np.abs(self.initial_theta), self.sizes)
+
+    @property
+    def reason_without_nominal(self) -> str:
+        """Sentence that says why `nominal` is empty; empty where it is not."""
+        if self.nominal:
+            return ""
+
+        rows = sum(len(recording.t) for recording in self.recordings)
+        if rows > MAX_NOMINAL_ROWS:
+            return (
+                "The nominal model is not drawn for recordings of more than "
+                f"{MAX_NOMINAL_ROWS:,} rows together."
+            )
+        if not len(self.trace):
+            return "The nominal model is not drawn: an earlier version of mjfim saved the estimate."
+        return "The nominal model is not drawn: its simulation diverges."
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of estimate.json."""

@@ -10,11 +10,11 @@ from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import cross_validation
-from mjfim.identification.dense_residuals import dense_residuals
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.recording import Recording
+from tests.support.dense_residuals import dense_residuals
 from tests.support.paths import ROOT
 
 

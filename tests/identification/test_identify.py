@@ -21,7 +21,6 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.aligned_recording import align
-from mjfim.identification.dense_residuals import dense_residuals
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify, identify_system, least_squares, newton_raphson
 from mjfim.optimize.condensed_least_squares import Condensed
@@ -30,6 +29,7 @@ from mjfim.output.summaries.verdicts import verdict_of
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.campaign import identify_all
+from tests.support.dense_residuals import dense_residuals
 from tests.support.numerics import make_task
 from tests.support.paths import ROOT
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from mjfim.identification.residual_tests import (
+    LargestResidual,
     autocorrelated,
-    find_worst_residual,
     is_larger_than_noise,
     is_smaller_than_noise,
     misfit_reasons,
@@ -17,6 +17,14 @@ from mjfim.records.estimate import Whiteness, WorstResidual
 from tests.support.numerics import Array
 
 NAMES = ("angle", "speed", "force")
+
+
+def worst_of(recordings: str, times: list[Array], z: list[Array]) -> WorstResidual | None:
+    """The interval with the largest residuals, found output by output as a fit does."""
+    largest = LargestResidual()
+    for j, output in enumerate(NAMES):
+        largest = largest.with_output(output, recordings, times, [part[:, j] for part in z])
+    return largest.interval
 
 
 def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
@@ -28,7 +36,7 @@ def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
 
 def place(times: list[Array], z: list[Array]) -> WorstResidual:
     """The worst residual of the three recordings a, b, c."""
-    found = find_worst_residual(NAMES, "abc", times, z)
+    found = worst_of("abc", times, z)
     assert found is not None
     return found
 
@@ -73,11 +81,8 @@ def test_gaps_and_outputs_that_are_not_measured() -> None:
     assert (worst.output, worst.recording) == ("angle", "a")
     assert worst.begin <= 7.2 + 0.4
     assert worst.end >= 7.8 - 0.4
-    assert (
-        find_worst_residual(NAMES, "abc", times, [np.full(part.shape, np.nan) for part in z])
-        is None
-    )
-    assert find_worst_residual(NAMES, "", [], []) is None
+    assert worst_of("abc", times, [np.full(part.shape, np.nan) for part in z]) is None
+    assert worst_of("", [], []) is None
 
 
 def test_a_single_value_is_not_an_interval() -> None:
@@ -100,7 +105,7 @@ def test_a_single_value_is_not_an_interval() -> None:
 def test_short_recordings(count: int) -> None:
     """The interval is the whole recording."""
     times, z = [np.arange(count) * 0.1 + 0.5], [np.tile([0.1, 2.0, 0.1], (count, 1))]
-    worst = find_worst_residual(NAMES, ["x"], times, z)
+    worst = worst_of("x", times, z)
     assert worst is not None
     assert (worst.output, worst.begin) == ("speed", 0.5)
     assert worst.size == pytest.approx(2.0)

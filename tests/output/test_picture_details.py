@@ -15,6 +15,9 @@ from mjfim.output import plots, vocabulary
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.plots.design import panel_columns
 from mjfim.output.plots.style import log_ticks, plain_number, without_zeros
+from mjfim.output.report.build import page_of
+from mjfim.output.report.render import rendered
+from mjfim.records import estimate as records_of_estimates
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.comparison import DESIGN
 from mjfim.records.design import Design, LimitUsage
@@ -153,6 +156,31 @@ def test_a_nominal_model_nearby_is_drawn_as_a_whole() -> None:
         estimate = dataclasses.replace(made, nominal=(factor * made.predicted[0],))
         axes = plots.fit(estimate, 0, make_labels(2, 3), [0.05, 0.05]).axes[0]
         assert (axes.get_ylim()[1] > factor * size) == inside
+
+
+@pytest.mark.parametrize(
+    ("rows", "trace", "reason"),
+    [
+        (10, 2, "more than 10 rows together"),
+        (1000, 2, "its simulation diverges"),
+        (1000, 0, "an earlier version of mjfim saved the estimate"),
+    ],
+)
+def test_a_figure_says_why_it_has_no_nominal_model(
+    rows: int, trace: int, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records_of_estimates, "MAX_NOMINAL_ROWS", rows)
+    residuals = {"qpos:joint_0": 0.05, "qpos:joint_1": 0.05}
+    estimate = dataclasses.replace(
+        make_estimate(), trace=np.ones((trace, 3)), residual_rms=residuals
+    )
+    texts = all_text(plots.fit(estimate, 0, make_labels(2, 3), [0.05, 0.05]))
+    assert reason in " ".join(texts.split())
+    assert reason in rendered(page_of(estimate))
+
+    # An estimate with a nominal model needs no reason.
+    shown = dataclasses.replace(estimate, nominal=estimate.predicted)
+    assert "is not drawn" not in all_text(plots.fit(shown, 0, make_labels(2, 3), [0.05, 0.05]))
 
 
 # ---- studies

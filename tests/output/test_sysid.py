@@ -16,7 +16,6 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification.dense_residuals import dense_residuals
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.output.archive import write_recording
 from mjfim.output.mjcf.write import same_dynamics
@@ -24,6 +23,7 @@ from mjfim.output.sysid.comparison import chi2, fit_with_sysid, report
 from mjfim.output.sysid.sequences import build, export
 from mjfim.records.recording import Recording
 from tests.support.cli import misused, run
+from tests.support.dense_residuals import dense_residuals
 from tests.support.numerics import Array, body_task, filtered_task
 from tests.support.paths import ROOT
 

@@ -106,6 +106,8 @@ def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] |
     )
     if curves.nominal is not None:
         note += " Both models begin each segment at the fitted initial state."
+    else:
+        note += f" {estimate.reason_without_nominal}"
     return _draw(curves, labels, f"Fit to {_file_name(curves.recording)}", note)
 
 

@@ -448,10 +448,12 @@ def _measured_dots(t: Array, values: Array) -> Plotly:
 
 
 def _signal_note(estimate: Estimate, drawn: int, signals: _Signals) -> str:
-    """Say what dotted lines mean, and what the plots leave out."""
+    """Explain dotted lines, and name what the plots leave out."""
     parts = []
     if 1 < len(signals.begins) <= MAX_SEGMENTS:
         parts.append("Dotted lines: segments of the fit, each with an initial state of its own.")
+    if estimate.reason_without_nominal:
+        parts.append(estimate.reason_without_nominal)
     outputs = len(estimate.recordings[0].outputs)
     if drawn < outputs:
         parts.append(

@@ -1,4 +1,4 @@
-"""All rows of a linearised problem at once, for small problems and tests."""
+"""All rows of a linearised problem at once, with which tests compare the sums of a fit."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
     residuals = []
     jacobians = []
 
-    simulated = problem.simulation.rows(at, derivatives=True, step=problem.difference_step)
-    for rows in simulated:
-        if rows is None:
-            return None
-        found = problem.whitened.linearised(rows)
-        residuals.append(found.r)
-        jacobians.append(_wide_jacobian(problem, found.J[:, n:], found.J[:, :n], rows.segment))
+    simulation = problem.simulation
+    for batch in simulation.batches(derivatives=True, step=problem.difference_step):
+        for rows in simulation.rows_of_batch(at, batch):
+            if rows is None:
+                return None
+            found = problem.whitened.linearised(rows)
+            residuals.append(found.r)
+            jacobians.append(_wide_jacobian(problem, found.J[:, n:], found.J[:, :n], rows.segment))
 
     common_rows = problem.prior_rows.common(at)
     no_private = np.zeros((len(common_rows), n))
