@@ -170,9 +170,9 @@ def test_a_figure_says_why_it_has_no_nominal_model(
     rows: int, trace: int, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(records_of_estimates, "MAX_NOMINAL_ROWS", rows)
-    residuals = {"qpos:joint_0": 0.05, "qpos:joint_1": 0.05}
+    sigma = {"qpos:joint_0": 0.05, "qpos:joint_1": 0.05}
     estimate = dataclasses.replace(
-        make_estimate(), trace=np.ones((trace, 3)), residual_rms=residuals
+        make_estimate(), trace=np.ones((trace, 3)), residual_rms=sigma, sigma=sigma
     )
     texts = all_text(plots.fit(estimate, 0, make_labels(2, 3), [0.05, 0.05]))
     assert reason in " ".join(texts.split())
