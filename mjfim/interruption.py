@@ -10,6 +10,7 @@ from __future__ import annotations
 import _thread
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,11 +23,14 @@ from mjfim.atomic_io import remove_temporary_files
 from mjfim.errors import NoResultError, UnfinishedError
 
 # Time after the first press at which a second one follows by itself [s]. Computations end within
-# about 5 s; figures take some more seconds, above all on a busy computer.
-FINISH_SECONDS = 20.0
+# about 5 s. What is drawn then may take much longer on a busy computer, and can be drawn later.
+FINISH_SECONDS = 6.0
 
 # Time after the second press of the user at which the process ends in any case [s].
 LAST_SECONDS = 5.0
+
+# Time after which an error is raised once more that came during a callback [s].
+AGAIN_SECONDS = 0.05
 
 # Exit code of an interrupted program.
 INTERRUPTED_CODE = 1
@@ -77,6 +81,10 @@ class Interruption:
         self._is_optional = False
         self._before: dict[int, Any] = {}
 
+        # An error that Python has dropped, because the press came during a callback.
+        self._dropped: type[BaseException] | None = None
+        self._hook_before = sys.unraisablehook
+
         # A queue of this kind may be used in a signal handler; None ends the thread that watches.
         self._pressed: SimpleQueue[int | None] = SimpleQueue()
 
@@ -92,6 +100,7 @@ class Interruption:
         threading.Thread(target=self._watch, name="mjfim-interruption", daemon=True).start()
         for number in SIGNALS:
             signal.signal(number, self)
+        self._hook_before, sys.unraisablehook = sys.unraisablehook, self._raise_again
         return self
 
     def __exit__(
@@ -107,6 +116,7 @@ class Interruption:
 
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        sys.unraisablehook = self._hook_before
         _current = None
         self._pressed.put(None)
 
@@ -117,6 +127,11 @@ class Interruption:
             NoResultError: There is nothing to keep yet.
             UnfinishedError: The second press, while something is written that may be left out.
         """
+        if self._dropped is not None:
+            error, self._dropped = self._dropped, None
+            if self._is_optional or error is NoResultError:
+                raise error
+            return
         self.presses += 1
 
         # The thread that announces the first press must not see what this function changes later.
@@ -180,6 +195,25 @@ class Interruption:
         finally:
             self._is_optional = False
 
+    def _raise_again(self, dropped: sys.UnraisableHookArgs) -> None:
+        """Raise an error of this handler once more where Python cannot pass it on.
+
+        A press may come while a callback of Python's memory management runs, such as after an
+        import. Python then shows the error in place of raising it, and the work would go on.
+
+        Args:
+            dropped: The error that is not passed on.
+        """
+        if dropped.exc_type not in (NoResultError, UnfinishedError):
+            self._hook_before(dropped)
+            return
+
+        # The callback has ended when the other thread sends the signal.
+        self._dropped = dropped.exc_type
+        again = threading.Timer(AGAIN_SECONDS, _press_by_itself)
+        again.daemon = True
+        again.start()
+
     def _watch(self) -> None:
         """Announce the first press, press again after a time, and end the process at last."""
         if self._pressed.get() is None:
@@ -192,7 +226,7 @@ class Interruption:
             pressed = self._pressed.get(timeout=FINISH_SECONDS)
         except Empty:
             if _current is self:
-                _thread.interrupt_main(signal.SIGINT)
+                _press_by_itself()
             pressed = self._pressed.get() and self._pressed.get()
         if pressed is None:
             return
@@ -205,6 +239,16 @@ class Interruption:
             self._announce(LAST_SENTENCE)
             remove_temporary_files()
             os._exit(INTERRUPTED_CODE)
+
+
+def _press_by_itself() -> None:
+    """Send SIGINT to the main thread, also while it waits, such as for another process."""
+    if hasattr(signal, "pthread_kill"):
+        main_thread = threading.main_thread().ident
+        assert main_thread is not None
+        signal.pthread_kill(main_thread, signal.SIGINT)
+    else:
+        _thread.interrupt_main(signal.SIGINT)
 
 
 # The handler in force. Signals concern the whole process, and so does the handler.

@@ -5,8 +5,11 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 import time
+import weakref
 from collections.abc import Iterator
+from concurrent.futures import Future
 
 import pytest
 
@@ -102,6 +105,51 @@ def test_the_second_press_follows_by_itself(
     interruption.keep()
     run_optional(draw_for_ever)
     assert sentences == [module.FIRST_SENTENCE]
+    assert interruption.incomplete
+
+
+def test_a_press_during_a_callback_is_not_lost(
+    interruption: Interruption, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Python shows errors of callbacks of its memory management, and does not raise them."""
+
+    class Held:
+        """Something with a callback at its end."""
+
+    def draw() -> None:
+        held = Held()
+        reference = weakref.ref(held, lambda _: signal.raise_signal(signal.SIGINT))
+        signal.raise_signal(signal.SIGINT)
+        del held
+        end = time.monotonic() + 10.0
+        while time.monotonic() < end:
+            time.sleep(0.01)
+        pytest.fail(f"nobody has ended the figure of {reference}")
+
+    interruption.keep()
+    run_optional(draw)
+    assert interruption.incomplete
+    assert interruption.presses == 2
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_the_press_that_follows_ends_waiting(
+    interruption: Interruption, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A figure of another process, which may hang, is waited for without a limit of time."""
+    monkeypatch.setattr(module, "FINISH_SECONDS", 0.1)
+    future: Future[None] = Future()
+    late = threading.Timer(5.0, future.set_result, [None])
+    late.start()
+
+    def wait_for_figure() -> None:
+        signal.raise_signal(signal.SIGINT)
+        future.result()
+
+    interruption.keep()
+    run_optional(wait_for_figure)
+    late.cancel()
+    assert not future.done()
     assert interruption.incomplete
 
 

@@ -525,7 +525,7 @@ def _say_what_is_there(interruption: Interruption) -> None:
 
     _announce(
         f"interrupted; {interruption.folder}/ holds only a part of the results, but each file in "
-        "it is complete"
+        f"it is complete; `mjfim report {interruption.folder} --pictures` draws what is missing"
     )
 
 

@@ -7,23 +7,33 @@ from typing import Annotated
 
 import typer
 
-from mjfim.cli.common import Force, claim_file, errors, verb
+from mjfim.cli.common import Force, Pictures, claim_file, errors, verb
+from mjfim.output.picture_format import PictureFormat
 from mjfim.output.report import is_report
 
 
 @verb
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of results of any verb.")],
+    missing: Annotated[
+        bool,
+        typer.Option(
+            "--pictures", help="Also draw the pictures that are missing, such as after Ctrl-C."
+        ),
+    ] = False,
+    pictures: Pictures = PictureFormat.PNG,
     force: Force = False,
 ) -> None:
     """Write the reports of a folder of results again, without computing anything anew."""
     # The parts of a report take a while to import; other verbs need them only when they write.
+    from mjfim.output.folders import missing_pictures, write_pictures
     from mjfim.output.report.build import report_files, rewrite_reports
 
     files = report_files(folder)
     inputs = [path for path in sorted(folder.iterdir()) if not is_report(path)]
-    for file in files.values():
+    drawn = missing_pictures(folder) if missing else {}
+    for file in (*files.values(), *(folder / pictures.file_of(name) for name in drawn)):
         claim_file(file, inputs, force=force)
 
-    for file in rewrite_reports(folder):
+    for file in (*rewrite_reports(folder), *write_pictures(folder, drawn, pictures)):
         errors.print(f"wrote {file}", markup=False)

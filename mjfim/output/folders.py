@@ -26,7 +26,7 @@ from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
 from mjfim.output.presentation import describe
 from mjfim.output.report import REPORT
-from mjfim.output.report.build import write_report
+from mjfim.output.report.build import records_in, write_report
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
@@ -417,27 +417,57 @@ def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFor
         _write_picture_files(folder, writers, picture_format)
         return
 
+    # Matplotlib takes seconds to import, which nobody waits for who has pressed Ctrl-C twice.
+    pictures: Pictures = {}
+    write_optional("the pictures", lambda: pictures.update(_pictures_of(record)))
+    write_pictures(folder, pictures, picture_format)
+
+
+def _pictures_of(record: ShownRecord) -> Pictures:
+    """Functions that draw the pictures of a record, by name."""
     from mjfim.output.plots.pictures import pictures_of  # imports matplotlib, which is slow
 
-    write_pictures(folder, pictures_of(record), picture_format)
+    return pictures_of(record)
 
 
-def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureFormat) -> None:
+def missing_pictures(folder: Path) -> Pictures:
+    """List the pictures of the results in a folder that are not there, in whatever format.
+
+    Args:
+        folder: Folder of results.
+
+    Returns:
+        Functions that draw, by name of the picture.
+
+    Raises:
+        RecordingError: The folder holds no result that has a report, or one cannot be read.
+    """
+    present = {path.stem for path in folder.iterdir() if path.suffix[1:] in set(PictureFormat)}
+    wanted: Pictures = {}
+    for record in records_in(folder).values():
+        wanted.update(_pictures_of(record))
+    return {name: draw for name, draw in wanted.items() if name not in present}
+
+
+def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureFormat) -> list[Path]:
     """Draw pictures and write them; those of an earlier run in another format are removed.
 
     Args:
         folder: Folder for the results.
         pictures: Functions that draw, by name of the picture.
         picture_format: Format of the pictures.
+
+    Returns:
+        The files.
     """
     writers = {name: partial(_write_picture, draw) for name, draw in pictures.items()}
-    _write_picture_files(folder, writers, picture_format)
+    return _write_picture_files(folder, writers, picture_format)
 
 
 def _write_picture_files(
     folder: Path, writers: Mapping[str, Callable[[Path], None]], picture_format: PictureFormat
-) -> None:
-    """Write pictures by functions that get the name of the file.
+) -> list[Path]:
+    """Write pictures by functions that get the name of the file, and return the files.
 
     Those of an earlier run in another format are removed.
     """
@@ -447,6 +477,8 @@ def _write_picture_files(
     for name, write in writers.items():
         file = folder / picture_format.file_of(name)
         write_optional(file.name, partial(write, file))
+    files = [folder / picture_format.file_of(name) for name in writers]
+    return [file for file in files if file.is_file()]
 
 
 def _write_content(content: bytes, file: Path) -> None:

@@ -18,6 +18,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.interruption import NOTHING_SENTENCE
 from mjfim.output import archive, plots
+from mjfim.output.folders import DESIGN_ARCHIVE, TABLE_FILES
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, FitEvent, StudyEvent
@@ -215,7 +216,11 @@ def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
     assert "Traceback" not in rest
     assert "wrote" in rest
     out = tmp_path / "out"
-    assert names(out) == DESIGN | {MANIFEST}
+
+    # On a busy computer there is no time for all pictures, which the last sentence says then.
+    missing = (DESIGN | {MANIFEST}) - names(out)
+    assert missing <= DESIGN - {*DESIGN_ARCHIVE, *TABLE_FILES}
+    assert bool(missing) == (f"`mjfim report {out} --pictures`" in rest)
     data = read(out / "design.json")
     assert data["status"] == "interrupted"
     assert data["final"]["eigenvalues"][0] > 5 * data["initial"]["eigenvalues"][0]
@@ -225,4 +230,4 @@ def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
         data["final"]["cost"], rel=1e-6
     )
     assert all(file.read_bytes()[:4] == b"\x89PNG" for file in out.glob("*.png"))
-    assert (out / "design.rrd").read_bytes()[:4] == b"RRF2"
+    assert all(file.read_bytes()[:4] == b"RRF2" for file in out.glob("*.rrd"))

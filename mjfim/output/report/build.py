@@ -170,8 +170,19 @@ def rewrite_reports(folder: Path) -> list[Path]:
     Raises:
         RecordingError: The folder holds no result that has a report, or one cannot be read.
     """
-    records = {verb: KINDS[verb].load(folder) for verb in verbs_in(folder)}
-    return _write_pages(folder, records, {})
+    return _write_pages(folder, records_in(folder), {})
+
+
+def records_in(folder: Path) -> dict[str, ShownRecord]:
+    """Read all results of a folder that have a report, by their verbs; the main one comes first.
+
+    Args:
+        folder: Folder of results.
+
+    Raises:
+        RecordingError: The folder holds no such result, or one cannot be read.
+    """
+    return {verb: KINDS[verb].load(folder) for verb in verbs_in(folder)}
 
 
 def _write_pages(
