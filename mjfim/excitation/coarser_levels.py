@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 from mjfim.excitation.levels import MIN_COARSE_SAMPLES, DescentLevel, first_point, similar_level
+from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 
 # Factors by which the samples of the levels are longer, the coarsest level first. The timestep
@@ -13,13 +14,16 @@ from mjfim.excitation.task import DesignTask
 SAMPLE_FACTORS = (8, 4, 2)
 
 
-def coarser_levels(fine: DescentLevel) -> tuple[DescentLevel, ...]:
+def coarser_levels(
+    fine: DescentLevel, evaluated: DesignPoint | None = None
+) -> tuple[DescentLevel, ...]:
     """Make several coarser levels where each sample is one engine step.
 
     With more engine steps in a sample, one level with a longer timestep is enough (`easier_level`).
 
     Args:
         fine: The stated level, on the plant without clamps.
+        evaluated: The initial control on the unmodified plant; None where it is not known.
 
     Returns:
         The levels on which the initial control costs nearly as much, the coarsest first; none with
@@ -29,7 +33,7 @@ def coarser_levels(fine: DescentLevel) -> tuple[DescentLevel, ...]:
     if task.experiment.descent.coarse != "auto" or task.system.grid.substeps > 1:
         return ()
 
-    first = first_point(fine)
+    first = first_point(fine, evaluated)
     if first is None:
         return ()
 

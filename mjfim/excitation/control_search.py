@@ -31,6 +31,7 @@ from mjfim.excitation.verification import verify
 from mjfim.information.smoothness import roughness
 from mjfim.interruption import hurried
 from mjfim.parallel import ExecutorLike, LostWorkError
+from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.records.design import Status
 
 # Largest number of searches, stopped on a coarse level, that are compared at the stated rate.
@@ -122,6 +123,7 @@ class ControlSearch:
             is_rough=self._is_rough(starts[0].control),
             executor=self.executor,
             budget=self.budget,
+            first=self.first,
         )
         constrained = yield from search.run(starts, inside)
         results += self._not_worse(self._evaluated(constrained), inside)
@@ -141,7 +143,10 @@ class ControlSearch:
         if self.limited is not None and self.limited.level.task.system.variant.smoothing_speeds:
             return True
 
+        # Derivatives exist where nothing touches, rubs, stops or clamps.
         model = task.system.model_at(task.theta)
+        if first_active_constraint(model, self.first.trajectory) is None:
+            return False
         found = roughness(
             task.plant,
             task.system.noise,

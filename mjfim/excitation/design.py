@@ -165,7 +165,8 @@ def design_task(
     interrupted = budget.stop.requested
 
     # Steps on other plants, also those of workers, are counted by the runs.
-    choice = choose(search, [first, begin], results, interrupted)
+    begins = [first] if initial_control is None else [first, begin]
+    choice = choose(search, begins, results, interrupted)
     steps = task.plant.engine_steps - steps_before + sum(result.steps for result in results)
     report = DesignReport(
         stage=stage,

@@ -152,11 +152,12 @@ def has_similar_cost(coarse: DescentLevel, first: DesignPoint, size: float, shar
     return point is not None and abs(point.cost - first.cost) <= share * size
 
 
-def easier_level(fine: DescentLevel) -> DescentLevel | None:
+def easier_level(fine: DescentLevel, evaluated: DesignPoint | None = None) -> DescentLevel | None:
     """Make a coarser or smoother level for the first round under hard limits.
 
     Args:
         fine: The stated level, on the plant without clamps.
+        evaluated: The initial control on the unmodified plant; None where it is not known.
 
     Returns:
         A level with a longer timestep or longer samples, and with smoothed friction where the model
@@ -165,7 +166,7 @@ def easier_level(fine: DescentLevel) -> DescentLevel | None:
     has_dry_friction = bool(fine.task.system.variant.smoothing_speeds)
     smooth = replace(fine, task=fine.task.smoothed()) if has_dry_friction else fine
 
-    first = first_point(smooth)
+    first = first_point(smooth, evaluated)
     if first is None:
         return None
 
@@ -217,8 +218,18 @@ def _coarser(level: DescentLevel, first: DesignPoint, factor: int) -> DescentLev
     return similar_level(level, first, lambda: coarser(factor))
 
 
-def first_point(level: DescentLevel) -> DesignPoint | None:
-    """The initial control on a level; None where the simulation diverges."""
+def first_point(level: DescentLevel, evaluated: DesignPoint | None = None) -> DesignPoint | None:
+    """The initial control on a level; None where the simulation diverges.
+
+    Args:
+        level: The level.
+        evaluated: The initial control on another plant, with the same criterion. It counts where
+            both plants move in the same way. None where it is not known.
+    """
+    curve = None if evaluated is None else evaluated.trajectory
+    reference = level.task.reference
+    if curve is not None and reference is not None and curve.moves_as(reference):
+        return evaluated
     try:
         return level.problem.point(level.task.initial)
     except SimulationDivergedError:

@@ -22,6 +22,7 @@ from mjfim.excitation.limited_rounds import LimitedRounds
 from mjfim.excitation.limited_searches import LimitedSearches
 from mjfim.excitation.merged_results import append_run
 from mjfim.excitation.multistart import Multistart
+from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.random_search import LEAST_PROGRESS, PATIENCE, RandomSearch
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.task import DesignTask
@@ -51,12 +52,15 @@ class LimitedSearch:
         is_rough: Whether derivatives fail somewhere along the first start.
         executor: Runs several starts side by side, or None.
         budget: Time of the search and the token that stops it.
+        first: The experiment's initial control, evaluated on the unmodified plant; None where it is
+            not known.
     """
 
     limited: LimitedCost
     is_rough: bool
     executor: ExecutorLike | None
     budget: Budget
+    first: DesignPoint | None = None
 
     def run(self, starts: list[InitialControl], inside: InsideControl | None) -> Runs:
         """Descend from several starts, and change controls at random where that gains more.
@@ -100,7 +104,7 @@ class LimitedSearch:
         """Descend within limits from several starts, after `done` iterations."""
         free = self.limited.level
         has_parts = any(start.repeats > 1 for start in starts)
-        levels = () if done or has_parts else coarser_levels(free)
+        levels = () if done or has_parts else coarser_levels(free, self.first)
         searches = LimitedSearches(
             stated=free,
             executor=self.executor,
@@ -112,7 +116,7 @@ class LimitedSearch:
         if levels:
             search = CoarseToFine(searches=searches, starts=starts, levels=levels)
         else:
-            coarse = None if done else easier_level(free)
+            coarse = None if done else easier_level(free, self.first)
             search = Multistart(
                 searches=searches, starts=starts, coarse=coarse, iterations_done=done
             )

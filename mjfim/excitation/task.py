@@ -561,7 +561,7 @@ class DesignTask:
         averaged = averaged.mean(axis=1)
 
         changed = self.system.with_variant(variant, self._relaxation())
-        system, reference = _calibrated(changed, averaged)
+        system, reference = _calibrated(changed, averaged, known=self)
         return replace(self, system=system, control=averaged, reference=reference)
 
     def restated(
@@ -630,13 +630,27 @@ class DesignTask:
         )
 
 
-def _calibrated(system: System, control: Array) -> tuple[System, Trajectory | None]:
+def _calibrated(
+    system: System, control: Array, known: DesignTask | None = None
+) -> tuple[System, Trajectory | None]:
     """The system with difference steps that suit the trajectory of a control, and the trajectory.
 
     A trajectory that diverges is None here; the step that needs it raises.
+
+    Args:
+        system: The system.
+        control: (N, nu) control.
+        known: A task on another plant, whose difference steps suit the same motion; None without
+            one.
     """
     try:
         trajectory = system.plant.simulate(system.theta, control)
     except SimulationDivergedError:
         return system, None
+
+    # Clamps and stops that do not act along the motion do not change it.
+    factors = None if known is None else known.plant.step_factors
+    reference = None if known is None else known.reference
+    if factors is not None and reference is not None and trajectory.moves_as(reference):
+        return replace(system, plant=system.plant.with_step_factors(factors)), trajectory
     return system.calibrated_along(system.theta, trajectory), trajectory

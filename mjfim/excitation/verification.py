@@ -93,60 +93,112 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
     """
     constraints = constraint_set_of(task, every=True)
     model = task.system.model_at(task.theta)
-    exact = _verify_on(task, constraints, trajectory, model)
+    exact = _played(task, constraints, trajectory.ctrl, model)
+    if exact is None:
+        return _diverged(task, constraints)
 
     # Without constraint forces, the settings of their solver do not matter.
-    if unconstrained(model) or not np.isfinite(exact.deviation):
-        return exact
+    found = _verification(task, constraints, trajectory, exact)
+    if unconstrained(model) or not np.isfinite(found.deviation):
+        return found
 
-    stated = task.system.model_with_stated_solver(task.theta)
-    return _worse_of(exact, _verify_on(task, constraints, trajectory, stated))
+    stated_model = task.system.model_with_stated_solver(task.theta)
+    stated = _played(task, constraints, trajectory.ctrl, stated_model)
+    if stated is None:
+        return _diverged(task, constraints)
+
+    # Both solvers give the same motion where no constraint force acts along it.
+    if stated.equals(exact):
+        return found
+    return _worse_of(found, _verification(task, constraints, trajectory, stated))
 
 
-def _verify_on(
-    task: DesignTask, constraints: ConstraintSet, trajectory: Trajectory, model: Any
-) -> Verification:
-    """Play the control of a trajectory on one model; all limits are checked."""
-    unenforced = _unenforced_kinds(task)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Played:
+    """A control that is played open loop on one model.
 
-    # Simulate the model and observe the limited quantities at every engine step.
+    Attributes:
+        motion: The motion at the samples.
+        observed: (N, rows, w) limited quantities within the samples.
+        positions: (N * substeps, nq) positions after every engine step; None without a clearance.
+    """
+
+    motion: Trajectory
+    observed: Array
+    positions: Array | None
+
+    def equals(self, other: _Played) -> bool:
+        """Whether another model moves in the same way, to the last digit.
+
+        Args:
+            other: The same control on the other model.
+        """
+        if not self.motion.moves_as(other.motion):
+            return False
+        if not np.array_equal(self.observed, other.observed):
+            return False
+        if self.positions is None or other.positions is None:
+            return self.positions is other.positions
+        return np.array_equal(self.positions, other.positions)
+
+
+def _played(
+    task: DesignTask, constraints: ConstraintSet, ctrl: Array, model: Any
+) -> _Played | None:
+    """Play a control, (N, nu), on one model; None where the simulation diverges."""
     simulator = BatchSimulator(model, substeps=task.system.grid.substeps)
     out = simulator.rollout(
         [model],
         task.plant.initial_state(task.theta)[None],
-        trajectory.ctrl[None],
+        ctrl[None],
         constraints.observations,
     )
     if not out.finite[0] or out.observed is None:
-        return Verification.diverged(constraints.substeps.kinds, unenforced)
-    played = task.plant.trajectory(out.states[0], trajectory.ctrl)
+        return None
+
+    motion = task.plant.trajectory(out.states[0], ctrl)
+    positions = None
+    if constraints.clearance is not None:
+        positions = _positions_at_engine_steps(task, simulator, motion)
+    return _Played(motion=motion, observed=out.observed[0], positions=positions)
+
+
+def _diverged(task: DesignTask, constraints: ConstraintSet) -> Verification:
+    """The verification of a control under which the simulation diverges."""
+    return Verification.diverged(constraints.substeps.kinds, _unenforced_kinds(task))
+
+
+def _verification(
+    task: DesignTask, constraints: ConstraintSet, trajectory: Trajectory, played: _Played
+) -> Verification:
+    """Check all limits of a trajectory along its control as one model plays it."""
+    motion = played.motion
 
     # All limits but the clearance.
     others = replace(constraints, clearance=None)
-    values = others.evaluate(played, out.observed[0], slopes=False)
+    values = others.evaluate(motion, played.observed, slopes=False)
     margins = others.margins(values)
     relative_margins = others.relative_margins(values)
     usage = [
         *usage_within_samples(task, constraints, values.observed),
-        *_usage_of_controls(task, constraints, played.ctrl),
+        *_usage_of_controls(task, constraints, motion.ctrl),
     ]
 
     # The clearance, at every engine step instead of at the samples.
     clearance = constraints.clearance
-    if clearance is not None:
-        positions = _positions_at_engine_steps(task, simulator, played)
-        distance, used = _clearance_usage(task, clearance, positions)
+    if clearance is not None and played.positions is not None:
+        distance, used = _clearance_usage(task, clearance, played.positions)
         usage.append(used)
         margins["clearance"] = distance - clearance.least
         relative_margins["clearance"] = margins["clearance"] / clearance.least
 
-    difference = task.space.minus(played.state, trajectory.state)
+    difference = task.space.minus(motion.state, trajectory.state)
     deviation = float(np.abs(difference / task.sizes[: task.space.nx]).max())
     return Verification(
         margins=margins,
         relative_margins=relative_margins,
         deviation=deviation,
-        unenforced=unenforced,
+        unenforced=_unenforced_kinds(task),
         usage=tuple(usage),
     )
 
@@ -261,8 +313,13 @@ def _clearance_usage(
         clearance: The clearance.
         positions: (n, nq) positions after each engine step.
     """
-    distance, _, pair = clearance.distances.nearest(positions)
     nearest = clearance.distances(positions, slopes=False).d.min(axis=1)
+
+    # Where geoms come within reach, the engine step at which they are nearest is known by now.
+    row = int(nearest.argmin())
+    is_within_reach = nearest[row] < clearance.distances.reach
+    candidates = positions[row : row + 1] if is_within_reach else positions
+    distance, _, pair = clearance.distances.nearest(candidates)
 
     t = _engine_times(task, len(positions))
     share = clearance.least / np.maximum(nearest, CONTACT_SHARE * clearance.least)

@@ -56,6 +56,16 @@ class Trajectory(SavedRecord):
         """(N+1, nq+nv+na) positions, velocities and activations side by side."""
         return np.concatenate([self.qpos, self.qvel, self.act], axis=1)
 
+    def moves_as(self, other: Trajectory) -> bool:
+        """Whether another trajectory is the same to the last digit.
+
+        Args:
+            other: The other trajectory.
+        """
+        same_times = np.array_equal(self.t, other.t)
+        same_control = same_times and np.array_equal(self.ctrl, other.ctrl)
+        return same_control and np.array_equal(self.state, other.state)
+
     def summary(self) -> dict[str, Any]:
         """Return the contents of trajectory.json."""
         return {

@@ -9,9 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjfim.arrays import Array
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import SAME_STATE_TOLERANCE, verify
+from mjfim.excitation.verification import SAME_STATE_TOLERANCE, _clearance_usage, verify
+from mjfim.model.geom_distance import GeomDistances, SignedDistances
 from mjfim.output.playback import reference_columns, simulate_playback
 from tests.support.numerics import CART_PENDULUM, make_task
 
@@ -392,3 +394,36 @@ def test_a_control_that_makes_the_model_diverge_violates_every_limit(tmp_path: P
     assert not found.is_feasible
     assert found.deviation == np.inf
     assert set(found.margins.values()) == {-np.inf}
+
+
+def test_distances_are_measured_once_where_both_solvers_give_the_same_motion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model has a stop, which the ball does not reach."""
+    measured: list[int] = []
+    measure = GeomDistances.__call__
+
+    def counted(self: GeomDistances, qpos: Array, slopes: bool) -> SignedDistances:
+        """Count the configurations."""
+        measured.append(len(qpos))
+        return measure(self, qpos, slopes)
+
+    monkeypatch.setattr(GeomDistances, "__call__", counted)
+    stop = f'limited="true" range="-1 {2.0 * SWING}"'
+    task = spring_task(tmp_path, joint=stop, limits={"clearance": 0.035})
+    found = verify(task, task.initial)
+    assert measured == [task.samples * task.system.grid.substeps]
+    assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.035, abs=1e-4)
+
+
+def test_a_clearance_beyond_the_reach_of_distances_is_measured_too(tmp_path: Path) -> None:
+    """One position is farther from the wall than that, the other one is nearer."""
+    task = spring_task(tmp_path, limits={"clearance": 1e-4})
+    constraints = constraint_set_of(task, every=True)
+    assert constraints.clearance is not None
+    distances = constraints.clearance.distances
+    near = task.initial.qpos[:1] + 0.19 - 0.5 * distances.reach
+    far = np.array([[-SWING]])
+    farther, nearer = (_clearance_usage(task, constraints.clearance, q)[0] for q in (far, near))
+    assert farther == pytest.approx(0.19 + SWING)
+    assert nearer == pytest.approx(0.5 * distances.reach)

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget
+from mjfim.excitation import control_search
 from mjfim.excitation.design import design_task
+from mjfim.excitation.levels import DescentLevel, first_point
 from mjfim.excitation.task import DesignTask
 from mjfim.model.smooth_friction import SMOOTHING_SPEED_FRACTION
 from mjfim.model.variants import RELAXED, STATED
@@ -111,6 +114,77 @@ def test_a_longer_timestep_keeps_the_samples_and_gives_nearly_equal_states(tmp_p
     assert 1e-6 < np.abs(near - far).max() < 0.05
     with pytest.raises(ValueError, match="do not divide by 3"):
         task.stretched(3)
+
+
+def test_difference_steps_are_calibrated_again_only_where_the_motion_changes(
+    tmp_path: Path,
+) -> None:
+    """A servo without its clamp moves as before unless the clamp cuts off its force."""
+    (tmp_path / "free").mkdir()
+    for folder, largest, is_same in ((tmp_path / "free", 100.0, True), (tmp_path, 5.0, False)):
+        names = ("shoulder", "elbow")
+        limits = {
+            "control": dict.fromkeys(names, (-1.0, 1.0)),
+            "force": dict.fromkeys(names, (-largest, largest)),
+        }
+        text = ARM.replace('-1 1"/>', f'-1 1" forcerange="-{largest} {largest}"/>')
+        task = make_task(
+            text.format(friction=0.0),
+            folder,
+            rate=100.0,
+            parameters={"mass": DRY["mass"]},
+            noise={"state": 0.01},
+            initial={"control": {"kind": "sine", "amplitude": 0.9, "frequency": 2.0}},
+            limits=limits,
+        )
+        free = task.relaxed()
+        assert free.initial.moves_as(task.initial) is is_same
+        assert (free.plant.step_factors is task.plant.step_factors) is is_same
+
+        # These are the steps of a calibration of its own.
+        own = free.plant.derivatives.calibrated_step_factors(free.theta, free.initial)
+        np.testing.assert_allclose(free.plant.step_factors, own)
+
+        # A longer timestep changes the motion as well.
+        long = task.stretched(5)
+        assert long.plant.step_factors is not task.plant.step_factors
+
+
+def test_the_initial_control_is_evaluated_again_only_where_it_moves_differently(
+    tmp_path: Path,
+) -> None:
+    task = arm(tmp_path, 0.0, parameters={"mass": DRY["mass"]})
+    stated = DescentLevel(task, None)
+    first = stated.problem.point(task.initial)
+
+    # Without the clamps, which do not act, nothing is simulated.
+    free = DescentLevel(task.relaxed(), None)
+    steps = free.task.plant.engine_steps
+    assert first_point(free, first) is first
+    assert free.task.plant.engine_steps == steps
+
+    # A longer timestep gives another motion, and another cost.
+    long = DescentLevel(free.task.stretched(5), None)
+    point = first_point(long, first)
+    assert point is not None
+    assert point.cost != first.cost
+    assert long.task.plant.engine_steps > 0
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.1])
+def test_derivatives_are_compared_only_where_something_rubs_or_touches(
+    friction: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A smooth motion needs no second sensitivity, which takes as long as an iteration."""
+    task = arm(tmp_path, friction, parameters={"mass": DRY["mass"]})
+    stage = DescentLevel(task, None)
+    compared = []
+    monkeypatch.setattr(control_search, "roughness", lambda *args: compared.append(args))
+    search = control_search.ControlSearch(
+        stage=stage, first=stage.problem.point(task.initial), executor=None, budget=Budget()
+    )
+    assert not search._is_rough(task.control)
+    assert len(compared) == (1 if friction else 0)
 
 
 @pytest.mark.slow
