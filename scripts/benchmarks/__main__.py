@@ -11,6 +11,7 @@ import sys
 
 # The benchmarks, each with the question that it answers.
 BENCHMARKS = {
+    "before_and_after": "what became better than at an earlier commit, and is it enough?",
     "start_up": "how long do the command line and the first command of the README take?",
     "benchmark": "where does the time of a design go?",
     "benchmark_arm": "how does the time of an iteration grow with the number of parameters?",

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -36,9 +36,7 @@ from mjfim.output.archive import write_recording
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 from mjfim.signals import multisine
-
-# Top folder of the repository.
-ROOT = Path(__file__).resolve().parents[2]
+from scripts.benchmarks.checkouts import ROOT, CommandRun, run_command
 
 # Experiment of the two joints.
 EXPERIMENT = ROOT / "models" / "two_joint_arm.toml"
@@ -147,6 +145,44 @@ def bare(system: System, samples: int) -> float:
     return seconds / (count * steps) * samples
 
 
+def write_hour(hours: float, seed: int, file: Path) -> int:
+    """Simulate a recording of the two joints and write it as CSV.
+
+    Args:
+        hours: Duration of the recording [h].
+        seed: Seed of controls and noise.
+        file: The CSV file.
+
+    Returns:
+        Number of samples.
+    """
+    system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
+    recording = played(system, 3600.0 * hours, seed)
+    write_recording(file, recording, system)
+    return len(recording.ctrl)
+
+
+def fit_hour(log: Path, folder: Path, package: Path = ROOT) -> tuple[CommandRun, dict[str, Any]]:
+    """Fit a recording of the two joints by the command line.
+
+    Args:
+        log: The recording.
+        folder: Folder that receives the results.
+        package: Folder that contains the package.
+
+    Returns:
+        The command and its `estimate.json`.
+
+    Raises:
+        RuntimeError: There is no estimate.
+    """
+    run = run_command(package, ["identify", str(EXPERIMENT), str(log), "-o", str(folder)])
+    estimate = folder / "estimate.json"
+    if not estimate.is_file():
+        raise RuntimeError(run.messages)
+    return run, json.loads(estimate.read_text(encoding="utf-8"))
+
+
 def measured(hours: float, seed: int) -> Hour:
     """Write, read and fit a recording.
 
@@ -157,33 +193,17 @@ def measured(hours: float, seed: int) -> Hour:
     Returns:
         Measurements.
     """
-    system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
-    recording = played(system, 3600.0 * hours, seed)
-    samples = len(recording.ctrl)
-
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         log = folder / "hour.csv"
-        write_recording(log, recording, system)
-        del recording
+        samples = write_hour(hours, seed, log)
         size = log.stat().st_size / 1e6
 
         files = [str(EXPERIMENT), str(log)]
-        read = subprocess.check_output([sys.executable, "-c", READ, *files], text=True)
+        read = subprocess.check_output([sys.executable, "-c", READ, *files], cwd=ROOT, text=True)
+        run, found = fit_hour(log, folder / "out")
 
-        clock, cpu = time.perf_counter(), cpu_of_children()
-        command = [sys.executable, "-m", "mjfim", "identify", *files, "-o", str(folder / "out")]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        fitted, cpu = time.perf_counter() - clock, cpu_of_children() - cpu
-
-        # Of all child processes up to now, the fit needs the most memory.
-        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-
-        estimate = folder / "out" / "estimate.json"
-        if not estimate.is_file():
-            raise SystemExit(done.stderr)
-        found = json.loads(estimate.read_text(encoding="utf-8"))
-
+    system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
     true = system.parameters.true
     error = (np.array(found["theta"]) - true) / np.array(found["std"])
     low, high = np.array(found["interval"], dtype=float).T
@@ -192,11 +212,11 @@ def measured(hours: float, seed: int) -> Hour:
         samples=samples,
         size=size,
         read=float(read),
-        fitted=fitted,
-        cpu=cpu,
+        fitted=run.wall,
+        cpu=run.processor,
         engine=bare(system, samples),
         steps=found["steps"],
-        gigabytes=peak,
+        gigabytes=run.gigabytes,
         wrong=float(np.abs(error).max()),
         within=int(inside.sum()),
         parameters=len(true),
@@ -237,18 +257,16 @@ def hour_table(hour: Hour) -> Table:
     return table
 
 
-def cpu_of_children() -> float:
-    """CPU time of all processes that have ended [s]."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+def short_recording() -> tuple[mjfim.Experiment, Recording]:
+    """Simulate a recording of 4 s of the cart-pendulum; return its experiment as well."""
+    experiment = mjfim.Experiment.from_file(SHORT).replace(horizon=4.0)
+    task = DesignTask.resolve(experiment)
+    return experiment, simulate_system(task.system, task.initial, 0)
 
 
 def short_table() -> Table:
-    """Fit a recording of 4 s of the cart-pendulum, and make a table of the times."""
-    experiment = mjfim.Experiment.from_file(SHORT).replace(horizon=4.0)
-    task = DesignTask.resolve(experiment)
-    recording = simulate_system(task.system, task.initial, 0)
-
+    """Fit a recording of 4 s, and make a table of the times."""
+    experiment, recording = short_recording()
     title = "a recording of 4 s, three parameters, 401 rows (limit: 0.5 s after the start-up)"
     table = Table("", "wall", "CPU", "steps", title=title, title_justify="left")
 
@@ -261,16 +279,16 @@ def short_table() -> Table:
 
     with tempfile.TemporaryDirectory() as name:
         log = Path(name) / "short.csv"
-        write_recording(log, recording, task.system)
+        write_recording(log, recording, System.resolve(experiment))
         fit = ["identify", str(SHORT), str(log), "-o", str(Path(name) / "out")]
-        for command in (["--version"], fit):
-            clock, cpu = time.perf_counter(), cpu_of_children()
-            subprocess.run(
-                [sys.executable, "-m", "mjfim", *command], capture_output=True, check=True
-            )
-            wall, cpu = time.perf_counter() - clock, cpu_of_children() - cpu
-            label = "mjfim --version" if command != fit else "mjfim identify with all pictures"
-            table.add_row(label, f"{wall:.2f} s", f"{cpu:.2f} s", "")
+        for label, words in (
+            ("mjfim --version", ["--version"]),
+            ("mjfim identify with all pictures", fit),
+        ):
+            run = run_command(ROOT, words)
+            if run.code != 0:
+                raise SystemExit(run.messages)
+            table.add_row(label, f"{run.wall:.2f} s", f"{run.processor:.2f} s", "")
     return table
 
 

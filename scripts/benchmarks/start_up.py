@@ -11,16 +11,10 @@ compiled before, as by an installation.
 from __future__ import annotations
 
 import argparse
-import io
-import os
-import resource
 import statistics
-import subprocess
-import sys
-import tarfile
 import tempfile
-import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,9 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mjfim.cli.main import ORDER
-
-# Top folder of the repository.
-ROOT = Path(__file__).resolve().parents[2]
+from scripts.benchmarks.checkouts import ROOT, CommandRun, earlier_checkout, run_command
 
 # Goals of the wall time on two idle cores [s].
 START_GOAL, FIRST_COMMAND_GOAL = 0.4, 2.5
@@ -57,19 +49,6 @@ class Command:
     goal: float = START_GOAL
 
 
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """Time of one run.
-
-    Attributes:
-        wall: Wall time [s].
-        processor: Processor time of the process and of all that it has started [s].
-    """
-
-    wall: float
-    processor: float
-
-
 def commands(folder: Path) -> list[Command]:
     """List the commands.
 
@@ -92,7 +71,7 @@ def commands(folder: Path) -> list[Command]:
     ]
 
 
-def timed(checkout: Path, command: Command) -> Run:
+def timed(checkout: Path, command: Command) -> CommandRun:
     """Run a command once.
 
     Args:
@@ -102,36 +81,10 @@ def timed(checkout: Path, command: Command) -> Run:
     Raises:
         RuntimeError: It ended with another exit code.
     """
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    clock = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-m", "mjfim", *command.words],
-        cwd=checkout,
-        env={**environment, "PYTHONPATH": str(checkout)},
-        capture_output=True,
-        text=True,
-    )
-    wall = time.perf_counter() - clock
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-
-    if done.returncode != command.code:
-        raise RuntimeError(f"{command.name}: exit code {done.returncode}\n{done.stderr}")
-    used = (after.ru_utime - before.ru_utime) + (after.ru_stime - before.ru_stime)
-    return Run(wall=wall, processor=used)
-
-
-def extracted(commit: str, folder: Path) -> Path:
-    """Extract the files of an earlier commit.
-
-    Args:
-        commit: The commit.
-        folder: Folder that receives them.
-    """
-    packed = subprocess.run(["git", "archive", commit], cwd=ROOT, capture_output=True, check=True)
-    with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
-        archive.extractall(folder, filter="data")
-    return folder
+    run = run_command(checkout, command.words)
+    if run.code != command.code:
+        raise RuntimeError(f"{command.name}: exit code {run.code}\n{run.messages}")
+    return run
 
 
 def measured(
@@ -151,7 +104,7 @@ def measured(
     for checkout in checkouts:
         timed(checkout, command)
 
-    runs: list[list[Run]] = [[] for _ in checkouts]
+    runs: list[list[CommandRun]] = [[] for _ in checkouts]
     for _ in range(repeats):
         for found, checkout in zip(runs, checkouts, strict=True):
             found.append(timed(checkout, command))
@@ -177,11 +130,11 @@ def main() -> int:
         table.add_column(heading, justify="left" if heading == "command" else "right")
 
     is_reached = True
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         checkouts = [ROOT]
         if options.before:
-            checkouts.insert(0, extracted(options.before, folder / "before"))
+            checkouts.insert(0, stack.enter_context(earlier_checkout(options.before)))
         for command in commands(folder):
             medians = measured(checkouts, command, options.repeats)
             cells = [f"{wall:.2f}, {processor:.2f}" for wall, processor in medians]

@@ -1,0 +1,248 @@
+"""Small measurements that two versions of the package have in common.
+
+Each function runs in a process of its own, with the package of this folder or that of an earlier
+commit (`run_in_subprocess`), and returns what JSON can hold. The code is the same for both. It
+imports what it needs where it needs it, so that a version that lacks something fails in this one
+measurement only.
+"""
+
+from __future__ import annotations
+
+import resource
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mjfim
+from mjfim.parallel import cores
+from scripts.benchmarks.checkouts import ROOT
+
+# Folder of the examples.
+MODELS = ROOT / "models"
+
+
+class Figure(NamedTuple):
+    """A measured number.
+
+    Attributes:
+        value: The number.
+        processors: Time of the processors [s], where the number is a wall time.
+    """
+
+    value: float
+    processors: float | None = None
+
+
+# Figures of one measurement, by their names.
+Figures = dict[str, Figure]
+
+
+class Time(NamedTuple):
+    """A duration.
+
+    Attributes:
+        wall: Wall time [s].
+        processors: Time of the processors [s].
+    """
+
+    wall: float
+    processors: float
+
+
+class Clock:
+    """Wall time, and time of the processors of this process and of those that have ended."""
+
+    def __init__(self) -> None:
+        self._wall = time.perf_counter()
+        self._processors = _processors()
+
+    def read(self) -> Time:
+        """Both since the clock was made [s]."""
+        return Time(time.perf_counter() - self._wall, _processors() - self._processors)
+
+
+def _processors() -> float:
+    """Time of the processors of this process and of its ended children [s]."""
+    own, others = (
+        resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    return own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
+
+
+def costs_over_time(tables: Mapping[str, Any], seconds: float) -> list[tuple[float, float]]:
+    """Run one design until the seconds of the processor are used up.
+
+    Args:
+        tables: Tables of the experiment.
+        seconds: Seconds of the processor for the search.
+
+    Returns:
+        Seconds since the search began, and the best J so far, of every iterate.
+    """
+    from mjfim.budget import Budget, StopToken
+    from mjfim.excitation.design import design_task
+    from mjfim.excitation.task import DesignTask
+    from mjfim.records.events import DesignEvent
+
+    task = DesignTask.resolve(mjfim.Experiment(**tables))
+    token = StopToken()
+    begun = time.process_time()
+    found: list[tuple[float, float]] = []
+
+    def note(event: DesignEvent) -> None:
+        """Note the iterate, and end the run where its time is over."""
+        spent = time.process_time() - begun
+        if spent > seconds:
+            token.request()
+        best = min([event.row.cost, *(cost for _, cost in found[-1:])])
+        found.append((spent, best))
+
+    design_task(task, callback=note, budget=Budget(stop=token))
+    return found
+
+
+def starts_side_by_side(starts: int) -> Figures:
+    """Design the cart-pendulum of the README, without limits, from several starts on all cores."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    experiment = experiment.replace(descent={"starts": starts})
+
+    clock = Clock()
+    with mjfim.Pool() as executor:
+        design = mjfim.design(experiment, executor=executor, progress=False)
+    return {"time": Figure(*clock.read()), "cost": Figure(design.final.cost)}
+
+
+def arm_iterations(p: int, iterations: int, is_limited: bool) -> Figures:
+    """Design a motion of the Panda for p inertial parameters, for some iterations.
+
+    `iteration` is the mean of one iteration, `rest` all that is not iterations: what is
+    identifiable, the first iterate, and the verification. `steps` are the engine steps of an
+    iteration, and `bare step` is the time of one step of the bare engine.
+    """
+    from mjfim.excitation.design import design_task
+    from mjfim.excitation.task import DesignTask
+    from mjfim.records.events import DesignEvent
+    from scripts.benchmarks.benchmark_arm import ARM, tables_of
+    from scripts.benchmarks.iteration_parts import bare_step_time
+
+    tables = tables_of(ARM, p, iterations)
+    tables["limits"] = {"enforce": is_limited}
+    readings: list[Time] = []
+    steps: list[int] = []
+
+    clock = Clock()
+    task = DesignTask.resolve(mjfim.Experiment(**tables))
+
+    def note(event: DesignEvent) -> None:
+        """Note the time and the engine steps of an iterate."""
+        readings.append(clock.read())
+        steps.append(event.row.steps)
+
+    design_task(task, callback=note)
+    end = clock.read()
+
+    count = max(len(readings) - 1, 1)
+    wall = readings[-1].wall - readings[0].wall
+    processors = readings[-1].processors - readings[0].processors
+    return {
+        "iteration": Figure(wall / count, processors / count),
+        "rest": Figure(end.wall - wall, end.processors - processors),
+        "steps": Figure((steps[-1] - steps[0]) / count),
+        "bare step": Figure(bare_step_time(task.plant.source.model, task)),
+    }
+
+
+def ratio_to_engine(repeats: int) -> Figures:
+    """Divide the time of cart-pendulum designs by that of the engine; the worst of all cases."""
+    from mjfim.excitation.task import DesignTask
+    from scripts.benchmarks import benchmark
+
+    benchmark.mjfim_run("a", "warm-up")
+    found: Figures = {}
+    for name, descent in (("levels", {}), ("one level", {"coarse": 1})):
+        ratios = []
+        for case in benchmark.CASES:
+            run, design = benchmark.fastest(repeats, case, name, **descent)
+            task = DesignTask.resolve(benchmark.experiment(case))
+            step = benchmark.step_seconds(task, design.trajectory)
+            ratios.append(run.seconds * cores() / (design.steps * step))
+        found[name] = Figure(max(ratios))
+    return found
+
+
+def limited_cart_pendulum(seconds: float, seed: int) -> Figures:
+    """Design the cart-pendulum under hard limits with all cores and a budget of wall time [s]."""
+    from scripts.benchmarks.benchmark_limits import run_mjfim
+
+    found = run_mjfim(seconds, seed)
+    first = min((t for t, _ in found.history), default=float("inf"))
+    return {"smallest eigenvalue": Figure(found.after(seconds)), "first": Figure(first)}
+
+
+def limited_arm(arm: str, horizon: float, dry: bool, seconds: float) -> Figures:
+    """Design the motion of an arm under hard limits with all cores and a budget of wall time [s].
+
+    The figure is the worst relative standard deviation, infinite where the design leaves a limit.
+    """
+    from scripts.benchmarks import arms
+    from scripts.benchmarks.arms_table import FUNDAMENTAL
+
+    with tempfile.TemporaryDirectory() as folder:
+        stated = arms.experiment(arm, horizon, dry, Path(folder))
+        descent = {"fourier": [FUNDAMENTAL], "max_iterations": 100_000, "seconds": seconds}
+        experiment = stated.replace(descent=descent)
+
+        clock = Clock()
+        with mjfim.Pool() as executor:
+            design = mjfim.design(experiment, executor=executor, progress=False)
+        used = clock.read()
+
+    is_kept = min(design.limits.values()) >= 0.0
+    sigma = float(design.final.eigenvalues[0] ** -0.5) if is_kept else float("inf")
+    return {"sigma": Figure(sigma), "time": Figure(*used)}
+
+
+def beside_baselines(example: str, seconds: float) -> Figures:
+    """Compare a design of an example with its baselines, each in one thread.
+
+    Args:
+        example: Name of the experiment.
+        seconds: Budget of every method [s of the processor].
+
+    Returns:
+        J of the design, and the same over the lowest J of the baselines.
+    """
+    from mjfim.records.comparison import DESIGN
+    from scripts.benchmarks import anytime
+
+    experiment = mjfim.Experiment.from_file(MODELS / f"{example}.toml")
+    rows = anytime.run(example, experiment, seconds, list(anytime.METHODS))
+    found = anytime.Results(example, rows)
+    cost = found.cost(DESIGN, seconds)
+    best, _ = found.best_baseline(seconds)
+    return {"cost": Figure(cost), "over best baseline": Figure(cost / best)}
+
+
+def short_fit() -> Figures:
+    """Fit a recording of 4 s, after a first fit that imports all libraries."""
+    from scripts.benchmarks.benchmark_hour import short_recording
+
+    experiment, recording = short_recording()
+    mjfim.identify(experiment, [recording], progress=False)
+    clock = Clock()
+    found = mjfim.identify(experiment, [recording], progress=False)
+    return {"time": Figure(*clock.read()), "steps": Figure(float(found.steps))}
+
+
+def rail_fit(seconds: float) -> Figures:
+    """Fit the log of a rail with dry friction, of a duration [s]."""
+    from scripts.benchmarks import rail
+
+    found = rail.passes(seconds, 0)
+    return {
+        "passes": Figure(sum(found.by_reason.values())),
+        "steps": Figure(float(found.steps)),
+        "time": Figure(found.seconds),
+    }

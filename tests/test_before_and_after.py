@@ -1,0 +1,181 @@
+"""The table of figures before and now: medians, ratios, verdicts, and kept measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from io import StringIO
+from math import inf, nan
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from scripts.benchmarks import before_and_after as script
+from scripts.benchmarks.before_and_after import Line, Measurement, Result
+from scripts.benchmarks.checkouts import ROOT, earlier_checkout, run_command
+from scripts.benchmarks.measurements import Figure, Figures
+from scripts.benchmarks.run_in_subprocess import run_in_subprocess
+
+
+def line(goal: float | None = 2.0, is_larger_better: bool = False) -> Line:
+    return Line(name="", figure="", goal=goal, is_larger_better=is_larger_better)
+
+
+@pytest.mark.parametrize(
+    ("value", "stated", "expected"),
+    [
+        (2.0, line(), "met"),
+        (2.06, line(), "missed by 3 %"),
+        (5.0, line(), "missed by a factor 2.5"),
+        (inf, line(), "missed"),
+        (nan, line(), "missed"),
+        (3.0, line(None), ""),
+        (403.2, line(403.15, True), "met"),
+        (403.0, line(403.15, True), "missed by 0.037 %"),
+        (201.575, line(403.15, True), "missed by a factor 2"),
+        (0.0, line(403.15, True), "missed"),
+    ],
+)
+def test_a_verdict_says_how_far_the_goal_is(value: float, stated: Line, expected: str) -> None:
+    assert script.verdict(Figure(value), stated) == expected
+
+
+def test_a_failed_measurement_misses_its_goal() -> None:
+    assert script.verdict(None, line()) == "missed"
+    assert script.text_of(None, "s") == "failed"
+
+
+def test_ratios_are_those_of_the_wall_and_of_the_processors() -> None:
+    assert script.ratio_of(Figure(4.0, 6.0), Figure(1.0, 3.0)) == "0.25 (0.5)"
+    assert script.ratio_of(Figure(4.0), Figure(1.0)) == "0.25"
+    assert script.ratio_of(Figure(0.0), Figure(1.0)) == ""
+    assert script.ratio_of(None, Figure(1.0)) == ""
+
+
+def test_numbers_have_their_unit_and_the_time_of_the_processors() -> None:
+    assert script.text_of(Figure(1.2345, 2.3456), "s") == "1.23 s (2.35)"
+    assert script.text_of(Figure(403.15), "") == "403.15"
+    assert script.text_of(Figure(330000.0), "") == "330,000"
+    assert script.text_of(Figure(inf), "s") == "none found"
+
+
+def test_medians_are_those_of_each_figure() -> None:
+    runs: Sequence[Figures] = [
+        {"time": Figure(wall, wall + 1.0), "steps": Figure(7.0)} for wall in (5.0, 1.0, 2.0)
+    ]
+    assert script.medians(runs) == {"time": Figure(2.0, 3.0), "steps": Figure(7.0)}
+    assert script.medians([]) is None
+
+
+def counting(calls: list[Path], wall: float) -> Callable[[Path], Figures | None]:
+    """A measurement that fails with the earlier version and becomes slower with each call."""
+
+    def run(package: Path) -> Figures | None:
+        calls.append(package)
+        return {"time": Figure(wall * len(calls), 1.0)} if package == ROOT else None
+
+    return run
+
+
+def test_versions_take_turns_and_kept_measurements_are_not_made_again(tmp_path: Path) -> None:
+    calls: list[Path] = []
+    before = tmp_path / "before"
+    stated = Measurement(name="made_up", run=counting(calls, 1.0), lines=(), repeats=2)
+
+    expected = Result(before=None, now={"time": Figure(3.0, 1.0)})
+    assert script.measured(stated, before, tmp_path) == expected
+    assert calls == [before, ROOT, before, ROOT]
+
+    assert script.measured(stated, before, tmp_path) == expected
+    assert len(calls) == 4
+
+
+def test_a_derived_figure_uses_the_earlier_steps() -> None:
+    earlier: Figures = {"steps": Figure(1000.0), "iteration": Figure(1.0, 2.0)}
+    own: Figures = {
+        "steps": Figure(10.0),
+        "iteration": Figure(0.2, 0.3),
+        "bare step": Figure(1e-4),
+    }
+    derived = Line(name="", figure="ratio", derived=script._over_earlier_steps)
+    found = script.figure_of(derived, Result(before=earlier, now=own), own)
+    assert found is not None
+    assert found.value == pytest.approx(3.0)
+    assert script.figure_of(derived, Result(before=None, now=own), own) is None
+
+
+def test_every_part_has_measurements_with_names_of_their_own(tmp_path: Path) -> None:
+    for is_quick in (True, False):
+        sizes = script.Sizes(is_quick=is_quick, hours=1.0, folder=tmp_path)
+        found = [each for part in script.PARTS.values() for each in part.measurements(sizes)]
+        names = [each.name for each in found]
+        assert len(set(names)) == len(names)
+        assert {"short_fit", "help"} <= set(names)
+        assert all(Path(name).name == name for name in names)
+
+
+def test_the_table_has_a_row_for_each_line() -> None:
+    lines = (
+        Line(name="an iteration", figure="time", unit="s", goal=0.25),
+        Line(name="its steps", figure="steps"),
+    )
+    stated = Measurement(name="arm", run=lambda package: None, lines=lines)
+    result = Result(
+        before={"time": Figure(0.5, 1.0), "steps": Figure(40.0)},
+        now={"time": Figure(0.2, 0.4), "steps": Figure(4.0)},
+    )
+    table = script.empty_table("1234567")
+    script.add_lines(table, stated, result)
+    written = StringIO()
+    Console(file=written, width=150).print(table)
+
+    rows = [
+        [cell.strip() for cell in row.strip("│").split("│")]
+        for row in written.getvalue().splitlines()
+        if row.startswith("│")
+    ]
+    assert rows == [
+        ["an iteration", "0.5 s (1)", "0.2 s (0.4)", "0.4 (0.4)", "≤ 0.25 s", "met"],
+        ["its steps", "40", "4", "0.1", "", ""],
+    ]
+
+
+def test_an_unknown_commit_is_named() -> None:
+    with (
+        pytest.raises(SystemExit, match="no_such_commit"),
+        earlier_checkout("no_such_commit"),
+    ):
+        pass
+
+
+def test_a_process_uses_the_package_of_a_folder_and_these_benchmarks(tmp_path: Path) -> None:
+    (tmp_path / "mjfim").mkdir()
+    (tmp_path / "mjfim" / "__init__.py").write_text("")
+    code = (
+        "import scripts.benchmarks\n"
+        "found = [mjfim.__file__, scripts.benchmarks.__file__, sys.path[0], sys.argv[1]]"
+    )
+    assert run_in_subprocess(code, "word", package=tmp_path) == [
+        str(tmp_path / "mjfim" / "__init__.py"),
+        str(ROOT / "scripts" / "benchmarks" / "__init__.py"),
+        str(tmp_path),
+        "word",
+    ]
+
+
+def test_a_command_is_that_of_its_package(tmp_path: Path) -> None:
+    (tmp_path / "mjfim").mkdir()
+    (tmp_path / "mjfim" / "__main__.py").write_text(
+        "import sys\nprint(sys.argv[1:], file=sys.stderr)\nsys.exit(3)\n"
+    )
+    run = run_command(tmp_path, ["check", "gone.toml"])
+    assert run.code == 3
+    assert run.messages.strip() == "['check', 'gone.toml']"
+    assert run.processor > 0.0
+    assert 0.0 < run.gigabytes < 1.0
+
+
+def test_the_help_states_the_minutes_of_the_parts() -> None:
+    words = script.parts_in_words()
+    for name, part in script.PARTS.items():
+        assert f"{name:12s} {part.minutes[0]:4g} ({part.minutes[1]:g})" in words
