@@ -7,6 +7,7 @@ treated as everywhere else.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -16,6 +17,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mjfim.output.picture_format import PictureFormat
     from mjfim.records.shown import ShownRecord
+
+# Messages for developers, which a user does not see.
+_log = logging.getLogger(__name__)
 
 # Fewest processors with which another process saves time.
 FEWEST_CORES = 2
@@ -66,7 +70,13 @@ class DrawingProcess:
             return {}
 
         future = self._begun[1]
-        return {} if future.exception() is not None else future.result()
+        fault = future.exception()
+        if fault is None:
+            return future.result()
+
+        # This process draws the pictures again, and says what keeps one of them from being drawn.
+        _log.info("the process that draws has failed, so this one draws: %r", fault)
+        return {}
 
     def end(self) -> None:
         """End the process at once."""
@@ -151,11 +161,11 @@ def _import_what_draws() -> None:
 
 
 def _contents(record: ShownRecord, picture_format: PictureFormat) -> dict[str, bytes]:
-    """Draw all pictures of a record; empty where one of them cannot be drawn."""
+    """Draw all pictures of a record.
+
+    A fault is raised, so that the program that waits for the pictures knows its reason.
+    """
     from mjfim.output.plots.pictures import pictures_of
     from mjfim.output.plots.style import content
 
-    try:
-        return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}
-    except Exception:
-        return {}
+    return {name: content(draw(), picture_format) for name, draw in pictures_of(record).items()}

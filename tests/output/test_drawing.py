@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import pickle
@@ -12,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from mjfim.errors import MjfimError
 from mjfim.output import drawing
 from mjfim.output.drawing import begin_pictures, drawing_elsewhere, picture_contents
 from mjfim.output.picture_format import PictureFormat
@@ -32,10 +34,10 @@ def test_a_single_processor_starts_no_process(monkeypatch: pytest.MonkeyPatch) -
         assert drawing._process.get() is None
 
 
-def test_a_picture_that_cannot_be_drawn_leaves_all_to_this_process() -> None:
-    """It draws them again, and so it can say what the fault is."""
+def test_a_picture_that_cannot_be_drawn_names_its_reason() -> None:
     without_figures: object = object()
-    assert drawing._contents(without_figures, PictureFormat.PNG) == {}  # type: ignore[arg-type]
+    with pytest.raises(MjfimError, match="a object has no figures"):
+        drawing._contents(without_figures, PictureFormat.PNG)  # type: ignore[arg-type]
 
 
 class FaultyPool:
@@ -65,7 +67,10 @@ class FaultyPool:
     [(OSError("no memory"), None), (None, pickle.PicklingError("record"))],
 )
 def test_a_process_that_fails_leaves_the_pictures_to_this_one(
-    raised: Exception | None, failed: Exception | None, monkeypatch: pytest.MonkeyPatch
+    raised: Exception | None,
+    failed: Exception | None,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The data of a result are written after its pictures are begun, so nothing is raised."""
     monkeypatch.setattr("mjfim.parallel.cores", lambda: 2)
@@ -74,7 +79,9 @@ def test_a_process_that_fails_leaves_the_pictures_to_this_one(
     with drawing_elsewhere():
         assert drawing._process.get() is not None
         begin_pictures(record, PictureFormat.PNG)
-        assert picture_contents(record) == {}
+        with caplog.at_level(logging.INFO, "mjfim.output.drawing"):
+            assert picture_contents(record) == {}
+    assert ("PicklingError('record')" in caplog.text) == (failed is not None)
 
 
 @pytest.mark.parametrize("error", [ImportError, NotImplementedError, OSError])
