@@ -5,7 +5,9 @@ result and its length are kept, so that the same work can be scheduled again on 
 workers within seconds. What is simulated is the time alone: the scheduler (`mjfim.parallel`, and
 what decides between slices of searches) is that of the package, and what the caller computes
 between tasks counts with its measured CPU time, during which the workers go on. So does the time in
-which it pickles orders and unpickles results; what a cluster needs beyond that is the latency.
+which it pickles orders and unpickles results. Beyond that, a cluster needs the latency, and the
+time in which each of its workers resolves the experiment at its first task: here one task does this
+for all of them.
 """
 
 from __future__ import annotations
