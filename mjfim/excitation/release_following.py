@@ -36,11 +36,13 @@ class Following:
         tried: All releases that it evaluated, in order; the start is not among them.
         has_ended: True where it ended by itself.
         converged: True where it found a minimum.
+        is_lost: True where its worker was lost each time, so that it does not go on.
     """
 
     tried: tuple[Release, ...] = ()
     has_ended: bool = False
     converged: bool = False
+    is_lost: bool = False
 
 
 def follow(

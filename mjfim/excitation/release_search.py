@@ -207,7 +207,8 @@ class ReleaseSearch:
             return
         if self._workers is not None:
             found = self._workers.followed(self._evaluation, starts)
-            yield from ((s, f) for s, f in zip(starts, found, strict=True) if f.tried)
+            begun = zip(starts, found, strict=True)
+            yield from ((start, each) for start, each in begun if each.tried or each.is_lost)
             return
 
         evaluate, descent = self._evaluation.release, self.stage.task.experiment.descent
@@ -229,6 +230,8 @@ class ReleaseSearch:
 
         best = min([start, *found.tried], key=lambda release: release.rank)
         status = Status.RELEASE_FOUND if found.converged else Status.MAX_ITERATIONS
+        if found.is_lost:
+            status = Status.LOST
         return StartResult(
             name=name, cost=best.cost, status=status, iterations=len(self._known) - count
         )

@@ -209,6 +209,7 @@ class ReleaseWorkers:
         for outcome in dispatch.arrivals():
             # A search whose worker is lost each time ends with what it has tried.
             if outcome.is_lost:
+                latest[outcome.index] = replace(latest[outcome.index], is_lost=True)
                 continue
             index, found = outcome.index, outcome.result
             evaluation.plant.simulator.add_steps(found.steps)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +106,32 @@ def test_workers_find_the_release_of_one_process(
     assert [(s.name, s.cost, s.status, s.iterations) for s in found.starts] == [
         (s.name, s.cost, s.status, s.iterations) for s in alone.starts
     ]
+
+
+def test_a_local_search_whose_worker_is_lost_is_called_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The search of the first release is lost after a slice, that of the second one at once."""
+    monkeypatch.setattr(release_search, "GRID_EXPONENT", 1)
+    monkeypatch.setattr(release_search, "LOCAL_SEARCHES", 2)
+    monkeypatch.setattr(release_workers, "SLICE_SECONDS", 0.0)
+    follow = release_workers._follow_in_worker
+    first: list[bytes] = []
+
+    def losing(order: release_workers._FollowOrder) -> Any:
+        """Run the first slice of the first search, and lose all others."""
+        first.append(order.start.shares.tobytes())
+        if len(first) > 1:
+            raise CancelledError
+        return follow(order)
+
+    monkeypatch.setattr(release_workers, "_follow_in_worker", losing)
+    experiment = short(tmp_path, horizon=0.1, descent={"starts": 2, "max_iterations": 6})
+    with ThreadPoolExecutor(1) as executor:
+        found = mjfim.design(experiment, threads=1, executor=executor)
+    assert [start.status for start in found.starts] == [Status.LOST, Status.LOST]
+    assert found.starts[0].iterations > 0
+    assert found.starts[1].iterations == 0
 
 
 @pytest.mark.slow
