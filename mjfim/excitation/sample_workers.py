@@ -128,35 +128,56 @@ class _Found(Generic[T]):
     steps: int
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _EvaluatedSample:
+    """An evaluated sample that a worker keeps.
+
+    Attributes:
+        point: Its motion, information and criterion.
+        steps: Engine steps that its evaluation took.
+    """
+
+    point: DesignPoint
+    steps: int
+
+
 # The latest plants, costs and evaluated samples of a worker.
 _worker_plants: KeptPerThread[DesignTask] = KeptPerThread(KEPT_PLANTS)
 _worker_problems: KeptPerThread[DesignProblem] = KeptPerThread(KEPT_PROBLEMS)
-_worker_points: KeptPerThread[DesignPoint] = KeptPerThread(KEPT_POINTS)
+_worker_points: KeptPerThread[_EvaluatedSample] = KeptPerThread(KEPT_POINTS)
 
 
 @one_blas_thread()
 def _point_in_worker(order: _SampleOrder) -> _Found[tuple[Array, Criterion]]:
     """Evaluate a control at a sample in a worker process."""
-    return _counted(order, lambda problem, point: _numbers(point))
+    _, evaluated = _evaluated(order)
+
+    # The count of a design must not depend on what a worker happens to keep.
+    return _Found(result=_numbers(evaluated.point), steps=evaluated.steps)
 
 
 @one_blas_thread()
 def _slope_in_worker(order: _SampleOrder) -> _Found[Array]:
     """Differentiate the criterion at a sample by the control, in a worker process."""
-    return _counted(order, lambda problem, point: _slope(problem, order, point))
+    problem, evaluated = _evaluated(order)
 
-
-def _counted(
-    order: _SampleOrder, work: Callable[[DesignProblem, DesignPoint], T | None]
-) -> _Found[T]:
-    """Do a work on an evaluated sample, and count the engine steps that this takes."""
-    problem = _worker_problems.get(order.problem.digest, lambda: order.problem.value.problem())
+    # The evaluation of the sample was counted when its cost was wanted.
     before = problem.plant.engine_steps
-    point = _worker_points.get(
-        order.key, lambda: problem.sample_point(order.theta, order.ctrl, order.accuracy)
-    )
-    result = work(problem, point)
-    return _Found(result=result, steps=problem.plant.engine_steps - before)
+    slope = _slope(problem, order, evaluated.point)
+    return _Found(result=slope, steps=problem.plant.engine_steps - before)
+
+
+def _evaluated(order: _SampleOrder) -> tuple[DesignProblem, _EvaluatedSample]:
+    """The cost of an order and its evaluated sample, which a worker may have kept."""
+    problem = _worker_problems.get(order.problem.digest, lambda: order.problem.value.problem())
+
+    def made() -> _EvaluatedSample:
+        """Evaluate the sample."""
+        before = problem.plant.engine_steps
+        point = problem.sample_point(order.theta, order.ctrl, order.accuracy)
+        return _EvaluatedSample(point=point, steps=problem.plant.engine_steps - before)
+
+    return problem, _worker_points.get(order.key, made)
 
 
 def _numbers(point: DesignPoint) -> tuple[Array, Criterion] | None:
@@ -247,8 +268,12 @@ class SampleWorkers:
 
         def here(order: _SampleOrder) -> _Found[Array]:
             """Differentiate a sample whose worker was lost."""
+            before = problem.plant.engine_steps
             point = problem.sample_point(order.theta, order.ctrl, order.accuracy)
-            return _Found(result=_slope(problem, order, point), steps=0)
+            repeated = problem.plant.engine_steps - before
+
+            # The plant counts the evaluation, which was counted before.
+            return _Found(result=_slope(problem, order, point), steps=-repeated)
 
         slopes = []
         for found in self._all(_slope_in_worker, orders, here):
