@@ -147,6 +147,9 @@ class FitWorkers:
         self._executor = Workers.of(executor)
         self._stop = StopToken() if stop is None else stop
 
+        # True after workers did nothing for a pass that began after a request to stop.
+        self._are_given_up = False
+
         # Orders of each problem, by the threads of a worker, and the segments of a part.
         self._orders: WeakKeyDictionary[FitProblem, dict[int, SharedValue[ProblemOrder]]]
         self._orders = WeakKeyDictionary()
@@ -168,8 +171,9 @@ class FitWorkers:
         at: UnknownValues,
     ) -> Sequence[T | None]:
         """Do a work on all batches. See `batch_workers.BatchWorkers`."""
-        # One batch is simulated by all threads of this process.
-        if len(batches) < 2:
+        # One batch is simulated by all threads of this process. So is what is needed after a
+        # request to stop, if the workers did not answer then: each pass would wait for them anew.
+        if len(batches) < 2 or self._are_given_up:
             return [work(problem, at, batch) for batch in batches]
 
         threads = self._executor.threads_for(len(batches))
@@ -193,6 +197,7 @@ class FitWorkers:
 
         if len(found) < len(orders) and not is_needed:
             raise InterruptedPassError
+        self._are_given_up = is_needed and len(found) < len(orders)
         for index, batch in enumerate(batches):
             if index not in found:
                 found[index] = work(problem, at, batch)

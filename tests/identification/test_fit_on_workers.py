@@ -14,12 +14,13 @@ import mjfim
 from mjfim.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import searches, segment_simulation
+from mjfim.identification import fit_workers, searches, segment_simulation
 from mjfim.identification.fit_orders import BatchOrder
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
+from mjfim.parallel import dispatch
 from tests.support.executors import LosingThreads, move_to, processes
 from tests.support.paths import MODELS
 
@@ -106,6 +107,38 @@ class StoppingThreads(ThreadPoolExecutor):
         if self._left == 0:
             self._stop.request()
         return super().submit(fn, *args, **kwargs)
+
+
+class HangingThreads(ThreadPoolExecutor):
+    """Threads that take tasks and do nothing; they count the tasks."""
+
+    count = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.count += 1
+        return Future()
+
+
+def test_workers_that_hang_after_a_request_to_stop_are_waited_for_once(
+    experiment: mjfim.Experiment,
+    recordings: list[mjfim.Recording],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
+    monkeypatch.setattr(fit_workers, "GRACE", 0.01)
+    monkeypatch.setattr(dispatch, "GRACE", 0.01)
+    monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.01)
+    problem = problem_of(experiment, recordings, SEGMENTS)
+    begin = problem.begin(problem.system.parameters.guess)
+    stop = StopToken()
+    stop.request()
+    with HangingThreads(1) as threads:
+        divided = problem.on_workers(FitWorkers(threads, stop))
+        costs = [divided.cost(begin)]
+        submitted = threads.count
+        costs += [divided.cost(begin) for _ in range(3)]
+        assert threads.count == submitted > 0
+    assert costs == [problem.cost(begin)] * 4
 
 
 def stopped_fit(
