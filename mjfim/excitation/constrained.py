@@ -342,6 +342,9 @@ class _Search:
                 has_short_steps = steps.hold_up(row.gamma, row.mu) and self.order.until_held_up
                 may_end_here = iterate.feasible or row.cost > self.order.cost_to_beat
                 is_held_up = has_short_steps and may_end_here
+
+                # Steps may be short at an optimum, where nothing holds the search up.
+                is_held_up = is_held_up and not (status is not None and status.success)
                 is_held_up = is_held_up or self._is_too_slow(min(row.cost, result.cost))
                 result = replace(result, is_held_up=is_held_up)
                 if is_held_up or self.budget.stop.requested:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -28,6 +29,7 @@ from mjfim.excitation.limited_searches import LimitedSearches, SearchTerms
 from mjfim.excitation.merged_results import better_of
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.short_steps import ShortSteps
 from mjfim.excitation.stated_comparison import StatedComparison
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
@@ -528,6 +530,33 @@ def test_the_stated_tolerance_ends_the_last_stage_once_the_limits_hold(tmp_path:
     assert [row.margin >= 0.0 for row in sharpest].index(True) == len(sharpest) - 1
     assert design.slope > Descent().tolerance * design.final.cost
     assert_inside(task, design.trajectory.ctrl)
+
+
+@pytest.mark.slow
+def test_short_steps_hold_up_no_search_that_has_converged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Short steps end a search before its last iterate, but are no reason to doubt that one."""
+    descent = {"max_iterations": 80, "tolerance": 100.0}
+    task = cart_inside(tmp_path, horizon=0.3, descent=descent)
+    search = ConstrainedSearch(
+        experiment=task.experiment,
+        start=InitialControl(name="initial control", control=task.control),
+        schedule=BarrierSchedule(first=0.03, last=0.01, patience=5),
+        max_iterations=80,
+        threads=1,
+        until_held_up=True,
+    )
+    iterates = len(consume(search.run(), None).history)
+
+    for held_up_at, status in ((iterates, Status.CONVERGED), (iterates - 1, Status.BEST_SEEN)):
+        count = itertools.count(1)
+        monkeypatch.setattr(
+            ShortSteps, "hold_up", lambda *_, n=held_up_at, count=count: next(count) >= n
+        )
+        result = consume(search.run(), None)
+        assert result.status is status
+        assert result.is_held_up is not status.success
 
 
 def test_limits_are_tightened_where_violated_and_released_where_well_kept() -> None:
