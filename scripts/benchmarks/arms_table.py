@@ -17,6 +17,7 @@ import itertools
 import json
 import sys
 from dataclasses import asdict, dataclass
+from math import isfinite
 from pathlib import Path
 
 from rich.console import Console
@@ -169,8 +170,7 @@ def markdown_row(case: Case) -> str:
         "dry" if case.dry else "smooth",
         f"{case.horizon:g} s",
         str(case.parameters),
-        f"{case.few:.3g}",
-        f"{case.many:.3g}",
+        *(f"{sigma:.3g}" if isfinite(sigma) else "none" for sigma in (case.few, case.many)),
         f"**{case.design:.3g}**",
         f"{100 * case.gain:.0f} %",
         margin if case.kept else "no",

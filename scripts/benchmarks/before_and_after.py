@@ -2,7 +2,7 @@
 
     python -m scripts.benchmarks before_and_after                       # 40 minutes
     python -m scripts.benchmarks before_and_after --quick               # 10 minutes
-    python -m scripts.benchmarks before_and_after --only start_up rail  # some parts
+    python -m scripts.benchmarks before_and_after --only limits starts  # some parts
     python -m scripts.benchmarks before_and_after --results FOLDER      # go on from there
 
 Every measurement runs in processes of its own, in turn with the package of the earlier commit and
@@ -147,7 +147,7 @@ class Part:
 
     Attributes:
         title: The subject.
-        minutes: Time that they take on two idle cores, and that of the quick ones [min].
+        minutes: Time expected on two idle cores, and that of the quick ones [min].
         measurements: Lists them.
     """
 
@@ -587,7 +587,7 @@ def fill(table: Table, args: argparse.Namespace, console: Console) -> None:
 
 def parts_in_words() -> str:
     """The parts with their times, for the help."""
-    lines = ["parts, with their minutes on two idle cores (quick):"]
+    lines = ["parts, with the minutes expected on two idle cores (quick):"]
     for name, part in PARTS.items():
         whole, quick = part.minutes
         lines.append(f"  {name:12s} {whole:4g} ({quick:g})   {part.title}")

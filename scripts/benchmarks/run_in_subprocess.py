@@ -51,9 +51,7 @@ def run_in_subprocess(code: str, *arguments: object, package: Path = ROOT) -> An
     command = [sys.executable, "-c", f"{first}\n{code}\n{last}\n", *(str(a) for a in arguments)]
 
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(package)}
-    done = subprocess.run(
-        command, cwd=package, capture_output=True, text=True, env=environment, check=False
-    )
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
     line = next((text for text in done.stdout.splitlines() if text.startswith(MARK)), None)
     if done.returncode != 0 or line is None:

@@ -132,7 +132,8 @@ def measured(options: argparse.Namespace, folder: Path) -> bool:
     engine = bare(alone, samples) / samples
     console.print(f"measured the engine in {time.process_time() - clock:.0f} CPU s")
 
-    runs = {f"{options.workers} workers": (options.workers,)}
+    count = options.workers
+    runs = {f"{count} {'worker' if count == 1 else 'workers'}": (count,)}
     if options.compare:
         runs["no workers"] = (0,)
     found = {
