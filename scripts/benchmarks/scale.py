@@ -7,6 +7,7 @@
     python -m scripts.benchmarks scale --full --only scaling                   # about 8 minutes
     python -m scripts.benchmarks scale --only kill --kills 10                  # about 6 minutes
     python -m scripts.benchmarks scale --only interrupt --kills 10             # about 6 minutes
+    python -m scripts.benchmarks scale --only key --kills 10                        # many minutes
     python -m scripts.benchmarks scale --only folder                           # about 2 minutes
 
 Needs the extra `dask`. The durations are those of two cores. The parts, each of which can be chosen
@@ -17,6 +18,8 @@ by `--only`, for some of the verbs by `--verb`:
                largest memory of a worker
     kill       SIGKILL of a worker at random moments: the same result
     interrupt  SIGINT at random moments: seconds until there is a result
+    key        Ctrl-C in a terminal at random moments of each command: seconds until it has ended,
+               with all data of its result
     folder     workers in an empty folder, after the files of the experiment were deleted
     scaling    seconds with one worker over seconds with two
     simulate   efficiency of a design from many starts on 1 to 256 simulated workers
@@ -43,7 +46,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -59,11 +62,12 @@ from mjfim.output.archive import write_table
 from mjfim.output.playback import design_columns, simulate_playback
 from scripts.benchmarks.benchmark_hour import EXPERIMENT as TWO_JOINTS
 from scripts.benchmarks.benchmark_hour import played
+from scripts.benchmarks.pressed_key import commands, moments, pressed, undisturbed_seconds
 from scripts.benchmarks.simulated_design import efficiencies, save_curve
 
 MODELS = Path(__file__).resolve().parents[2] / "models"
 
-PARTS = ("equal", "kill", "interrupt", "folder", "scaling", "simulate")
+PARTS = ("equal", "kill", "interrupt", "key", "folder", "scaling", "simulate")
 
 # What is wanted: CPU seconds of the cluster over those of one process, memory of a worker [MiB],
 # seconds from SIGINT to a result, and speed of two workers over that of one.
@@ -423,6 +427,35 @@ def interrupted(verb: Verb, workers: int, times: int, seed: int) -> bool:
     )
 
 
+def keys_pressed(names: Sequence[str] | None, times: int, seed: int) -> bool:
+    """Press Ctrl-C at random moments of each command."""
+    rng = np.random.default_rng(seed)
+    good = True
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for command in commands(folder / "inputs"):
+            if names is not None and command.name not in names:
+                continue
+            duration = undisturbed_seconds(command, folder / "out")
+            found = [
+                pressed(command, folder / "out", moment) for moment in moments(duration, times, rng)
+            ]
+            ended = [press for press in found if press is not None]
+            for press in ended:
+                if press.fault:
+                    print(f"{command.name:11s} at {press.moment:.1f} s: {press.fault}")
+            whole = sum(not press.fault for press in ended)
+            longest = max((press.seconds for press in ended), default=0.0)
+            good &= judge(
+                command.name,
+                f"whole after a key within {duration:.0f} s, last one [s]",
+                f"{whole} of {len(ended)}, {longest:.1f}",
+                f"all, <= {MOST_SECONDS:.0f}",
+                good=whole == len(ended) and longest <= MOST_SECONDS,
+            )
+    return good
+
+
 def in_empty_folder(sizes: Sizes, references: dict[str, Reference], workers: int) -> bool:
     """Do the work in workers without any file: the experiments are deleted meanwhile."""
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as empty:
@@ -527,6 +560,8 @@ def run(options: argparse.Namespace) -> bool:
         good &= _large_work(large, parts, options)
     if parts & SMALL_PARTS:
         good &= _small_work(small, parts, options)
+    if "key" in parts:
+        good &= keys_pressed(options.verb, options.kills, options.seed)
     if "simulate" in parts:
         good &= simulation(large, large.starts, options.simulated_starts, options.picture)
 
