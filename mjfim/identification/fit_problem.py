@@ -460,9 +460,38 @@ class FitProblem:
             for loss in losses:
                 total += loss
 
+        return 0.5 * total + self.prior_cost(at)
+
+    def prior_cost(self, at: UnknownValues) -> float:
+        """Half of the sum of the squared priors and pins.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            The cost.
+        """
         common = self.prior_rows.common(at)[:, -1]
         private = self.prior_rows.private(at)[:, :, -1]
-        return 0.5 * (total + float(common @ common) + float(np.sum(private**2)))
+        return 0.5 * (float(common @ common) + float(np.sum(private**2)))
+
+    def squares(self, at: UnknownValues) -> Array | None:
+        """Sums of squared errors, which do not depend on the noise.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (ny,) sum of every output [y-unit^2]; None where a simulation diverges.
+        """
+        total = np.zeros(len(self.system.outputs))
+        batches = self.simulation.batches(derivatives=False)
+        for squares in self.of_batches(FitProblem.squares_of_batch, batches, at):
+            if squares is None:
+                return None
+            for found in squares:
+                total += found
+        return total
 
     def condense(self, at: UnknownValues) -> Condensed | None:
         """Linearise about the unknowns and condense block by block.
@@ -523,6 +552,23 @@ class FitProblem:
                 return None
             losses.append(self.loss.value(self.whitened.residual(rows)))
         return losses
+
+    def squares_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[Array] | None:
+        """Squared errors of a batch, which `squares` adds in this order.
+
+        Args:
+            at: The unknowns.
+            batch: The batch.
+
+        Returns:
+            (ny,) sums of the outputs [y-unit^2]; None where a simulation diverges.
+        """
+        squares = []
+        for rows in self.simulation.rows_of_batch(at, batch):
+            if rows is None:
+                return None
+            squares.append(np.array([float(e @ e) for e in self.whitened.errors(rows)]))
+        return squares
 
     def blocks_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> dict[int, Array] | None:
         """Condensed blocks of a batch, all of whose rows are in it.

@@ -23,11 +23,12 @@ from mjfim.identification.continuation import continued_fit
 from mjfim.identification.extreme_values import describe_extreme_value
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
+from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import NEWTON, FitSearch, of_subset, quick_subset
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import FitTask, Method
-from mjfim.information.null_space import NullSpace, find_null_space
+from mjfim.information.null_space import CLEAR_SINGULAR_VALUE, NullSpace, find_null_space
 from mjfim.optimize.levenberg_marquardt import (
     InterruptedPassError,
     SearchSettings,
@@ -42,6 +43,10 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
+
+# Share of the segments, or of each one of few, on which the search for combinations without effect
+# begins.
+SHARE_THAT_DETERMINES = 0.2
 
 Callback = Callable[[FitEvent], None]
 
@@ -270,7 +275,7 @@ def _first_fit(
     """
     count = len(problem.segments)
     try:
-        begin = search.best_start(problem, subset, begin)
+        begin = search.best_start(problem, begin)
         if not search.interrupted() or len(subset) == count:
             return problem, subset, search.solve(problem, begin)
     except InterruptedPassError:
@@ -322,10 +327,32 @@ def _why_diverged(problem: FitProblem, theta: Array) -> str:
 def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
     """Directions of theta, at the start, about which the data contain no information.
 
-    The data are the recordings and the priors.
+    The data are the recordings and the priors. What a part of them determines clearly, all of them
+    determine as well, and one difference step is enough to see it.
+    """
+    count = len(problem.segments)
+    wanted = int(SHARE_THAT_DETERMINES * count)
+    part = (
+        problem.of_segments(spread_over_data(count, wanted))
+        if wanted
+        else problem.of_first_parts(SHARE_THAT_DETERMINES)
+    )
+    quick = _null_space(task, part, with_error=False)
+    if not quick.count and quick.smallest > CLEAR_SINGULAR_VALUE:
+        return quick
+    return _null_space(task, problem, with_error=True)
+
+
+def _null_space(task: FitTask, problem: FitProblem, *, with_error: bool) -> NullSpace:
+    """Directions of theta, at the start, about which some segments and priors tell nothing.
+
+    Args:
+        task: The task.
+        problem: Problem of the segments.
+        with_error: Whether to simulate with a second difference step, which shows round-off.
     """
     parameters = task.system.parameters
-    rows = sensitivity_rows(problem, problem.begin(task.start))
+    rows = sensitivity_rows(problem, problem.begin(task.start), with_error=with_error)
     J = np.concatenate([row for row, _ in rows])
     change = np.concatenate([error for _, error in rows])
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
+from mjfim.identification.estimated_noise import EstimatedNoiseProblem
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.next_step import next_step_on_part
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
@@ -18,9 +20,11 @@ from mjfim.model.parameter_samples import sample_parameters
 from mjfim.optimize.levenberg_marquardt import (
     InterruptedPassError,
     IterationReport,
+    Problem,
     SearchSettings,
     Solution,
     UnknownValues,
+    completed,
     minimise,
 )
 from mjfim.plant.noise import Noise
@@ -38,10 +42,20 @@ FINAL_TOLERANCE_OF_MUCH_DATA = 1e-2
 
 # Number of samples that one linearisation simulates, with two-sided differences, above which the
 # amount of data is large.
-SAMPLES_OF_MUCH_DATA = 10 * SAMPLES_FOR_ONE_SIDED
+SAMPLES_OF_MUCH_DATA = SAMPLES_FOR_ONE_SIDED
 
-# Number of samples of the subset of segments on which the search begins, if there are more data.
+# Number of samples of a subset of segments that is quick to simulate, if there are more data.
 SUBSET_SAMPLES = 40_000
+
+# Largest share of the data on which the search begins, where that leaves enough samples and
+# segments.
+FIRST_SHARE = 0.25
+MIN_FIRST_SAMPLES = 5_000
+MIN_FIRST_SEGMENTS = 5
+
+# Length of a step [standard deviations] at which the search over these first data ends. They tell
+# less than all data, so that their minimum is not needed to more digits.
+FIRST_TOLERANCE = 0.1
 
 # Iterations of a short search: from a random start, or for the initial states of a subset.
 SHORT_SEARCH_ITERATIONS = 8
@@ -58,7 +72,16 @@ INITIAL_STATE_SHARE = 0.2
 # Length of a step [standard deviations] at which initial states count as found.
 INITIAL_STATE_TOLERANCE = 0.1
 
-# Largest number of times that the noise is estimated and the parameters are fitted again.
+# Decrease of the cost, as a share of it, that a last step of initial states may bring: where theta
+# is wrong, they cannot explain the data.
+INITIAL_STATE_ROUGH_SHARE = 0.01
+
+# Decrease of the cost, as a share of it, that a last step with the stated noise may still bring
+# where the noise is estimated afterwards.
+ROUGH_SHARE = 0.1
+
+# Largest number of times that the noise of a robust fit is estimated and the parameters are fitted
+# again.
 MAX_NOISE_ROUNDS = 10
 
 # Relative change of an estimated standard deviation below which it has converged.
@@ -96,6 +119,23 @@ def quick_subset(problem: FitProblem) -> np.ndarray:
     return evenly_spread_indices(count, wanted)
 
 
+def first_subset(problem: FitProblem) -> np.ndarray:
+    """Indices of the segments on which the search begins, evenly spread over the data.
+
+    Args:
+        problem: Problem of all segments.
+
+    Returns:
+        The indices; with little data those of all segments.
+    """
+    quick = quick_subset(problem)
+    wanted = int(FIRST_SHARE * len(problem.segments))
+    enough = FIRST_SHARE * problem.sample_count >= MIN_FIRST_SAMPLES
+    if not enough or not MIN_FIRST_SEGMENTS <= wanted < len(quick):
+        return quick
+    return evenly_spread_indices(len(problem.segments), wanted)
+
+
 def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
     """Take the unknowns of some segments.
 
@@ -127,21 +167,19 @@ class FitSearch:
         """True after a request to stop."""
         return self.budget.stop.requested
 
-    def best_start(
-        self, problem: FitProblem, subset: np.ndarray, begin: UnknownValues
-    ) -> UnknownValues:
+    def best_start(self, problem: FitProblem, begin: UnknownValues) -> UnknownValues:
         """Find where the search over all data begins.
 
         This is the best result of short searches on a subset of the segments.
 
         Args:
             problem: Problem of all segments.
-            subset: Indices of the segments of the subset.
             begin: Unknowns at the stated start.
 
         Returns:
             Unknowns of all segments.
         """
+        subset = first_subset(problem)
         starts = self.task.settings.starts
         part = problem.of_segments(subset)
         is_whole = len(part.segments) == len(problem.segments)
@@ -152,7 +190,11 @@ class FitSearch:
             return placed
 
         settings = replace(
-            self._final_settings(problem), relinearise_at_end=False, next_step_length=None
+            self._final_settings(problem),
+            tolerance=FIRST_TOLERANCE,
+            relinearise_at_end=False,
+            rough_share=0.0 if self.task.noise_is_stated else ROUGH_SHARE,
+            next_step_length=None,
         )
         found = [self._minimise(part, placed, settings, "part of the data")]
         found += self._from_random_starts(part, starts)
@@ -177,8 +219,8 @@ class FitSearch:
     ) -> tuple[FitProblem, Solution]:
         """Search over all data.
 
-        Where the noise is estimated, the search is repeated until the noise agrees with the
-        residuals.
+        Where the noise is estimated, it is searched for together with the parameters; the search
+        with the stated noise only leads near.
 
         Args:
             problem: Problem of all segments.
@@ -193,20 +235,48 @@ class FitSearch:
             SimulationDivergedError: The simulation diverges at the begin.
         """
         settings = self._final_settings(problem, max_iterations)
-        solution = self._minimise(problem, begin, settings, phase)
         if self.task.noise_is_stated:
-            return problem, solution
+            return problem, self._minimise(problem, begin, settings, phase)
+        if self.task.settings.loss != "linear":
+            return self._solve_in_turn_with_noise(problem, begin, settings, phase)
 
+        # The stated noise is only the first guess: its minimum is left as soon as it is near.
+        near = replace(
+            settings, relinearise_at_end=False, rough_share=ROUGH_SHARE, next_step_length=None
+        )
+        first = self._minimise(problem, begin, near, phase)
+        if first.interrupted:
+            return problem, first
+
+        smallest = MIN_NOISE_SHARE * self.task.system.noise.sigma
+        likelihood = EstimatedNoiseProblem(problem, smallest)
+        try:
+            found = self._minimise(
+                likelihood, first.unknowns, settings, f"{phase}, noise estimated"
+            )
+        except InterruptedPassError:
+            return problem, replace(first, interrupted=True)
+        weighted = completed(partial(likelihood.weighted, found.unknowns))
+        return weighted, replace(
+            found,
+            cost=likelihood.weighted_cost(found.unknowns),
+            iterates=(*first.iterates, *found.iterates[1:]),
+        )
+
+    def _solve_in_turn_with_noise(
+        self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
+    ) -> tuple[FitProblem, Solution]:
+        """Search, and estimate the noise robustly, in turn until the noise stays the same."""
+        solution = self._minimise(problem, begin, settings, phase)
         for _ in range(MAX_NOISE_ROUNDS):
             if solution.interrupted:
                 break
 
             # The noise that is estimated from the residuals weights them in the next search.
-            sigma = self._residual_sigma(problem, solution.unknowns)
+            sigma = self._robust_sigma(problem, solution.unknowns)
             change = float(np.abs(sigma / problem.noise.sigma - 1.0).max())
             noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
             reweighted = problem.with_noise(noise)
-            settings = self._final_settings(reweighted, max_iterations)
             try:
                 refined = self._minimise(
                     reweighted, solution.unknowns, settings, f"{phase}, noise estimated"
@@ -306,6 +376,7 @@ class FitSearch:
             max_iterations=iterations,
             tolerance=INITIAL_STATE_TOLERANCE,
             relinearise_at_end=False,
+            rough_share=INITIAL_STATE_ROUGH_SHARE,
         )
         held = problem.with_shared_held()
         try:
@@ -351,7 +422,7 @@ class FitSearch:
         return found
 
     def minimise(
-        self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
+        self, problem: Problem, begin: UnknownValues, settings: SearchSettings, phase: str
     ) -> Solution | None:
         """Search for a minimum within the budget, and report the iterations.
 
@@ -367,7 +438,7 @@ class FitSearch:
         return minimise(problem, begin, settings, self.budget, self._reporter(phase))
 
     def _minimise(
-        self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
+        self, problem: Problem, begin: UnknownValues, settings: SearchSettings, phase: str
     ) -> Solution:
         """Solution of a search. Raises SimulationDivergedError where its start diverges."""
         found = self.minimise(problem, begin, settings, phase)
@@ -396,29 +467,19 @@ class FitSearch:
 
         return report
 
-    def _residual_sigma(self, problem: FitProblem, at: UnknownValues) -> Array:
-        """(ny,) standard deviations of the residuals [y-unit].
+    def _robust_sigma(self, problem: FitProblem, at: UnknownValues) -> Array:
+        """(ny,) standard deviations of the residuals that are no outliers [y-unit].
 
-        With a robust loss, outliers do not count.
+        Outliers hardly change the median, from which they are taken.
         """
         sigma = np.array(problem.noise.sigma)
         predicted = problem.predict(at)
         if predicted is None:
             return sigma
 
-        # Fitted parameters make residuals smaller than the noise.
-        is_robust = self.task.settings.loss != "linear"
-        count = problem.value_count
-        correction = count / max(count - problem.unknown_count, 1)
         smallest = MIN_NOISE_SHARE * self.task.system.noise.sigma
-
         for j, errors in enumerate(problem.errors(predicted)):
-            if not len(errors):
-                continue
-
-            # The median is used with a robust loss, because outliers hardly change it.
-            spread = float(np.sqrt(np.mean(errors**2) * correction))
-            if is_robust:
+            if len(errors):
                 spread = SIGMA_PER_MEDIAN * float(np.median(np.abs(errors)))
-            sigma[j] = max(spread, smallest[j])
+                sigma[j] = max(spread, smallest[j])
         return sigma

@@ -24,7 +24,7 @@ STEPS_OF_BATCH = 100_000
 
 # Number of samples that one linearisation simulates, with two-sided differences, above which
 # differences are one-sided.
-SAMPLES_FOR_ONE_SIDED = 400_000
+SAMPLES_FOR_ONE_SIDED = 100_000
 
 # Step of one-sided differences over that of two-sided ones.
 ONE_SIDED_STEP_FACTOR = 0.1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import zip_longest
 
@@ -9,15 +10,18 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
+from mjfim.identification.batch_workers import BatchWork
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.segment_simulation import SegmentBatch
+from mjfim.identification.segment_simulation import SegmentBatch, SegmentRows
 from mjfim.information.null_space import COARSER_STEP_FACTOR
 from mjfim.optimize.condensed_least_squares import triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
 
 
-def sensitivity_rows(problem: FitProblem, at: UnknownValues) -> list[tuple[Array, Array]]:
+def sensitivity_rows(
+    problem: FitProblem, at: UnknownValues, *, with_error: bool = True
+) -> list[tuple[Array, Array]]:
     """Condensed rows of the whitened sensitivity G, and their change with a longer step.
 
     The longer difference step shows the error of the differences. Where the whole initial state is
@@ -26,6 +30,7 @@ def sensitivity_rows(problem: FitProblem, at: UnknownValues) -> list[tuple[Array
     Args:
         problem: The problem.
         at: The unknowns.
+        with_error: False for changes of zero, at half of the cost.
 
     Returns:
         (k, p) rows and (k, p) changes of every segment [standard deviations / theta-unit], k at
@@ -34,7 +39,8 @@ def sensitivity_rows(problem: FitProblem, at: UnknownValues) -> list[tuple[Array
     Raises:
         SimulationDivergedError: A perturbed simulation diverges.
     """
-    condensed = _condensed_sensitivity(problem, at)
+    work = sensitivities_of_batch if with_error else sensitivities_without_error
+    condensed = _condensed_sensitivity(problem, at, work)
     n = problem.simulation.private_count if problem.layout.free_starts else 0
 
     found = []
@@ -51,10 +57,13 @@ def sensitivity_rows(problem: FitProblem, at: UnknownValues) -> list[tuple[Array
     return found
 
 
-def _condensed_sensitivity(problem: FitProblem, at: UnknownValues) -> dict[int, Array]:
+def _condensed_sensitivity(
+    problem: FitProblem, at: UnknownValues, work: BatchWork[dict[int, Array]]
+) -> dict[int, Array]:
     """Triangle of the whitened sensitivity and its change with a longer step, by segment.
 
-    Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes.
+    Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes. The work condenses
+    those of a batch.
     """
     batches = list(
         problem.simulation.batches(
@@ -62,7 +71,7 @@ def _condensed_sensitivity(problem: FitProblem, at: UnknownValues) -> dict[int, 
         )
     )
     condensed: dict[int, Array] = {}
-    results = problem.of_batches(sensitivities_of_batch, batches, at)
+    results = problem.of_batches(work, batches, at)
     for batch, found in zip(batches, results, strict=True):
         if found is None:
             raise SimulationDivergedError(
@@ -92,16 +101,37 @@ def sensitivities_of_batch(
         (k, 2 (n+p)) triangle of each segment by its index; None where a perturbed simulation
         diverges.
     """
-    fine = problem.simulation.rows_of_batch(at, batch)
     longer = replace(batch, step=COARSER_STEP_FACTOR * batch.step)
     coarse = problem.simulation.rows_of_batch(at, longer)
+    return _condensed_batch(problem, problem.simulation.rows_of_batch(at, batch), coarse)
 
+
+def sensitivities_without_error(
+    problem: FitProblem, at: UnknownValues, batch: SegmentBatch
+) -> dict[int, Array] | None:
+    """Condense the whitened sensitivity of a batch. See `sensitivities_of_batch`.
+
+    Its change with a longer step is not computed, and zero.
+    """
+    return _condensed_batch(problem, problem.simulation.rows_of_batch(at, batch), ())
+
+
+def _condensed_batch(
+    problem: FitProblem, fine: Iterable[SegmentRows | None], coarse: Iterable[SegmentRows | None]
+) -> dict[int, Array] | None:
+    """(k, 2 (n+p)) triangle of each segment by its index; None where a simulation diverges.
+
+    Args:
+        problem: The problem.
+        fine: Simulated rows of a batch.
+        coarse: Those with a longer step of the differences, as far as they were simulated.
+    """
     condensed: dict[int, Array] = {}
     for rows, coarse_rows in zip_longest(fine, coarse):
         if rows is None:
             return None
 
-        # Where the simulation with the longer step diverges, the change is unknown.
+        # Without a simulation with the longer step, the change is unknown.
         J = problem.whitened.sensitivity(rows)
         change = np.zeros_like(J)
         if coarse_rows is not None:

@@ -221,6 +221,8 @@ class SearchSettings:
             bounds.
         relinearise_at_end: Whether to linearise once more at the solution. False saves one
             linearisation: the search ends when the next step is expected to be below the tolerance.
+        rough_share: Predicted decrease of the cost, as a share of the cost, below which a step is
+            the last one. It serves searches that need not converge; 0 for the others.
         next_step_length: Estimates the length of the next step [standard deviations] at the end
             of a complete one, at less cost than a linearisation of all data. A search that has it
             begins with hardly any damping, since it begins near the minimum. None without it.
@@ -230,6 +232,7 @@ class SearchSettings:
     tolerance: float = 1e-4
     damped: bool = True
     relinearise_at_end: bool = True
+    rough_share: float = 0.0
     next_step_length: NextStepLength | None = None
 
 
@@ -373,6 +376,9 @@ class _Search:
 
         if converged:
             return self._finished(trial.step)
+        if trial.fraction == 1.0 and self._is_near(predicted):
+            self.condensed = self.condensed.after(trial.step)
+            return self._solution("near the minimum", success=True)
         if self._needs_no_relinearisation(trial, predicted):
             self.condensed = self.condensed.after(trial.step)
             return self._solution(
@@ -503,6 +509,13 @@ class _Search:
             and predicted.private_length < SHORT_STEP
         )
         return complete and length < SHORT_STEP and next_length < self.settings.tolerance
+
+    def _is_near(self, predicted: Step) -> bool:
+        """Whether a search that need not converge has come near the minimum.
+
+        The minimum of the linearised cost was not much lower than the cost.
+        """
+        return predicted.predicted_decrease < self.settings.rough_share * self.cost
 
     def _needs_no_relinearisation(self, trial: _Trial, predicted: Step) -> bool:
         """Whether the linearisation, although it is one long step old, still holds at its end.

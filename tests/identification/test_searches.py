@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjfim.budget import Budget
-from mjfim.identification.searches import FitSearch
+from mjfim.identification.searches import FitSearch, first_subset
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (
     SearchSettings,
@@ -109,3 +109,25 @@ def test_other_ends_of_a_search_stay() -> None:
     ended = replace(stuck, stuck=False)
     assert search().over_roughness(rough, ended) == (rough, ended)
     assert search("newton").over_roughness(rough, stuck) == (rough, stuck)
+
+
+def of_segments(samples: int, count: int) -> Any:
+    """A problem of which only the sizes count."""
+    return SimpleNamespace(segments=[None] * count, sample_count=samples)
+
+
+@pytest.mark.parametrize(
+    ("samples", "count", "wanted"),
+    [
+        pytest.param(24_800, 25, 6, id="a quarter"),
+        pytest.param(24_800, 4, 4, id="too few segments"),
+        pytest.param(10_000, 100, 100, id="too few samples"),
+        pytest.param(4_000_000, 1000, 10, id="much data"),
+    ],
+)
+def test_a_search_begins_on_a_part_that_is_large_enough(
+    samples: int, count: int, wanted: int
+) -> None:
+    chosen = first_subset(of_segments(samples, count))
+    assert len(chosen) == wanted
+    assert np.diff(chosen).max() - np.diff(chosen).min() <= 1

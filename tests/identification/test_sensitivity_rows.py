@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import mjfim
@@ -14,6 +15,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.identify import _unseen_directions
 from mjfim.identification.segment_simulation import SegmentBatch
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import FitTask
@@ -46,3 +48,33 @@ def test_the_recordings_of_the_batch_that_diverges_are_named(
         sensitivity_rows(problem, at)
     assert "log0" not in last
     assert str(caught.value).startswith(" or ".join(sorted(set(last))) + ": the simulation")
+
+
+def test_rows_without_error_are_those_of_the_finer_step() -> None:
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
+    design = DesignTask.resolve(experiment, threads=1)
+    recordings = [simulate_system(design.system, design.initial, seed) for seed in range(2)]
+    problem = FitTask.resolve(experiment, recordings, threads=1).problem()
+    at = problem.begin(problem.system.parameters.guess)
+    steps = problem.system.plant.engine_steps
+    full = sensitivity_rows(problem, at)
+    between = problem.system.plant.engine_steps
+    fast = sensitivity_rows(problem, at, with_error=False)
+    assert problem.system.plant.engine_steps - between == (between - steps) // 2
+    for (J, change), (other, none) in zip(full, fast, strict=True):
+        np.testing.assert_allclose(other.T @ other, J.T @ J, rtol=1e-9)
+        assert (none == 0.0).all()
+        assert (change != 0.0).any()
+
+
+def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> None:
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=2.0)
+    design = DesignTask.resolve(experiment, threads=1)
+    recording = simulate_system(design.system, design.initial, 0)
+    task = FitTask.resolve(experiment, [recording], threads=1)
+    problem = task.problem()
+    before = problem.system.plant.engine_steps
+    sensitivity_rows(problem, problem.begin(task.start))
+    between = problem.system.plant.engine_steps
+    assert _unseen_directions(task, problem).count == 0
+    assert problem.system.plant.engine_steps - between < 0.2 * (between - before)

@@ -458,3 +458,16 @@ def test_the_last_linearisation_is_at_the_solution() -> None:
     assert saved.cost == p.cost(saved.unknowns)
     assert not np.array_equal(saved.condensed.blocks, fresh.blocks)
     np.testing.assert_allclose(saved.condensed.information(), fresh.information(), rtol=1e-3)
+
+
+def test_a_rough_search_ends_where_a_step_hardly_lowers_the_cost() -> None:
+    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
+    p = problem(*decays(), lower=[0.0, -5.0])
+    exact = solved(p, start, SearchSettings())
+    rough = solved(p, start, SearchSettings(relinearise_at_end=False, rough_share=0.1))
+    assert rough.success
+    assert rough.iterations < exact.iterations
+
+    # The last step is taken, and the one before it promised more.
+    assert rough.cost == p.cost(rough.unknowns)
+    assert exact.cost <= rough.cost < 1.1 * exact.cost
