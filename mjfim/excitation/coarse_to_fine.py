@@ -38,6 +38,17 @@ LAST_WEIGHTS: dict[int, tuple[float, ...]] = {
     3: (0.03, 3e-4, 1e-4),
 }
 
+# Barrier weight with which the stated level begins. It is larger than that with which the level
+# before ends, because the jumps of a control move to other samples.
+STATED_FIRST_WEIGHT = 1e-3
+
+# Smallest barrier weight on the stated level, the ratio of the barrier's relaxation to its weight,
+# and the slope at which the descent has converged there. With the optimum so close, only the
+# barrier keeps the cost above it.
+STATED_LAST_WEIGHT = 1e-5
+STATED_RELAXATION = 0.1
+STATED_TOLERANCE = 1e-6
+
 # Number of iterations for which there has to be time before a round on a finer level begins.
 FEWEST_ITERATIONS = 2.0
 
@@ -63,15 +74,22 @@ class CoarseToFine(LimitedRounds):
             Round(level=level, last_mu=mu, next_mu=mu, share=ROUND_SHARE)
             for level, mu in zip(self.levels, weights, strict=True)
         ]
-        return [*coarse, Round(level=self.searches.stated)]
+        coarse[-1] = replace(coarse[-1], next_mu=STATED_FIRST_WEIGHT)
+        return [*coarse, Round(level=self.searches.stated, last_mu=STATED_LAST_WEIGHT)]
 
     def terms(self, entry: Entry, seconds: float) -> SearchTerms:
         """Return the limits of the search of a start, see `RoundPlan`."""
         stage = self.rounds[entry.round]
-        share = 1.0 if stage.level is self.searches.stated else ROUND_SHARE
+        is_stated = stage.level is self.searches.stated
+        share = 1.0 if is_stated else ROUND_SHARE
         left = max(self.max_iterations - entry.done, 1)
+
+        # The descents end so close to an optimum that a sharp barrier takes most iterations.
+        schedule = BarrierSchedule(first=entry.mu, last=stage.last_mu, follows_curvature=True)
+        if is_stated:
+            schedule = replace(schedule, relaxation=STATED_RELAXATION, tolerance=STATED_TOLERANCE)
         return SearchTerms(
-            schedule=BarrierSchedule(first=entry.mu, last=stage.last_mu),
+            schedule=schedule,
             max_iterations=int(np.ceil(share * left)),
             seconds=seconds,
         )

@@ -17,7 +17,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.magnitudes import Magnitude, VectorBarrier
 from mjfim.model.geom_distance import GeomDistances
 from mjfim.optimize.barrier import BarrierDerivatives, Bounds
-from mjfim.optimize.lq import Weights
+from mjfim.optimize.lq import TangentCurve, Weights
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Trajectory
@@ -100,8 +100,53 @@ class ExpansionSums:
         return ExpansionSums(a=np.zeros((N + 1, nx)), b=np.zeros((N, nu)), weights=weights)
 
 
-class Constraint(Protocol):
+class LimitedQuantities(Protocol):
+    """Quantities between bounds along a trajectory, with the derivatives of their barrier."""
+
+    def slacks(self, values: ConstraintValues) -> Array:
+        """Relative distances to the lower and to the upper bounds, (2, ...); infinite without one.
+
+        Norms of several numbers are left out.
+
+        Args:
+            values: The constrained quantities.
+        """
+        ...
+
+    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """Changes of these distances along a tangent curve, to first order.
+
+        Args:
+            values: The constrained quantities with their derivatives.
+            step: The tangent curve.
+        """
+        ...
+
+    def add_expansion(
+        self,
+        values: ConstraintValues,
+        delta: float,
+        sums: ExpansionSums,
+        factors: Array | None = None,
+    ) -> None:
+        """Add the derivatives of the barrier to the sums.
+
+        Args:
+            values: The constrained quantities with their derivatives.
+            delta: Relaxation of the barrier, a relative margin.
+            sums: Sums over all kinds, changed in place.
+            factors: Factors of the curvature, ordered like `slacks`; default: 1.
+        """
+        ...
+
+
+class Constraint(LimitedQuantities, Protocol):
     """Inequality constraints of one or several kinds along a trajectory."""
+
+    @property
+    def quantities_between_bounds(self) -> LimitedQuantities:
+        """The limited quantities, without what measures them."""
+        ...
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """Margins of every constrained quantity, by kind."""
@@ -113,16 +158,6 @@ class Constraint(Protocol):
         Args:
             values: The constrained quantities.
             delta: Relaxation of the barrier, a relative margin.
-        """
-        ...
-
-    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
-        """Add the derivatives of the barrier to the sums.
-
-        Args:
-            values: The constrained quantities with their derivatives.
-            delta: Relaxation of the barrier, a relative margin.
-            sums: Sums over all kinds, changed in place.
         """
         ...
 
@@ -178,6 +213,11 @@ class SubstepConstraint:
             scale[list(magnitude.columns)] = magnitude.norm_at(float(self.bounds.scale[i]))
         return scale
 
+    @property
+    def quantities_between_bounds(self) -> SubstepConstraint:
+        """See `Constraint.quantities_between_bounds`."""
+        return self
+
     def tightened(self, fractions: Mapping[str, float]) -> SubstepConstraint:
         """Narrow the ranges by a fraction of their half-width, by kind."""
         each = np.array([fractions.get(kind, 0.0) for kind in self.kinds])
@@ -198,6 +238,15 @@ class SubstepConstraint:
             found[..., i] = magnitude.value(observed)
         return found
 
+    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `LimitedQuantities.slack_changes`."""
+        jacobian = values.observation_jacobian
+        if jacobian is None:
+            raise ValueError("the observations have no derivatives")
+        moved = np.concatenate([step.z[:-1], step.v], axis=1)
+        changes = np.einsum("kswi,ki->ksw", jacobian[:, :, self.number_columns], moved)
+        return self._number_bounds.slack_changes(changes)
+
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """Margins at every engine step, one item per quantity. See `Constraint.margins`."""
         margins = self.bounds.margin(self.quantities(values.observed))
@@ -213,8 +262,14 @@ class SubstepConstraint:
             for i, magnitude in self.magnitudes
         )
 
-    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
-        """See `Constraint.add_expansion`; the Hessian is one matrix product per sample."""
+    def add_expansion(
+        self,
+        values: ConstraintValues,
+        delta: float,
+        sums: ExpansionSums,
+        factors: Array | None = None,
+    ) -> None:
+        """See `LimitedQuantities.add_expansion`; the Hessian is one matrix product per sample."""
         jacobian = values.observation_jacobian
         if jacobian is None:
             raise ValueError("the observations have no derivatives")
@@ -224,7 +279,7 @@ class SubstepConstraint:
         slope = np.zeros(observed.shape)
         bent = np.zeros(jacobian.shape)
 
-        barrier = self._number_barrier(observed, delta, weight)
+        barrier = self._number_barrier(observed, delta, weight, factors)
         slope[..., self.number_columns] = barrier.slope
         bent[:, :, self.number_columns] = (
             barrier.curvature[..., None] * jacobian[:, :, self.number_columns]
@@ -248,14 +303,26 @@ class SubstepConstraint:
         sums.weights.S[:] += hessian[:, nx:, :nx]
         sums.weights.R[:] += hessian[:, nx:, nx:]
 
-    def _number_barrier(self, observed: Array, delta: float, weight: float) -> BarrierDerivatives:
+    def slacks(self, values: ConstraintValues) -> Array:
+        """See `LimitedQuantities.slacks`; of the quantities that are single numbers."""
+        observed, _ = self._observed_with_weight(values)
+        return self._number_bounds.slacks(observed[..., self.number_columns])
+
+    def _number_barrier(
+        self, observed: Array, delta: float, weight: float, factors: Array | None = None
+    ) -> BarrierDerivatives:
         """Barrier of the quantities that are single numbers, with derivatives by them."""
-        bounds = Bounds(
+        numbers = observed[..., self.number_columns]
+        return self._number_bounds.barrier(numbers, delta, weight, factors)
+
+    @property
+    def _number_bounds(self) -> Bounds:
+        """Ranges of the quantities that are single numbers."""
+        return Bounds(
             lower=self.bounds.lower[self.numbers],
             upper=self.bounds.upper[self.numbers],
             scale=self.bounds.scale[self.numbers],
         )
-        return bounds.barrier(observed[..., self.number_columns], delta, weight)
 
     def _vector_barrier(
         self, i: int, magnitude: Magnitude, observed: Array, delta: float, weight: float
@@ -280,10 +347,19 @@ class ControlConstraint:
 
     bounds: Bounds
 
+    @property
+    def quantities_between_bounds(self) -> ControlConstraint:
+        """See `Constraint.quantities_between_bounds`."""
+        return self
+
     def tightened(self, fractions: Mapping[str, float]) -> ControlConstraint:
         """Narrow the ranges by the fraction of their half-width for this kind."""
         fraction = fractions.get("control", 0.0)
         return replace(self, bounds=self.bounds.tightened(fraction))
+
+    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `LimitedQuantities.slack_changes`."""
+        return self.bounds.slack_changes(step.v)
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
@@ -294,9 +370,19 @@ class ControlConstraint:
         """See `Constraint.barrier`."""
         return self.bounds.barrier(values.trajectory.ctrl, delta, values.weight).value
 
-    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
-        """See `Constraint.add_expansion`."""
-        barrier = self.bounds.barrier(values.trajectory.ctrl, delta, values.weight)
+    def slacks(self, values: ConstraintValues) -> Array:
+        """See `LimitedQuantities.slacks`."""
+        return self.bounds.slacks(values.trajectory.ctrl)
+
+    def add_expansion(
+        self,
+        values: ConstraintValues,
+        delta: float,
+        sums: ExpansionSums,
+        factors: Array | None = None,
+    ) -> None:
+        """See `LimitedQuantities.add_expansion`."""
+        barrier = self.bounds.barrier(values.trajectory.ctrl, delta, values.weight, factors)
         diagonal = np.arange(sums.b.shape[1])
 
         sums.b[:] += barrier.slope
@@ -325,6 +411,11 @@ class ControlRateConstraint:
     control_after: Array | None = None
     periodic: bool = False
 
+    @property
+    def quantities_between_bounds(self) -> ControlRateConstraint:
+        """See `Constraint.quantities_between_bounds`."""
+        return self
+
     def tightened(self, fractions: Mapping[str, float]) -> ControlRateConstraint:
         """Narrow the ranges by the fraction of their half-width for this kind."""
         fraction = fractions.get("control_rate", 0.0)
@@ -345,6 +436,15 @@ class ControlRateConstraint:
             last = ctrl[0]
         return np.diff(ctrl, axis=0, prepend=first[None], append=last[None]) / self.dt
 
+    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `LimitedQuantities.slack_changes`."""
+        v = step.v
+        first = v[0] if self.control_before is None else np.zeros(v.shape[1])
+        last = v[-1] if self.control_after is None else np.zeros(v.shape[1])
+        last = v[0] if self.periodic else last
+        rates = np.diff(v, axis=0, prepend=first[None], append=last[None]) / self.dt
+        return self.bounds.slack_changes(rates)
+
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
         margins = self.bounds.margin(self.rates(values.trajectory.ctrl))
@@ -355,10 +455,20 @@ class ControlRateConstraint:
         rates = self.rates(values.trajectory.ctrl)
         return self.bounds.barrier(rates, delta, values.weight).value
 
-    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
-        """See `Constraint.add_expansion`."""
+    def slacks(self, values: ConstraintValues) -> Array:
+        """See `LimitedQuantities.slacks`."""
+        return self.bounds.slacks(self.rates(values.trajectory.ctrl))
+
+    def add_expansion(
+        self,
+        values: ConstraintValues,
+        delta: float,
+        sums: ExpansionSums,
+        factors: Array | None = None,
+    ) -> None:
+        """See `LimitedQuantities.add_expansion`."""
         rates = self.rates(values.trajectory.ctrl)
-        barrier = self.bounds.barrier(rates, delta, values.weight)
+        barrier = self.bounds.barrier(rates, delta, values.weight, factors)
         slope = barrier.slope / self.dt
 
         # A control raises the rate into its sample and lowers the rate out of it.
@@ -393,6 +503,11 @@ class EndStateConstraint:
     bounds: Bounds
     target: Array
 
+    @property
+    def quantities_between_bounds(self) -> EndStateConstraint:
+        """See `Constraint.quantities_between_bounds`."""
+        return self
+
     def tightened(self, fractions: Mapping[str, float]) -> EndStateConstraint:
         """Narrow the tolerances by a fraction of their half-width, by kind."""
         position = fractions.get("end_position", 0.0)
@@ -401,6 +516,11 @@ class EndStateConstraint:
         space = self.space
         each = np.repeat([position, velocity, 0.0], (space.nv, space.nv, space.na))
         return replace(self, bounds=self.bounds.tightened(each))
+
+    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `LimitedQuantities.slack_changes`."""
+        J = self.space.minus_derivative(self._difference(values))
+        return self.bounds.slack_changes(J @ step.z[-1])
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
@@ -416,10 +536,20 @@ class EndStateConstraint:
         """See `Constraint.barrier`."""
         return self.bounds.barrier(self._difference(values), delta, END_WEIGHT).value
 
-    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
-        """See `Constraint.add_expansion`."""
+    def slacks(self, values: ConstraintValues) -> Array:
+        """See `LimitedQuantities.slacks`."""
+        return self.bounds.slacks(self._difference(values))
+
+    def add_expansion(
+        self,
+        values: ConstraintValues,
+        delta: float,
+        sums: ExpansionSums,
+        factors: Array | None = None,
+    ) -> None:
+        """See `LimitedQuantities.add_expansion`."""
         difference = self._difference(values)
-        barrier = self.bounds.barrier(difference, delta, END_WEIGHT)
+        barrier = self.bounds.barrier(difference, delta, END_WEIGHT, factors)
 
         # The difference of two rotations is not linear in the state, so that J is no identity.
         J = self.space.minus_derivative(difference)
@@ -429,6 +559,70 @@ class EndStateConstraint:
     def _difference(self, values: ConstraintValues) -> Array:
         """(nx,) final state minus the target."""
         return self.space.minus(values.trajectory.state[-1], self.target)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LimitedDistances:
+    """Distances between geoms that were measured already; they have to be at least a clearance.
+
+    Attributes:
+        least: The clearance [m].
+        reach: Largest distance that is measured [m].
+    """
+
+    least: float
+    reach: float
+
+    def slacks(self, values: ConstraintValues) -> Array:
+        """See `LimitedQuantities.slacks`."""
+        measured = measured_distances(values)
+        return self.bounds(measured).slacks(measured)
+
+    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `LimitedQuantities.slack_changes`."""
+        slopes = self._slopes(values)
+        changes = np.einsum("kmi,ki->km", slopes, step.z[1:, : slopes.shape[2]])
+        return self.bounds(measured_distances(values)).slack_changes(changes)
+
+    def add_expansion(
+        self,
+        values: ConstraintValues,
+        delta: float,
+        sums: ExpansionSums,
+        factors: Array | None = None,
+    ) -> None:
+        """See `LimitedQuantities.add_expansion`."""
+        measured, slopes = measured_distances(values), self._slopes(values)
+        barrier = self.bounds(measured).barrier(measured, delta, values.weight, factors)
+        nv = slopes.shape[2]
+        hessian = np.swapaxes(slopes * barrier.curvature[..., None], 1, 2) @ slopes
+
+        # Distances are measured at the samples 1 ... N.
+        sums.a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, slopes)
+        sums.weights.Q[1:, :nv, :nv] += hessian
+
+    def bounds(self, measured: Array) -> Bounds:
+        """Bounds of (N, m) distances: at least the clearance; the barrier is zero at the reach."""
+        m = measured.shape[1]
+        return Bounds(
+            lower=np.full(m, self.least),
+            upper=np.full(m, np.inf),
+            scale=np.full(m, self.reach - self.least),
+        )
+
+    @staticmethod
+    def _slopes(values: ConstraintValues) -> Array:
+        """(N, m, nv) derivatives of the distances by the position [m / q-unit]."""
+        if values.distance_slopes is None:
+            raise ValueError("the distances have no derivatives")
+        return values.distance_slopes
+
+
+def measured_distances(values: ConstraintValues) -> Array:
+    """(N, m) distances between geoms [m]. Raises ValueError where they were not measured."""
+    if values.distances is None:
+        raise ValueError("the distances were not measured")
+    return values.distances
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -448,6 +642,11 @@ class ClearanceConstraint:
         """Distance to which margins are relative: the clearance, unless it is negligible [m]."""
         return max(self.least, NEGLIGIBLE_CLEARANCE * self.distances.reach)
 
+    @property
+    def quantities_between_bounds(self) -> LimitedDistances:
+        """See `Constraint.quantities_between_bounds`."""
+        return LimitedDistances(least=self.least, reach=self.distances.reach)
+
     def tightened(self, fractions: Mapping[str, float]) -> ClearanceConstraint:
         """Raise the clearance by a fraction of it, at most half of the way to the reach."""
         raised = self.least * (1.0 + fractions.get("clearance", 0.0))
@@ -456,40 +655,32 @@ class ClearanceConstraint:
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
-        margins = self._measured(values) - self.least
+        margins = measured_distances(values) - self.least
         yield KindMargins("clearance", margins, self.scale)
 
     def barrier(self, values: ConstraintValues, delta: float) -> float:
         """See `Constraint.barrier`."""
-        measured = self._measured(values)
-        return self._bounds(measured).barrier(measured, delta, values.weight).value
-
-    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
-        """See `Constraint.add_expansion`."""
-        measured, slopes = self._measured(values), values.distance_slopes
-        if slopes is None:
-            raise ValueError("the distances have no derivatives")
-
-        barrier = self._bounds(measured).barrier(measured, delta, values.weight)
-        nv = slopes.shape[2]
-        hessian = np.swapaxes(slopes * barrier.curvature[..., None], 1, 2) @ slopes
-
-        # Distances are measured at the samples 1 ... N.
-        sums.a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, slopes)
-        sums.weights.Q[1:, :nv, :nv] += hessian
-
-    def _bounds(self, measured: Array) -> Bounds:
-        """Bounds of (N, m) distances: at least the clearance; the barrier is zero at the reach."""
-        m = measured.shape[1]
-        return Bounds(
-            lower=np.full(m, self.least),
-            upper=np.full(m, np.inf),
-            scale=np.full(m, self.distances.reach - self.least),
+        measured = measured_distances(values)
+        return (
+            self.quantities_between_bounds.bounds(measured)
+            .barrier(measured, delta, values.weight)
+            .value
         )
 
-    @staticmethod
-    def _measured(values: ConstraintValues) -> Array:
-        """(N, m) distances [m]."""
-        if values.distances is None:
-            raise ValueError("the distances were not measured")
-        return values.distances
+    def slacks(self, values: ConstraintValues) -> Array:
+        """See `LimitedQuantities.slacks`."""
+        return self.quantities_between_bounds.slacks(values)
+
+    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
+        """See `LimitedQuantities.slack_changes`."""
+        return self.quantities_between_bounds.slack_changes(values, step)
+
+    def add_expansion(
+        self,
+        values: ConstraintValues,
+        delta: float,
+        sums: ExpansionSums,
+        factors: Array | None = None,
+    ) -> None:
+        """See `LimitedQuantities.add_expansion`."""
+        self.quantities_between_bounds.add_expansion(values, delta, sums, factors)

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
+from mjfim.excitation.barrier_curvature import CurvatureOfLimits
 from mjfim.excitation.constraint_kinds import (
     ClearanceConstraint,
     Constraint,
@@ -17,7 +18,6 @@ from mjfim.excitation.constraint_kinds import (
     ControlConstraint,
     ControlRateConstraint,
     EndStateConstraint,
-    ExpansionSums,
     SubstepConstraint,
 )
 from mjfim.excitation.limits import Limit, derivative_substeps_of, has_constant_forces
@@ -178,12 +178,12 @@ class ConstraintSet:
         Returns:
             The expansion.
         """
-        N, nu = values.trajectory.ctrl.shape
+        nu = values.trajectory.ctrl.shape[1]
         values = replace(values, observation_jacobian=observation_jacobian)
 
-        sums = ExpansionSums.zero(N, observation_jacobian.shape[-1] - nu, nu)
-        for member in self.members:
-            member.add_expansion(values, delta, sums)
+        members = tuple(member.quantities_between_bounds for member in self.members)
+        curvature = CurvatureOfLimits(members=members, values=values, delta=delta, nu=nu)
+        sums = curvature.sums()
 
         step_scale = np.full(nu, np.inf)
         if self.rate is not None:
@@ -196,6 +196,7 @@ class ConstraintSet:
             observations=observation_jacobian / self.substeps.column_scale[:, None],
             control_scale=self.control.bounds.scale,
             control_step_scale=step_scale,
+            curvature=curvature,
         )
 
 

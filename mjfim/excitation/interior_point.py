@@ -80,6 +80,11 @@ class BarrierSchedule:
             iterations.
         window: Number of iterations over which progress is measured.
         tolerance: Slope, relative to the size of the merit, at which the last stage has converged.
+        relaxation: Ratio of the relaxation delta of the barrier to its weight mu. Limits whose
+            multiplier is larger than twice the inverse of it are violated by the minima.
+        follows_curvature: Whether directions may follow the curvature of a sharp barrier along a
+            step. That saves iterations near the optimum, but takes time that grows with the
+            numbers of states and limits.
     """
 
     first: float = 0.1
@@ -88,6 +93,8 @@ class BarrierSchedule:
     settled: float = 2.0
     window: int = 8
     tolerance: float = 1e-5
+    relaxation: float = RELAXATION_PER_MU
+    follows_curvature: bool = False
 
     def barrier_weights(self) -> list[float]:
         """All weights mu, a geometric sequence with a ratio of about `MU_FACTOR`."""
@@ -543,8 +550,14 @@ class InteriorPointMethod:
 
     def _problem(self, mu: float, constraints: ConstraintSet) -> InteriorProblem:
         """The problem with barrier weight mu; the relaxation delta is proportional to mu."""
-        delta = min(MAX_RELAXATION, RELAXATION_PER_MU * mu)
-        return InteriorProblem(base=self.base, constraints=constraints, mu=mu, delta=delta)
+        delta = min(MAX_RELAXATION, self.schedule.relaxation * mu)
+        return InteriorProblem(
+            base=self.base,
+            constraints=constraints,
+            mu=mu,
+            delta=delta,
+            follows_curvature=self.schedule.follows_curvature,
+        )
 
     @property
     def _problem_without_cost(self) -> InteriorProblem:

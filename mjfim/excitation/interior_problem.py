@@ -7,7 +7,7 @@ outside the limits as well (Hauser & Saccon 2006).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,10 @@ from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
+
+# Largest weight mu of the barrier with which directions may follow its curvature along a step. With
+# larger weights it is so smooth that this is not worth the time.
+SHARP_MU = 4e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,6 +80,8 @@ class InteriorProblem:
         mu: Weight of the barrier B.
         delta: Relaxation of the barrier, over half of each range.
         with_cost: False to minimise the barrier alone, which steers a control inside the limits.
+        follows_curvature: Whether directions may follow the curvature of a sharp barrier along a
+            step, see `StructuredBFGS`.
     """
 
     base: DesignProblem
@@ -83,6 +89,7 @@ class InteriorProblem:
     mu: float
     delta: float
     with_cost: bool = True
+    follows_curvature: bool = False
 
     def point(self, ctrl: Array, *, lumps: bool = True) -> InteriorPoint:
         """Evaluate a control along its open-loop trajectory.
@@ -180,6 +187,8 @@ class InteriorProblem:
         scale = self._merit_scale(point)
         barrier: BarrierExpansion = self.constraints.expand(values, jacobian, self.delta)
         barrier = barrier.scaled(self.mu)
+        if not (self.follows_curvature and self.mu <= SHARP_MU):
+            barrier = replace(barrier, curvature=None)
 
         return Expansion(
             A=expansion.A,

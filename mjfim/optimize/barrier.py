@@ -10,13 +10,22 @@ bounds, so that a descent may begin there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.optimize.lq import TangentCurve, Weights
+
+# Smallest and largest factor of the curvature of the barrier in the model of a step.
+MIN_FACTOR = 0.05
+MAX_FACTOR = 1e4
+
+# Change of a distance to a bound, relative to the distance, below which the curvature is constant.
+SHORT_STEP = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,6 +61,45 @@ def relaxed_log_barrier(s: Array, delta: float) -> tuple[Array, Array, Array]:
     first = np.where(inside, -1.0 / safe, parabola / delta)
     second = np.where(inside, safe**-2.0, delta**-2.0)
     return value, first, second
+
+
+def curvature_factors(slacks: Array, changes: Array, factors: Array, delta: float) -> Array:
+    """Factors by which the curvature of the barrier changes along a step.
+
+    A quadratic model with the curvature of the barrier at the beginning of a step is wrong where a
+    distance s to a bound changes by a large part: it takes the distance across the bound, or stops
+    it early on the way inside. The wanted curvature is the mean one between s and the distance s+
+    at which the barrier has the slope that the model predicts for the end of the step. With the
+    logarithm this is the curvature z / s of primal-dual methods, where z is the predicted slope.
+    Where such models, each with the curvature along the minimum of the one before, come to rest,
+    the minimum is that of the barrier itself, with limits that are linear in the step.
+
+    Args:
+        slacks: (...) relative distances s to bounds, infinite without a bound.
+        changes: (...) their changes along the minimum of the model.
+        factors: (...) factors of the curvature in this model.
+        delta: Relative distance below which the barrier is relaxed.
+
+    Returns:
+        (...) factors for the next model, 1 without a bound.
+    """
+    bounded = np.isfinite(slacks)
+    s = np.where(bounded, slacks, 1.0)
+    ds = np.where(bounded, changes, 0.0)
+
+    # Slope of the barrier that the model predicts; it always pushes inside.
+    _, first, second = relaxed_log_barrier(s, delta)
+    pushed = np.maximum(-first - factors * second * ds, -MIN_FACTOR * first)
+
+    # Distance at which the barrier has this slope.
+    after = np.where(pushed * delta < 1.0, 1.0 / pushed, delta * (2.0 - pushed * delta))
+
+    # Both differences vanish for a short step, where the curvature does not change.
+    difference = s - after
+    is_short = np.abs(difference) <= SHORT_STEP * np.maximum(np.abs(s), delta)
+    mean = (pushed + first) / np.where(is_short, 1.0, difference)
+    found = np.where(is_short, 1.0, np.clip(mean / second, MIN_FACTOR, MAX_FACTOR))
+    return np.where(bounded, found, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,13 +181,40 @@ class Bounds:
         one_sided = np.where(np.isfinite(self.lower), from_lower, 0.0)
         return np.asarray(np.where(np.isfinite(self.upper), from_upper, one_sided))
 
-    def barrier(self, r: Array, delta: float, weight: float) -> BarrierDerivatives:
+    def slacks(self, r: Array) -> Array:
+        """Relative distances to both bounds.
+
+        Args:
+            r: (..., w) numbers.
+
+        Returns:
+            (2, ..., w) distances to the lower and to the upper bound over the scale, negative
+            outside, infinite without a bound.
+        """
+        return np.stack([r - self.lower, self.upper - r]) / self.scale
+
+    def slack_changes(self, change: Array) -> Array:
+        """Changes of the relative distances to both bounds.
+
+        Args:
+            change: (..., w) changes of the numbers.
+
+        Returns:
+            (2, ..., w) changes, ordered like `slacks`.
+        """
+        return np.stack([change, -change]) / self.scale
+
+    def barrier(
+        self, r: Array, delta: float, weight: float, factors: Array | None = None
+    ) -> BarrierDerivatives:
         """Barrier of numbers with its derivatives.
 
         Args:
             r: (..., w) numbers.
             delta: Relative distance below which the barrier is relaxed.
             weight: Factor of the barrier of every number.
+            factors: (2, ..., w) factors of the curvature that belongs to the lower and to the
+                upper bound; default: 1.
 
         Returns:
             Sum and derivatives of the weighted barrier; zero where a number has no bound.
@@ -148,7 +223,7 @@ class Bounds:
         slope = np.zeros(r.shape)
         curvature = np.zeros(r.shape)
 
-        for sign, bound in ((1.0, self.lower), (-1.0, self.upper)):
+        for side, (sign, bound) in enumerate(((1.0, self.lower), (-1.0, self.upper))):
             bounded = np.isfinite(bound)
             scale = self.scale[bounded]
             distance = sign * (r[..., bounded] - bound[bounded]) / scale
@@ -156,9 +231,49 @@ class Bounds:
             beta, first, second = relaxed_log_barrier(distance, delta)
             value += weight * float(np.sum(beta))
             slope[..., bounded] += sign * weight * first / scale
+            if factors is not None:
+                second = second * factors[side][..., bounded]
             curvature[..., bounded] += weight * second / scale**2
 
         return BarrierDerivatives(value=value, slope=slope, curvature=curvature)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CurvatureAlong:
+    """Curvature of the barrier along a step.
+
+    Attributes:
+        weights: The Gauss-Newton Hessian with this curvature, as a quadratic form on tangent
+            curves.
+        factors: Factors of the curvature at the beginning of the step, by kind of limit.
+        growth: Largest ratio of a factor to that in the model that led to the step; at least 1.
+    """
+
+    weights: Weights
+    factors: tuple[Array, ...]
+    growth: float
+
+
+class StepCurvature(Protocol):
+    """The barrier about a trajectory, from which its curvature along steps follows."""
+
+    def along(self, step: TangentCurve, factors: Sequence[Array] | None) -> CurvatureAlong:
+        """Curvature along the minimum of a quadratic model, see `curvature_factors`.
+
+        Args:
+            step: The minimum of the model.
+            factors: Factors of the curvature in this model, by kind of limit; None where it has
+                the curvature at the beginning of the step.
+        """
+        ...
+
+    def scaled(self, mu: float) -> StepCurvature:
+        """The same for a multiple of the barrier.
+
+        Args:
+            mu: Factor of the barrier.
+        """
+        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,6 +291,7 @@ class BarrierExpansion:
         control_scale: (nu,) scale of the control [u-unit].
         control_step_scale: (nu,) scale of the control's change from one sample to the next
             [u-unit], infinite without a limit.
+        curvature: The curvature along steps, or None where only that at the trajectory is known.
     """
 
     a: Array
@@ -184,6 +300,7 @@ class BarrierExpansion:
     observations: Array
     control_scale: Array
     control_step_scale: Array
+    curvature: StepCurvature | None = None
 
     def scaled(self, mu: float) -> BarrierExpansion:
         """Expansion of a multiple of the barrier, with unchanged scales of the limits.
@@ -194,7 +311,13 @@ class BarrierExpansion:
         Returns:
             The expansion.
         """
-        return replace(self, a=mu * self.a, b=mu * self.b, weights=self.weights.scaled(mu))
+        return replace(
+            self,
+            a=mu * self.a,
+            b=mu * self.b,
+            weights=self.weights.scaled(mu),
+            curvature=None if self.curvature is None else self.curvature.scaled(mu),
+        )
 
     def largest_relative_move(self, zeta: TangentCurve) -> float:
         """Largest change of any limited quantity or control along a tangent curve.

@@ -7,7 +7,7 @@ by BFGS.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -45,6 +45,17 @@ MIN_TAKEN_FRACTION = 0.3
 # Predicted decrease above which a shortened step raises the damping. With a smaller one, short
 # damped steps would look like convergence.
 SIGNIFICANT_DECREASE = 0.01
+
+# Largest number of models, one after the other, with the curvature of the barrier along the minimum
+# of the model before.
+MAX_BENT_MODELS = 6
+
+# Growth of the curvature of any limit along the minimum of a model from which on the next model
+# takes the curvature along it.
+SIGNIFICANT_GROWTH = 1.3
+
+# Fraction of a step below which the line search has shortened it much.
+MUCH_SHORTENED = 0.5
 
 # Smallest squared norm of a step in a denominator.
 SMALLEST_SQUARE = 1e-300
@@ -272,6 +283,10 @@ class _LocalModel:
             H = H + damping * uniform_H
         return BasisMetric(H=H)
 
+    def with_weights(self, weights: Weights) -> _LocalModel:
+        """The model with other weights."""
+        return replace(self, weights=weights)
+
     @cached_property
     def _matrices(self) -> tuple[Array, Array]:
         """(M nu, M nu) matrices of the weights and of the uniform weights on the coefficients."""
@@ -312,6 +327,10 @@ class StructuredBFGS:
     Marquardt). This shortens directions with little curvature, but not the step back inside the
     limits, where the barrier's curvature is large.
 
+    Where the line search shortens a step much, the barrier's curvature changes too much along it.
+    The next directions then follow this change: the minimum of the model is found again with the
+    curvature along the minimum before, which costs no simulation.
+
     Attributes:
         ridge: (nu,) weight of the control at every sample, which keeps the metric positive.
         basis: (N, M) basis of the controls, or None where the controls are free.
@@ -319,6 +338,7 @@ class StructuredBFGS:
         reach: Trusted length of a step: largest change of any limited quantity, over half of its
             range.
         damping: Factor of the uniform weights in the next step, in units of mu.
+        is_bent: Whether the next step uses the curvature of the barrier along the step.
     """
 
     ridge: Array
@@ -326,6 +346,7 @@ class StructuredBFGS:
     memory: int = 30
     reach: float = 0.5
     damping: float = 0.0
+    is_bent: bool = False
     _pairs: tuple[_RemainderPair, ...] = ()
     _last: _LocalModel | None = field(default=None, repr=False)
     _proposed: TangentCurve | None = field(default=None, repr=False)
@@ -345,6 +366,8 @@ class StructuredBFGS:
         """
         here = self._local_model(expansion, K)
         zeta, relative_length = self._damped_curve(here)
+        if self.is_bent:
+            here, zeta, relative_length = self._bent(here, zeta, relative_length)
 
         for _ in range(MAX_DAMPED_TRIALS - 1):
             if relative_length <= 1.0:
@@ -357,6 +380,38 @@ class StructuredBFGS:
         fraction = 1.0 / max(relative_length, 1.0)
         self._proposed = TangentCurve(z=fraction * zeta.z, v=fraction * zeta.v)
         return self._proposed
+
+    def _bent(
+        self, here: _LocalModel, zeta: TangentCurve, relative_length: float
+    ) -> tuple[_LocalModel, TangentCurve, float]:
+        """Minimum of the model with the curvature of the barrier along the step itself.
+
+        Args:
+            here: The model with the curvature at its point.
+            zeta: Tangent curve of its minimum.
+            relative_length: Length of this over the trusted length.
+
+        Returns:
+            The model with the last curvature, its minimum, and the length of that.
+        """
+        curvature = _barrier(here.expansion).curvature
+        if curvature is None:
+            return here, zeta, relative_length
+
+        factors: tuple[Array, ...] | None = None
+        for _ in range(MAX_BENT_MODELS):
+            along = curvature.along(zeta, factors)
+            if along.growth < SIGNIFICANT_GROWTH:
+                break
+            factors = along.factors
+            here = here.with_weights(self._with_ridge(along.weights))
+            zeta, relative_length = self._damped_curve(here)
+
+        return here, zeta, relative_length
+
+    def _with_ridge(self, form: Weights) -> Weights:
+        """Weights of the barrier plus those of the ridge."""
+        return Weights(Q=form.Q, S=form.S, R=form.R + np.diag(self.ridge), W=form.W)
 
     def _damped_curve(self, here: _LocalModel) -> tuple[TangentCurve, float]:
         """Tangent curve of the model's minimum, and its length over the trusted length."""
@@ -403,7 +458,7 @@ class StructuredBFGS:
         return partial(inverse_hessian_product, pairs=pairs, initial=metric.solve)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Adapt the damping to an accepted step, and store a curvature pair.
+        """Adapt damping and curvature to an accepted step, and store a curvature pair.
 
         Args:
             expansion: Expansion at the new point.
@@ -415,7 +470,7 @@ class StructuredBFGS:
         if before is None or proposed is None:
             return
 
-        self._adapt_damping(before, proposed, moved)
+        self._adapt(before, proposed, moved)
 
         after = self._local_model(expansion, K)
         s = after.coordinates.coordinate(moved)
@@ -425,12 +480,18 @@ class StructuredBFGS:
         y = after.cost_gradient - before.cost_gradient - before.predicted_change(s)
         self._pairs = (*self._pairs, _RemainderPair(s=s, y=y))[-self.memory :]
 
-    def _adapt_damping(
-        self, before: _LocalModel, proposed: TangentCurve, moved: TangentCurve
-    ) -> None:
-        """Lower the damping after a step that was taken, raise it after a shortened one."""
+    def _adapt(self, before: _LocalModel, proposed: TangentCurve, moved: TangentCurve) -> None:
+        """Lower the damping after a step that was taken, raise it after a shortened one.
+
+        Such a step also changes how the curvature of the barrier is taken.
+        """
         square = max(float(np.vdot(proposed.v, proposed.v)), SMALLEST_SQUARE)
         taken_fraction = float(np.vdot(proposed.v, moved.v)) / square
+
+        # The curvature along the step is tried after a step that was much too long, and given up
+        # after one that was too long in spite of it.
+        if taken_fraction < MUCH_SHORTENED and _barrier(before.expansion).curvature is not None:
+            self.is_bent = not self.is_bent
 
         if taken_fraction > MIN_TAKEN_FRACTION:
             relative_length = self._relative_length(before.expansion, proposed)
@@ -458,8 +519,7 @@ class StructuredBFGS:
             return last
 
         barrier = _barrier(expansion)
-        form = barrier.weights
-        weights = Weights(Q=form.Q, S=form.S, R=form.R + np.diag(self.ridge), W=form.W)
+        weights = self._with_ridge(barrier.weights)
         coordinates = CurveCoordinates(A=expansion.A, B=expansion.B, K=K)
 
         gradient = self._gradient(coordinates, expansion.a, expansion.b)

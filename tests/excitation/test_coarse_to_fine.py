@@ -236,9 +236,10 @@ def test_no_level_resembles_one_on_which_the_initial_control_diverges(fine: Desc
 
 @pytest.mark.slow
 def test_the_cart_pendulum_gets_near_its_best_optimum_with_few_engine_steps() -> None:
-    # One level took 2 million steps from each start.
-    task = DesignTask.resolve(LIMITS.replace(descent={"starts": 2}), threads=1)
+    # One level took 2 million steps from each start, and several levels with steps that ended at
+    # the bounds of the control came to 403.26 in 1.1 million. The best known value is 403.4.
+    task = DesignTask.resolve(LIMITS.replace(descent={"starts": 5}), threads=1)
     design = design_task(task)
-    assert design.final.eigenvalues[0] > 402.0
+    assert design.final.eigenvalues[0] > 403.3
     assert min(design.limits.values()) >= 0.0
-    assert design.steps < 2_000_000
+    assert design.steps < 1_000_000

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.constraint_kinds import END_WEIGHT, ConstraintValues
-from mjfim.excitation.constraints import constraint_set_of
+from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.interior_problem import InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
 from mjfim.optimize.lq import TangentCurve
 from tests.support.limits import ARM, barrier_check, directions_of, floating_task
-from tests.support.numerics import make_task
+from tests.support.numerics import Array, make_task, relative_error
 
 WIDE = {
     "position": 0.5,
@@ -217,6 +217,84 @@ def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Pa
         ].max()
         wanted = max(moved, np.abs(way / constraints.control.bounds.scale).max())
         assert expansion.barrier.largest_relative_move(zeta) == pytest.approx(wanted, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_changes_of_distances_to_bounds_are_those_of_the_simulation(
+    name: str, tmp_path: Path
+) -> None:
+    task = arm_task(tmp_path, **TOGETHER[name])
+    constraints = constraint_set_of(task)
+    problem = InteriorProblem(
+        base=task.problem, constraints=constraints, mu=1.0, delta=0.1, with_cost=False
+    )
+    expansion = problem.expand(problem.point(task.control))
+    values = along_control(task, constraints, task.control, slopes=True)
+    _, _, rise = task.plant.derivatives.observation_jacobians(
+        task.theta, values.trajectory, constraints.observations
+    )
+    values = replace(values, observation_jacobian=rise)
+    for way in 1e-4 * directions_of(task, 2, seed=5):
+        zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
+        up, down = (
+            along_control(task, constraints, task.control + s * way, slopes=False)
+            for s in (1.0, -1.0)
+        )
+        for member in constraints.members:
+            limited = member.quantities_between_bounds
+            high, low = limited.slacks(up), limited.slacks(down)
+            bounded = np.isfinite(high)
+            found = limited.slack_changes(values, zeta)[bounded]
+            assert relative_error(found, 0.5 * (high[bounded] - low[bounded])) < 5e-3
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_the_curvature_along_a_step_is_that_of_its_factors(name: str, tmp_path: Path) -> None:
+    """A step that changes nothing has the curvature at its beginning; a second model continues with
+    the factors of the first one."""
+    task = arm_task(tmp_path, **TOGETHER[name])
+    mu = 3e-3
+    problem = InteriorProblem(
+        base=task.problem,
+        constraints=constraint_set_of(task),
+        mu=mu,
+        delta=0.05,
+        with_cost=False,
+        follows_curvature=True,
+    )
+    expansion = problem.expand(problem.point(task.control))
+    barrier = expansion.barrier
+    assert barrier is not None
+    assert barrier.curvature is not None
+    K = np.zeros((task.samples, 2, task.space.nx))
+    way = directions_of(task, 1, seed=6)[0]
+    still = barrier.curvature.along(expansion.lift(K, 0.0 * way), None)
+    assert still.growth == 1.0
+    np.testing.assert_allclose(still.weights.Q, barrier.weights.Q, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(still.weights.R, barrier.weights.R, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(still.weights.W, barrier.weights.W, rtol=1e-9, atol=0)
+
+    step = expansion.lift(K, way)
+    once = barrier.curvature.along(step, None)
+    assert once.growth > 1.0
+    assert once.growth == pytest.approx(max(each.max() for each in once.factors))
+    again = barrier.curvature.along(step, once.factors)
+    ratios = [b / a for a, b in zip(once.factors, again.factors, strict=True)]
+    assert again.growth == pytest.approx(max(each.max() for each in ratios))
+    # with a smooth barrier, or where it is not asked for, the curvature is not followed
+    for other in (replace(problem, mu=0.1), replace(problem, follows_curvature=False)):
+        smooth = other.expand(other.point(task.control)).barrier
+        assert smooth is not None
+        assert smooth.curvature is None
+
+
+def along_control(
+    task: DesignTask, constraints: ConstraintSet, ctrl: Array, slopes: bool
+) -> ConstraintValues:
+    """The limited quantities along a control."""
+    observed = task.plant.observe(task.theta, ctrl, constraints.observations)
+    assert observed is not None
+    return constraints.evaluate(*observed, slopes=slopes)
 
 
 def test_margins_along_a_trajectory_are_those_of_single_engine_steps(tmp_path: Path) -> None:

@@ -7,8 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
-from mjfim.optimize.barrier import BarrierExpansion, Bounds, relaxed_log_barrier
+from mjfim.optimize.barrier import (
+    BarrierExpansion,
+    Bounds,
+    curvature_factors,
+    relaxed_log_barrier,
+)
 from mjfim.optimize.lq import TangentCurve, Weights
 from tests.support.numerics import Array, relative_error
 
@@ -171,3 +177,32 @@ def test_the_largest_relative_move_is_over_observations_and_controls() -> None:
     ]
     assert [float(array.flat[0]) for array in found] == [2.0, 4.0, 2.0, 4.0, 6.0, 8.0]
     np.testing.assert_array_equal(double.observations, observations)  # ranges, not weights
+
+
+@pytest.mark.parametrize(
+    ("s", "slope", "bend", "delta"),
+    [(0.3, 5.0, 0.1, 1e-3), (1.0, 0.01, 0.5, 1e-3), (0.5, 300.0, 0.1, 1e-2), (0.2, 30.0, 4.0, 0.1)],
+)
+def test_models_with_the_curvature_along_their_minimum_lead_to_that_of_the_barrier(
+    s: float, slope: float, bend: float, delta: float
+) -> None:
+    """The minimum of slope x + bend x^2 / 2 + beta(s + x) follows from a few quadratic models."""
+    slack = np.array([s])
+    _, first, second = relaxed_log_barrier(slack, delta)
+    factors = np.ones(1)
+    for _ in range(20):
+        x = -(slope + first) / (bend + factors * second)
+        factors = curvature_factors(slack, x, factors, delta)
+    wanted = brentq(
+        lambda x: slope + bend * x + relaxed_log_barrier(np.array([s + x]), delta)[1][0], -2.0, 2.0
+    )
+    assert x[0] == pytest.approx(wanted, rel=1e-3)
+    # the curvature at the beginning leads elsewhere
+    newton = -(slope + first[0]) / (bend + second[0])
+    assert abs(newton - wanted) > 0.2 * abs(wanted)
+
+
+def test_the_curvature_along_a_step_is_that_at_its_beginning_without_a_step_or_a_bound() -> None:
+    slacks = np.array([0.5, 1e-4, -0.02, INF, INF])
+    changes = np.array([0.0, 0.0, 0.0, 3.0, -3.0])
+    np.testing.assert_array_equal(curvature_factors(slacks, changes, np.ones(5), 1e-3), np.ones(5))
