@@ -116,15 +116,9 @@ class LimitedSearch:
         if levels:
             search = CoarseToFine(searches=searches, starts=starts, levels=levels)
         else:
-            # Making the coarse level takes about as long as an iteration on it.
-            begun = self.budget.seconds_used
             coarse = None if done else easier_level(free, self.first)
             search = Multistart(
-                searches=searches,
-                starts=starts,
-                coarse=coarse,
-                iterations_done=done,
-                seconds_of_an_iteration=self.budget.seconds_used - begun,
+                searches=searches, starts=starts, coarse=coarse, iterations_done=done
             )
         constrained = yield from search.run()
         return (yield from search.tighten_winner(constrained))

@@ -35,10 +35,6 @@ MU_RESTART_FACTOR = 3.0
 # Share of the iterations and of the time for the first round.
 FIRST_ROUND_SHARE = 0.5
 
-# Number of estimated iterations for which each stage of the barrier has to have time. A stage that
-# ends before its first step costs a gradient, and gains nothing.
-ITERATIONS_OF_A_STAGE = 1
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Multistart(LimitedRounds):
@@ -46,12 +42,9 @@ class Multistart(LimitedRounds):
 
     Attributes:
         coarse: A level that is quicker to simulate, or smoother; None without one.
-        seconds_of_an_iteration: Estimated time of an iteration in the first round [s]; 0 where it
-            is not known.
     """
 
     coarse: DescentLevel | None
-    seconds_of_an_iteration: float = 0.0
 
     @cached_property
     def rounds(self) -> Sequence[Round]:
@@ -76,9 +69,7 @@ class Multistart(LimitedRounds):
         if entry.round < len(self.rounds) - 1:
             iterations = round(FIRST_ROUND_SHARE * self.max_iterations)
 
-        schedule = self._in_time(
-            BarrierSchedule(first=entry.mu, last=stage.last_mu), entry, seconds
-        )
+        schedule = BarrierSchedule(first=entry.mu, last=stage.last_mu)
         return SearchTerms(schedule=schedule, max_iterations=iterations, seconds=seconds)
 
     def judge(self, entry: Entry) -> Judge | None:
@@ -99,26 +90,6 @@ class Multistart(LimitedRounds):
     def merged(self, before: RunResult | None, result: RunResult) -> RunResult:
         """Result of a start after a further round, see `RoundPlan`."""
         return result if before is None else better_of(before, result)
-
-    def _in_time(self, schedule: BarrierSchedule, entry: Entry, seconds: float) -> BarrierSchedule:
-        """A schedule without the last stages where there is no time for all of them.
-
-        Steps are long while the weight is large, so that the first stages gain most.
-
-        Args:
-            schedule: The schedule.
-            entry: The start.
-            seconds: Time of the search [s].
-        """
-        task = self.rounds[entry.round].level.task
-        steps = task.samples * task.system.grid.substeps
-        each = entry.seconds_per_step * steps if entry.round else self.seconds_of_an_iteration
-        weights = schedule.barrier_weights()
-        if each == 0.0 or seconds >= ITERATIONS_OF_A_STAGE * each * len(weights):
-            return schedule
-
-        count = max(int(seconds / (ITERATIONS_OF_A_STAGE * each)), 1)
-        return replace(schedule, last=weights[count - 1])
 
     @property
     def _differs_by_timestep_only(self) -> bool:

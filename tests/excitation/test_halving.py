@@ -22,7 +22,7 @@ from mjfim.excitation.limited_searches import LimitedSearches
 from mjfim.excitation.merged_results import continued
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.round_times import LEAST_SHARE, RoundTimes
-from mjfim.excitation.rounds import Entry, Judgement
+from mjfim.excitation.rounds import Judgement
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.running_rounds import RunningRounds
 from mjfim.excitation.search_slices import SealedState, SearchSlice
@@ -97,23 +97,6 @@ def multistart_of(task: DesignTask, count: int, executor: Executor) -> Multistar
     searches = LimitedSearches(stated=level, executor=executor, budget=Budget())
     starts = [InitialControl(name=f"{i}", control=task.control) for i in range(count)]
     return Multistart(searches=searches, starts=starts, coarse=level)
-
-
-@pytest.mark.parametrize("number", [0, 1])
-def test_stages_without_time_for_a_step_are_left_out(number: int, task: DesignTask) -> None:
-    """An iteration takes two seconds on the coarse level as on the stated one."""
-    level = DescentLevel(task.relaxed(), None)
-    searches = LimitedSearches(stated=level, executor=None, budget=Budget())
-    start = InitialControl(name="0", control=task.control)
-    plan = Multistart(searches=searches, starts=[start], coarse=level, seconds_of_an_iteration=2.0)
-    steps = level.task.samples * level.task.system.grid.substeps
-    entry = Entry(number=0, index=0, round=number, start=start, seconds_per_step=2.0 / steps)
-
-    every = plan.terms(entry, np.inf).schedule.barrier_weights()
-    assert len(every) > 3
-    for seconds, count in ((0.0, 1), (3.9, 1), (4.0, 2), (2.0 * len(every), len(every))):
-        schedule = plan.terms(entry, seconds).schedule
-        assert (schedule.first, schedule.last) == (every[0], pytest.approx(every[count - 1]))
 
 
 class InventedTasks(MeasuredTasks):
