@@ -1,8 +1,9 @@
 """Reaction of a program to Ctrl-C and SIGTERM, so that no result is lost.
 
 The first press asks the computation to return its best result so far, which is then written. A
-second press, which follows by itself after `FINISH_SECONDS`, leaves out what is not necessary, such
-as figures. Before there is anything to keep, the first press ends the program.
+second press leaves out what is not necessary, such as figures. These are also left out
+`FINISH_SECONDS` after the first press, which hurries no computation. Before there is anything to
+keep, the first press ends the program.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from typing import Any, Protocol
 from mjfim.atomic_io import remove_temporary_files
 from mjfim.errors import NoResultError, UnfinishedError
 
-# Time after the first press at which a second one follows by itself [s]. Computations end within
-# about 5 s. What is drawn then may take much longer on a busy computer, and can be drawn later.
+# Time after the first press at which files are left out that are not necessary [s]. Computations
+# usually end within about 5 s. What is drawn then may take much longer on a busy computer, and can
+# be drawn later.
 FINISH_SECONDS = 6.0
 
 # Time after the second press of the user at which the process ends in any case [s].
@@ -59,7 +61,7 @@ class Interruption:
     process that ignores Ctrl-C, such as a worker, continues to ignore it.
 
     Attributes:
-        presses: Number of presses so far.
+        presses: Number of presses of the user so far.
         folder: Folder that holds results already, or None.
         incomplete: True after results were left out.
     """
@@ -79,10 +81,16 @@ class Interruption:
         self._has_result = False
         self._has_work_to_finish = False
         self._is_optional = False
+
+        # Whether the time for files that may be left out is over, and whether the signal that says
+        # so is still to come.
+        self._is_time_over = False
+        self._is_own_press_expected = False
         self._before: dict[int, Any] = {}
 
         # An error that Python has dropped, because the press came during a callback.
         self._dropped: type[BaseException] | None = None
+        self._again: threading.Timer | None = None
         self._hook_before = sys.unraisablehook
 
         # A queue of this kind may be used in a signal handler; None ends the thread that watches.
@@ -114,10 +122,14 @@ class Interruption:
         if not self._before:
             return
 
+        # From here on, no press follows by itself: the handlers of before would receive it.
+        _current = None
+        if self._again is not None:
+            self._again.cancel()
+
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         sys.unraisablehook = self._hook_before
-        _current = None
         self._pressed.put(None)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
@@ -125,12 +137,20 @@ class Interruption:
 
         Raises:
             NoResultError: There is nothing to keep yet.
-            UnfinishedError: The second press, while something is written that may be left out.
+            UnfinishedError: The second press, or the end of the time, while something is written
+                that may be left out.
         """
         if self._dropped is not None:
             error, self._dropped = self._dropped, None
             if self._is_optional or error is NoResultError:
                 raise error
+            return
+
+        # The thread that watches has sent this signal; computations go on.
+        if self._is_own_press_expected:
+            self._is_own_press_expected = False
+            if self._is_optional:
+                raise UnfinishedError
             return
         self.presses += 1
 
@@ -151,7 +171,7 @@ class Interruption:
 
     @property
     def hurried(self) -> bool:
-        """True after the second press."""
+        """True after the second press of the user."""
         return self.presses > 1
 
     def keep(self, folder: Path | None = None) -> None:
@@ -180,14 +200,14 @@ class Interruption:
             self._requests.remove(request)
 
     def run_optional(self, write: Callable[[], object]) -> None:
-        """Call a function, and leave it at the second press.
+        """Call a function, and leave it at the second press, or when the time is over.
 
         Args:
             write: Writes something that may be left out.
         """
         self._is_optional = True
         try:
-            if self.hurried:
+            if self.hurried or self._is_time_over:
                 raise UnfinishedError
             write()
         except UnfinishedError:
@@ -210,12 +230,17 @@ class Interruption:
 
         # The callback has ended when the other thread sends the signal.
         self._dropped = dropped.exc_type
-        again = threading.Timer(AGAIN_SECONDS, _press_by_itself)
-        again.daemon = True
-        again.start()
+        self._again = threading.Timer(AGAIN_SECONDS, self._press_by_itself)
+        self._again.daemon = True
+        self._again.start()
+
+    def _press_by_itself(self) -> None:
+        """Send a signal to the main thread, unless the program has left this context."""
+        if _current is self:
+            _send_to_main_thread()
 
     def _watch(self) -> None:
-        """Announce the first press, press again after a time, and end the process at last."""
+        """Announce the first press, end what may be left out, and end the process at last."""
         if self._pressed.get() is None:
             return
         if self._has_work_to_finish:
@@ -225,9 +250,10 @@ class Interruption:
         try:
             pressed = self._pressed.get(timeout=FINISH_SECONDS)
         except Empty:
-            if _current is self:
-                _press_by_itself()
-            pressed = self._pressed.get() and self._pressed.get()
+            self._is_time_over = True
+            self._is_own_press_expected = True
+            self._press_by_itself()
+            pressed = self._pressed.get()
         if pressed is None:
             return
 
@@ -241,7 +267,7 @@ class Interruption:
             os._exit(INTERRUPTED_CODE)
 
 
-def _press_by_itself() -> None:
+def _send_to_main_thread() -> None:
     """Send SIGINT to the main thread, also while it waits, such as for another process."""
     if hasattr(signal, "pthread_kill"):
         main_thread = threading.main_thread().ident
@@ -267,7 +293,7 @@ def hurried() -> bool:
 
 
 def run_optional(write: Callable[[], object]) -> None:
-    """Call a function, and leave it when the user presses Ctrl-C twice.
+    """Call a function, and leave it when the user presses twice, or some time after one press.
 
     Args:
         write: Writes something that may be left out, such as figures.

@@ -108,6 +108,52 @@ def test_the_second_press_follows_by_itself(
     assert interruption.incomplete
 
 
+def test_computations_are_hurried_by_presses_of_the_user_only(
+    interruption: Interruption, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A search for a control within the limits, which may take longer, goes on after the time."""
+    monkeypatch.setattr(module, "FINISH_SECONDS", 0.05)
+    drawn = []
+    with stop_on_interrupt():
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0.2)
+        assert not hurried()
+
+    run_optional(lambda: drawn.append("a figure"))
+    assert interruption.incomplete
+    assert not drawn
+    assert interruption.presses == 1
+
+    signal.raise_signal(signal.SIGINT)
+    assert hurried()
+
+
+def test_no_press_follows_by_itself_after_the_end() -> None:
+    """An error that Python drops is raised again only while the program is in the context."""
+
+    class Held:
+        """Something with a callback at its end."""
+
+    def draw() -> None:
+        held = Held()
+        reference = weakref.ref(held, lambda _: signal.raise_signal(signal.SIGINT))
+        signal.raise_signal(signal.SIGINT)
+        del held
+        assert reference() is None
+
+    seen: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: seen.append(number))
+    try:
+        with Interruption(lambda _: None) as handler:
+            handler.keep()
+            run_optional(draw)
+        time.sleep(4.0 * module.AGAIN_SECONDS)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert handler.presses == 2
+    assert not seen
+
+
 def test_a_press_during_a_callback_is_not_lost(
     interruption: Interruption, capfd: pytest.CaptureFixture[str]
 ) -> None:

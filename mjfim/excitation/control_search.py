@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -40,6 +41,9 @@ EVALUATED_STOPPED = 4
 # Number of the best searches under hard limits that are evaluated on the unmodified plant, where
 # the costs of all of them are known from the plant without clamps.
 EVALUATED_LIMITED = 8
+
+# Time after a request to stop in which further ones are evaluated until one keeps all limits [s].
+EVALUATED_SECONDS = 20.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,7 +188,7 @@ class ControlSearch:
 
         The costs of the others are those of the searches. After a request to stop, these may be
         costs on a coarse level, of controls that were not verified. Further ones are then evaluated
-        until one keeps all limits.
+        until one keeps all limits, a time is over, or the user presses Ctrl-C a second time.
         """
         by_cost = sorted(range(len(results)), key=lambda index: results[index].cost)
         first, others = by_cost[:EVALUATED_LIMITED], by_cost[EVALUATED_LIMITED:]
@@ -192,8 +196,10 @@ class ControlSearch:
         evaluated = {index: self._on_stated_plant(results[index]) for index in sorted(wanted)}
 
         is_stopped = self.budget.stop.requested
+        end = time.monotonic() + EVALUATED_SECONDS
         for index in others if is_stopped else []:
-            if hurried() or any(result.is_feasible for result in evaluated.values()):
+            is_found = any(result.is_feasible for result in evaluated.values())
+            if is_found or hurried() or time.monotonic() > end:
                 break
             if index not in evaluated:
                 evaluated[index] = self._on_stated_plant(results[index])

@@ -79,7 +79,9 @@ def test_a_design_all_of_whose_workers_are_lost_says_so() -> None:
         choose(SEARCH, [INITIAL], results, False)
 
 
-def test_a_control_within_limits_is_found_behind_many_others_after_a_request_to_stop() -> None:
+def test_a_control_within_limits_is_found_behind_many_others_after_a_request_to_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     evaluated: list[str] = []
 
     def on_stated_plant(result: RunResult) -> RunResult:
@@ -99,3 +101,8 @@ def test_a_control_within_limits_is_found_behind_many_others_after_a_request_to_
     assert evaluated == [f"{i}" for i in range(11)]
     assert [result.name for result in found if result.is_feasible] == ["10"]
     assert ControlSearch._evaluated(search, []) == []
+
+    evaluated.clear()
+    monkeypatch.setattr(control_search, "EVALUATED_SECONDS", -1.0)
+    ControlSearch._evaluated(search, results)
+    assert evaluated == [f"{i}" for i in range(EVALUATED_LIMITED)]
