@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import os
+import shlex
 import sys
 import threading
 import time
@@ -34,6 +35,7 @@ from mjfim.errors import (
     MjfimError,
     ModelWarning,
     NoResultError,
+    RecordingError,
     UndrawnWarning,
     UnfinishedError,
 )
@@ -477,6 +479,8 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
             # A press may have come between the creation of a temporary file and its removal.
             remove_temporary_files()
 
+        if interruption.incomplete:
+            _say_what_is_there(interruption)
         if interruption.presses:
             raise typer.Exit(INTERRUPTED_CODE)
 
@@ -523,10 +527,24 @@ def _say_what_is_there(interruption: Interruption) -> None:
         _announce(NOTHING_SENTENCE)
         return
 
-    _announce(
+    sentence = (
         f"interrupted; {interruption.folder}/ holds only a part of the results, but each file in "
-        f"it is complete; `mjfim report {interruption.folder} --pictures` draws what is missing"
+        "it is complete"
     )
+    if _holds_a_result(interruption.folder):
+        name = shlex.quote(str(interruption.folder))
+        sentence += f"; `mjfim report {name} --pictures` draws the pictures that are missing"
+    _announce(sentence)
+
+
+def _holds_a_result(folder: Path) -> bool:
+    """Check whether a folder holds a result that has a report."""
+    from mjfim.output.report.build import verbs_in  # takes a while to import
+
+    try:
+        return bool(verbs_in(folder))
+    except RecordingError:
+        return False
 
 
 class VerbCommand(TyperCommand):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mjfim.cli.common import Force, Pictures, claim_file, errors, verb
+from mjfim.cli.common import Force, Pictures, claim_file, errors, keep_result, verb
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.report import is_report
 
@@ -18,7 +18,9 @@ def report(
     missing: Annotated[
         bool,
         typer.Option(
-            "--pictures", help="Also draw the pictures that are missing, such as after Ctrl-C."
+            "--pictures",
+            help="Also draw the pictures that are missing, such as after Ctrl-C, or older than "
+            "their results.",
         ),
     ] = False,
     pictures: Pictures = PictureFormat.PNG,
@@ -30,10 +32,16 @@ def report(
     from mjfim.output.report.build import report_files, rewrite_reports
 
     files = report_files(folder)
-    inputs = [path for path in sorted(folder.iterdir()) if not is_report(path)]
     drawn = missing_pictures(folder) if missing else {}
+
+    # A picture that is older than its result is replaced, in whatever format it is.
+    replaced = {folder / ending.file_of(name) for name in drawn for ending in PictureFormat}
+    present = [path for path in sorted(folder.iterdir()) if not is_report(path)]
+    inputs = [path for path in present if path not in replaced]
     for file in (*files.values(), *(folder / pictures.file_of(name) for name in drawn)):
         claim_file(file, inputs, force=force)
 
+    # From here on, files are there after Ctrl-C.
+    keep_result(folder)
     for file in (*rewrite_reports(folder), *write_pictures(folder, drawn, pictures)):
         errors.print(f"wrote {file}", markup=False)

@@ -433,6 +433,8 @@ def _pictures_of(record: ShownRecord) -> Pictures:
 def missing_pictures(folder: Path) -> Pictures:
     """List the pictures of the results in a folder that are not there, in whatever format.
 
+    A picture that is older than the data of its result shows those of an earlier run.
+
     Args:
         folder: Folder of results.
 
@@ -442,11 +444,20 @@ def missing_pictures(folder: Path) -> Pictures:
     Raises:
         RecordingError: The folder holds no result that has a report, or one cannot be read.
     """
-    present = {path.stem for path in folder.iterdir() if path.suffix[1:] in set(PictureFormat)}
-    wanted: Pictures = {}
-    for record in records_in(folder).values():
-        wanted.update(_pictures_of(record))
-    return {name: draw for name, draw in wanted.items() if name not in present}
+    drawn: dict[str, int] = {}
+    for path in folder.iterdir():
+        if path.suffix[1:] in set(PictureFormat):
+            drawn[path.stem] = max(drawn.get(path.stem, 0), path.stat().st_mtime_ns)
+
+    # Pictures of two results may have the same name; the later result has written it.
+    records = [
+        ((folder / f"{record.file_stem}.npz").stat().st_mtime_ns, record)
+        for record in records_in(folder).values()
+    ]
+    wanted: dict[str, tuple[int, DrawPicture]] = {}
+    for written, record in sorted(records, key=lambda each: each[0]):
+        wanted.update({name: (written, draw) for name, draw in _pictures_of(record).items()})
+    return {name: draw for name, (written, draw) in wanted.items() if drawn.get(name, 0) < written}
 
 
 def write_pictures(folder: Path, pictures: Pictures, picture_format: PictureFormat) -> list[Path]:
