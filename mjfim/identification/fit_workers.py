@@ -197,7 +197,8 @@ class FitWorkers:
 
         if len(found) < len(orders) and not is_needed:
             raise InterruptedPassError
-        self._are_given_up = is_needed and len(found) < len(orders)
+        # One order that is lost again and again does not mean that no worker answers.
+        self._are_given_up = is_needed and watch.is_over and len(found) < len(orders)
         for index, batch in enumerate(batches):
             if index not in found:
                 found[index] = work(problem, at, batch)

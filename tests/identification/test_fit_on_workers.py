@@ -21,7 +21,7 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.parallel import dispatch
-from tests.support.executors import LosingThreads, move_to, processes
+from tests.support.executors import LosingExecutor, LosingThreads, move_to, processes
 from tests.support.paths import MODELS
 
 # Settings of fits: whole recordings, and segments whose initial states are unknown.
@@ -139,6 +139,33 @@ def test_workers_that_hang_after_a_request_to_stop_are_waited_for_once(
         costs += [divided.cost(begin) for _ in range(3)]
         assert threads.count == submitted > 0
     assert costs == [problem.cost(begin)] * 4
+
+
+def test_workers_that_lose_one_task_after_a_request_to_stop_do_the_next_ones(
+    experiment: mjfim.Experiment,
+    recordings: list[mjfim.Recording],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
+    problem = problem_of(experiment, recordings, SEGMENTS)
+    begin = problem.begin(problem.system.parameters.guess)
+    stop = StopToken()
+    stop.request()
+    lost: list[Any] = []
+
+    def is_first(order: Any, count: int) -> bool:
+        """Lose the first order, however often it is submitted."""
+        if not lost:
+            lost.append(order)
+        return order is lost[0]
+
+    executor = LosingExecutor(is_first)
+    divided = problem.on_workers(FitWorkers(executor, stop))
+    costs = [divided.cost(begin)]
+    submitted = executor.count
+    costs.append(divided.cost(begin))
+    assert executor.count > submitted > 2
+    assert costs == [problem.cost(begin)] * 2
 
 
 def stopped_fit(
