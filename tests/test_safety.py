@@ -125,6 +125,11 @@ def test_importing_the_package_stays_light() -> None:
     assert heavy_libraries_after("import mjfim") == set()
 
 
+def test_a_campaign_begins_to_compute_before_it_imports_what_draws() -> None:
+    """Ctrl-C before the first computation finds no long import."""
+    assert heavy_libraries_after("import mjfim.output.campaign_folder") == set()
+
+
 def test_heavy_libraries_are_found() -> None:
     """A new process reports a heavy library that its code imports."""
     assert heavy_libraries_after("from matplotlib import figure") == {"matplotlib"}

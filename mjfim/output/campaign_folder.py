@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,8 +32,6 @@ from mjfim.output.folders import (
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
-from mjfim.output.plots.pictures import Pictures
-from mjfim.output.plots.style import format_with_uncertainty
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import write_report
 from mjfim.recordings.read import read_recording
@@ -41,6 +39,9 @@ from mjfim.records.campaign import Campaign, EarlierRound, Round
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.serialization import read_json, write_json
+
+if TYPE_CHECKING:
+    from mjfim.output.plots.pictures import Pictures
 
 # Files of a campaign beside the folders of its rounds.
 CAMPAIGN_FILES = (
@@ -297,6 +298,10 @@ def accuracy_sentence(estimate: Estimate, wanted: Array) -> str:
         estimate: The estimate.
         wanted: (p,) standard deviations aimed at [theta-unit]; infinite where none is.
     """
+    from mjfim.output.plots.style import (
+        format_with_uncertainty,
+    )  # imports matplotlib, which is slow
+
     parts = []
     for j, name in enumerate(estimate.parameters):
         if np.isfinite(wanted[j]):
