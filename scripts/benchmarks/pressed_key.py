@@ -37,6 +37,9 @@ LONGEST = 120.0
 # command at once.
 EARLIEST, LATEST = 0.1, 0.95
 
+# Exit codes of a command that has done its work, or a part of it.
+USUAL_CODES = (0, 1)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
@@ -60,17 +63,36 @@ class Press:
     Attributes:
         moment: Time from the start of the command to the press [s].
         seconds: Time from the press to the end of the command [s].
-        fault: What is wrong, in words; empty where the data are complete, or where the command said
-            that there was nothing to keep.
+        code: Exit code.
+        missing: Names of the files of the result that are not there.
         said: What the command wrote on stderr.
         files: Names of the files in its folder.
     """
 
     moment: float
     seconds: float
-    fault: str
+    code: int
+    missing: tuple[str, ...]
     said: str
     files: tuple[str, ...]
+
+    @property
+    def is_excused(self) -> bool:
+        """True where the command said that there was nothing to keep, and wrote nothing."""
+        return NOTHING_SENTENCE in self.said and not self.files
+
+    @property
+    def fault(self) -> str:
+        """Faults, in words; empty where the data are complete, or where there were none."""
+        faults = [] if self.code in USUAL_CODES else [f"exit code {self.code}"]
+        if self.missing and not self.is_excused:
+            faults.append(f"{', '.join(self.missing)} missing")
+        return "; ".join(faults)
+
+    @property
+    def last_line(self) -> str:
+        """Last line of what the command wrote on stderr; empty where it wrote nothing."""
+        return (self.said.strip().splitlines() or [""])[-1]
 
 
 def commands(inputs: Path) -> list[Command]:
@@ -141,8 +163,10 @@ def undisturbed_seconds(command: Command, folder: Path) -> float:
         folder: Folder for its results; it is removed.
     """
     clock = time.perf_counter()
-    _run(_words(command, folder))
-    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        _run(_words(command, folder))
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
     return time.perf_counter() - clock
 
 
@@ -157,6 +181,14 @@ def pressed(command: Command, folder: Path, moment: float) -> Press | None:
     Returns:
         What became of it; None where it had ended before.
     """
+    try:
+        return _pressed(command, folder, moment)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _pressed(command: Command, folder: Path, moment: float) -> Press | None:
+    """Press Ctrl-C while a command runs, whose folder remains."""
     with _started(_words(command, folder)) as process:
         try:
             process.wait(moment)
@@ -172,11 +204,14 @@ def pressed(command: Command, folder: Path, moment: float) -> Press | None:
         seconds = time.perf_counter() - clock
 
     files = tuple(sorted(path.name for path in folder.rglob("*") if path.is_file()))
-    shutil.rmtree(folder, ignore_errors=True)
-    missing = [name for name in command.data if name not in files]
-    is_empty = NOTHING_SENTENCE in said
-    fault = f"{', '.join(missing)} missing" if missing and not is_empty else ""
-    return Press(moment=moment, seconds=seconds, fault=fault, said=said, files=files)
+    return Press(
+        moment=moment,
+        seconds=seconds,
+        code=process.returncode,
+        missing=tuple(name for name in command.data if name not in files),
+        said=said,
+        files=files,
+    )
 
 
 def moments(seconds: float, count: int, rng: np.random.Generator) -> Sequence[float]:
@@ -196,9 +231,15 @@ def _words(command: Command, folder: Path) -> tuple[str, ...]:
 
 
 def _run(words: Sequence[str]) -> None:
-    """Run a command until its end."""
+    """Run a command until its end.
+
+    Raises:
+        RuntimeError: It did not do its work.
+    """
     with _started(words) as process:
-        process.communicate()
+        _, said = process.communicate()
+    if process.returncode not in USUAL_CODES:
+        raise RuntimeError(f"mjfim {' '.join(words)}: exit code {process.returncode}: {said}")
 
 
 @contextmanager
@@ -218,3 +259,5 @@ def _started(words: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
+        if process.stderr is not None:
+            process.stderr.close()
