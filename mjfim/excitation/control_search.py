@@ -32,7 +32,7 @@ from mjfim.excitation.verification import verify
 from mjfim.information.smoothness import roughness
 from mjfim.interruption import hurried
 from mjfim.parallel import ExecutorLike, LostWorkError
-from mjfim.plant.active_constraints import first_active_constraint
+from mjfim.plant.active_constraints import nothing_acts_along
 from mjfim.records.design import Status
 
 # Largest number of searches, stopped on a coarse level, that are compared at the stated rate.
@@ -149,7 +149,7 @@ class ControlSearch:
 
         # Derivatives exist where nothing touches, rubs, stops or clamps.
         model = task.system.model_at(task.theta)
-        if first_active_constraint(model, self.first.trajectory) is None:
+        if nothing_acts_along(model, self.first.trajectory, task.system.grid.substeps):
             return False
         found = roughness(
             task.plant,

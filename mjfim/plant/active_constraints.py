@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from mjfim.model.coordinates import actuator_names, joint_names
+from mjfim.model.variants import unconstrained
 from mjfim.records.trajectory import Trajectory
 
 # An actuator with several forces counts as clamped where the norm of its forces is at most this
@@ -90,6 +91,25 @@ def first_active_constraint(
         if constraints or clamps:
             return k, (*constraints, *clamps)
     return None
+
+
+def nothing_acts_along(model: Any, trajectory: Trajectory, substeps: int) -> bool:
+    """Whether it is certain that nothing touches, rubs, stops or clamps along a trajectory.
+
+    Args:
+        model: Compiled MuJoCo model.
+        trajectory: The trajectory.
+        substeps: Number of engine steps of a sample.
+    """
+    # Clamps of joints and tendons are not observed.
+    if model.jnt_actfrclimited.any() or model.tendon_actfrclimited.any():
+        return False
+
+    # Between two samples, a contact may open and close again, and a force be clamped.
+    may_act = not unconstrained(model) or bool(model.actuator_forcelimited.any())
+    if may_act and substeps > 1:
+        return False
+    return first_active_constraint(model, trajectory) is None
 
 
 def active_constraints(
