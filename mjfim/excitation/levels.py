@@ -226,7 +226,10 @@ def first_point(level: DescentLevel, evaluated: DesignPoint | None = None) -> De
         evaluated: The initial control on another plant, with the same criterion. It counts where
             both plants move in the same way. None where it is not known.
     """
-    curve = None if evaluated is None else evaluated.trajectory
+    # At the further samples of a robust design, the plants may move differently.
+    is_robust = evaluated is not None and bool(evaluated.others)
+    curve = None if evaluated is None or is_robust else evaluated.trajectory
+
     reference = level.task.reference
     if curve is not None and reference is not None and curve.moves_as(reference):
         return evaluated

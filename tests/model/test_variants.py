@@ -171,6 +171,21 @@ def test_the_initial_control_is_evaluated_again_only_where_it_moves_differently(
     assert long.task.plant.engine_steps > 0
 
 
+def test_clamps_may_act_at_the_samples_of_a_robust_design_only(tmp_path: Path) -> None:
+    """The clamp of a servo just lets the expected arm move freely, but not a heavier one."""
+    mass = {"mass": {**DRY["mass"], "bounds": (0.1, 2.0)}}
+    model = ARM.replace('kp="30"', 'kp="30" forcerange="-13 13"')
+    robust = {"over": "mean", "samples": 3}
+    task = arm(tmp_path, 0.0, model, parameters=mass, robust=robust)
+    first = DescentLevel(task, None).problem.point(task.initial)
+
+    free = DescentLevel(task.relaxed(), None)
+    assert free.task.initial.moves_as(task.initial)
+    point = first_point(free, first)
+    assert point is not None
+    assert point.cost != first.cost
+
+
 # Edits of an arm whose joints turn freely.
 RANGE = ('name="elbow"', 'name="elbow" range="-2 2"')
 FORCE_RANGE = ('kp="30"', 'kp="30" forcerange="-50 50"')
