@@ -310,7 +310,7 @@ class _Search:
         result = RunResult(name=self.order.start.name)
         status: Status | None = None
         best_of_stages: dict[float, Array] = {}
-        steps = ShortSteps()
+        steps = ShortSteps(self.method.tolerance)
         if begun is not None:
             result = begun.result
             best_of_stages = begun.state.best_of_stages
@@ -339,7 +339,8 @@ class _Search:
                 yield DesignEvent(start=result.name, row=row)
 
                 # Later stages of the barrier bring a good iterate back inside the limits.
-                has_short_steps = steps.hold_up(row.gamma, row.mu) and self.order.until_held_up
+                has_short_steps = steps.hold_up(row.gamma, row.mu, row.slope)
+                has_short_steps = has_short_steps and self.order.until_held_up
                 may_end_here = iterate.feasible or row.cost > self.order.cost_to_beat
                 is_held_up = has_short_steps and may_end_here
 

@@ -233,6 +233,14 @@ class InteriorPointMethod:
         if first.control is not None and not budget.stop.requested:
             yield from self._minimize(first.control, budget, first.iterations)
 
+    @property
+    def tolerance(self) -> float:
+        """Slope at which a stage has converged.
+
+        It is below a coarser stated tolerance: a smaller slope also means a smaller violation.
+        """
+        return min(self.schedule.tolerance, BarrierSchedule.tolerance)
+
     def resume(self, state: BarrierState, budget: Budget) -> Iterator[BarrierIterate]:
         """Go on from an iterate, to the last digit as if the run had not been interrupted.
 
@@ -513,15 +521,13 @@ class InteriorPointMethod:
         begun = stage.begun
         start = stage.problem.reevaluate(begun.point) if within is None else begun.point
 
-        # Continue below a coarser stated tolerance: a smaller slope also means a smaller violation.
-        tolerance = min(self.schedule.tolerance, BarrierSchedule.tolerance)
         return optimize(
             stage.problem,
             start,
             begun.direction,
             self.regulator,
             Armijo(),
-            tolerance=tolerance,
+            tolerance=self.tolerance,
             max_iterations=stage.max_iterations,
             resumed=None if within is None else within.descent,
         )

@@ -22,21 +22,31 @@ MOST_OF_ONE_STEP = 4.0
 WINDOW = 12
 MOST_IN_WINDOW = 6
 
+# Slope from which on short steps count, over the slope at which the descent has converged. Near an
+# optimum steps may be short, where nothing holds the descent up.
+STEEP = 100.0
+
 
 class ShortSteps:
-    """Observes how much shorter the steps of a descent are than full ones."""
+    """Observes how much shorter the steps of a descent are than full ones.
 
-    def __init__(self) -> None:
+    Args:
+        tolerance: Slope at which the descent has converged.
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        self._tolerance = tolerance
         self._stage: float | None = None
         self._decades = 0.0
         self._are_short: deque[bool] = deque(maxlen=WINDOW)
 
-    def hold_up(self, gamma: float, stage: float) -> bool:
+    def hold_up(self, gamma: float, stage: float, slope: float) -> bool:
         """Add a step.
 
         Args:
             gamma: Its length, relative to the full step.
             stage: Weight of the barrier; the first iterate of a stage was not reached by a step.
+            slope: Slope after the step.
 
         Returns:
             True if the descent is held up.
@@ -45,7 +55,7 @@ class ShortSteps:
             self._stage = stage
             return False
 
-        is_short = gamma <= SHORT
+        is_short = gamma <= SHORT and slope > STEEP * self._tolerance
         self._are_short.append(is_short)
         missing = -math.log10(max(gamma, 10.0**-MOST_OF_ONE_STEP))
         self._decades = self._decades + missing if is_short else 0.0

@@ -36,17 +36,27 @@ from tests.support.stiff_servos import dry_arm_experiment, stiff_arm_task
     ],
 )
 def test_a_descent_of_short_steps_is_held_up(steps: list[float], held_up: bool) -> None:
-    observed = ShortSteps()
-    assert not observed.hold_up(0.0, 0.1), "the first iterate was not reached by a step"
-    found = [observed.hold_up(gamma, 0.1) for gamma in steps]
+    observed = ShortSteps(tolerance=1e-5)
+    assert not observed.hold_up(0.0, 0.1, 0.1), "the first iterate was not reached by a step"
+    found = [observed.hold_up(gamma, 0.1, slope=0.1) for gamma in steps]
     assert found[-1] is held_up
     assert not any(found[:-1])
 
 
+@pytest.mark.parametrize(("slope", "held_up"), [(9e-4, False), (1.1e-3, True)])
+def test_short_steps_near_an_optimum_do_not_count(slope: float, held_up: bool) -> None:
+    """The sixth short step in twelve may be the last one before a descent converges."""
+    observed = ShortSteps(tolerance=1e-5)
+    observed.hold_up(0.0, 0.1, 0.1)
+    for gamma in 5 * [0.04, 1.0]:
+        assert not observed.hold_up(gamma, 0.1, slope=0.1)
+    assert observed.hold_up(0.04, 0.1, slope) is held_up
+
+
 def test_the_first_iterate_of_a_stage_is_no_step() -> None:
-    observed = ShortSteps()
+    observed = ShortSteps(tolerance=1e-5)
     stages = (0.1, 0.03, 0.01, 0.003)
-    assert not any(observed.hold_up(gamma, mu) for mu in stages for gamma in (0.0, 1.0))
+    assert not any(observed.hold_up(gamma, mu, slope=0.1) for mu in stages for gamma in (0.0, 1.0))
 
 
 def search_of(task: DesignTask) -> tuple[RandomSearch, ControlsWithinLimits]:
