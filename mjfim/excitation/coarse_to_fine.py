@@ -52,6 +52,11 @@ STATED_TOLERANCE = 1e-6
 # Number of iterations for which there has to be time before a round on a finer level begins.
 FEWEST_ITERATIONS = 2.0
 
+# Number of iterations in the time of a search on the stated level below which its five stages would
+# end before a step. It then begins with the barrier weight of the level before, and ends with the
+# usual smallest one.
+FEW_ITERATIONS = 10.0
+
 # Number of iterations for which each start of the first round should have time.
 ITERATIONS_OF_A_START = 50
 
@@ -87,7 +92,8 @@ class CoarseToFine(LimitedRounds):
         # The descents end so close to an optimum that a sharp barrier takes most iterations.
         schedule = BarrierSchedule(first=entry.mu, last=stage.last_mu, follows_curvature=True)
         if is_stated:
-            schedule = replace(schedule, relaxation=STATED_RELAXATION, tolerance=STATED_TOLERANCE)
+            is_short = seconds < FEW_ITERATIONS * self._seconds_of_iteration(entry)
+            schedule = self._short_schedule(entry) if is_short else self._sharp_schedule(entry)
         return SearchTerms(
             schedule=schedule,
             max_iterations=int(np.ceil(share * left)),
@@ -144,8 +150,7 @@ class CoarseToFine(LimitedRounds):
         if not has_feasible:
             return True
 
-        steps = level.task.samples * level.task.system.grid.substeps
-        return self._seconds_left >= FEWEST_ITERATIONS * entry.seconds_per_step * steps
+        return self._seconds_left >= FEWEST_ITERATIONS * self._seconds_of_iteration(entry)
 
     def next_round(self, number: int, done: int) -> int:
         """Number of the round that follows another one, see `RoundPlan`.
@@ -179,6 +184,27 @@ class CoarseToFine(LimitedRounds):
         counts = range(1, len(starts) + 1)
         affordable = [n for n in counts if self.searches.turns(n) * each <= seconds]
         return starts[: max(affordable, default=1)]
+
+    def _sharp_schedule(self, entry: Entry) -> BarrierSchedule:
+        """Stages of the stated level, which end with a sharp barrier."""
+        return BarrierSchedule(
+            first=entry.mu,
+            last=STATED_LAST_WEIGHT,
+            relaxation=STATED_RELAXATION,
+            tolerance=STATED_TOLERANCE,
+            follows_curvature=True,
+        )
+
+    def _short_schedule(self, entry: Entry) -> BarrierSchedule:
+        """Stages of the stated level where there is time for few iterations."""
+        # A control that is far from an optimum still needs a blunt barrier.
+        first = self.rounds[-2].last_mu if entry.mu <= STATED_FIRST_WEIGHT else entry.mu
+        return BarrierSchedule(first=first, follows_curvature=True)
+
+    def _seconds_of_iteration(self, entry: Entry) -> float:
+        """Expected time of an iteration on the level of a start [s]; 0 in the first round."""
+        task = self.rounds[entry.round].level.task
+        return entry.seconds_per_step * task.samples * task.system.grid.substeps
 
     @property
     def _seconds_left(self) -> float:

@@ -217,6 +217,28 @@ def test_no_coarse_level_begins_after_the_end_of_the_time(fine: DescentLevel) ->
     assert search.may_begin(stated, has_feasible=False)
 
 
+@pytest.mark.parametrize(
+    ("begun", "iterations", "weights"),
+    [
+        (1e-3, 11.0, (1e-3, 1e-5, 5)),
+        (1e-3, 9.0, (3e-4, 1e-4, 2)),
+        (0.1, 9.0, (0.1, 1e-4, 7)),
+    ],
+)
+def test_few_iterations_are_not_spent_on_many_stages(
+    begun: float, iterations: float, weights: tuple[float, float, int], search: CoarseToFine
+) -> None:
+    """Two stages let both of them step; a control that was not optimised yet needs more."""
+    start = search.starts[0]
+    entry = Entry(number=0, index=0, round=2, start=start, mu=begun, done=5, seconds_per_step=1e-3)
+    seconds = iterations * 1e-3 * search.searches.stated.task.samples
+    found = search.terms(entry, seconds).schedule.barrier_weights()
+    assert (found[0], found[-1], len(found)) == pytest.approx(weights)
+
+    # Without a limit of time, all stages have time for steps.
+    assert search.terms(entry, np.inf).schedule.barrier_weights()[-1] == pytest.approx(1e-5)
+
+
 def test_only_staircases_are_smoothed(comparison: CoarseComparison) -> None:
     limited = LIMITS.replace(limits={"control_rate": 5.0})
     fine = DescentLevel(DesignTask.resolve(limited, threads=1).relaxed(), None)
