@@ -93,7 +93,8 @@ class CoarseToFine(LimitedRounds):
         schedule = BarrierSchedule(first=entry.mu, last=stage.last_mu, follows_curvature=True)
         if is_stated:
             is_short = seconds < FEW_ITERATIONS * self._seconds_of_iteration(entry)
-            schedule = self._short_schedule(entry) if is_short else self._sharp_schedule(entry)
+            sharp = replace(self.sharpest, first=entry.mu)
+            schedule = self._short_schedule(entry) if is_short else sharp
         return SearchTerms(
             schedule=schedule,
             max_iterations=int(np.ceil(share * left)),
@@ -159,6 +160,17 @@ class CoarseToFine(LimitedRounds):
         """
         return number + 1 if done < self.max_iterations else len(self.rounds) - 1
 
+    @property
+    def sharpest(self) -> BarrierSchedule:
+        """See `LimitedRounds.sharpest`."""
+        return BarrierSchedule(
+            first=STATED_FIRST_WEIGHT,
+            last=STATED_LAST_WEIGHT,
+            relaxation=STATED_RELAXATION,
+            tolerance=STATED_TOLERANCE,
+            follows_curvature=True,
+        )
+
     def comparison(self, level: DescentLevel) -> CoarseComparison:
         """Who compares the results of a coarse level.
 
@@ -184,16 +196,6 @@ class CoarseToFine(LimitedRounds):
         counts = range(1, len(starts) + 1)
         affordable = [n for n in counts if self.searches.turns(n) * each <= seconds]
         return starts[: max(affordable, default=1)]
-
-    def _sharp_schedule(self, entry: Entry) -> BarrierSchedule:
-        """Stages of the stated level, which end with a sharp barrier."""
-        return BarrierSchedule(
-            first=entry.mu,
-            last=STATED_LAST_WEIGHT,
-            relaxation=STATED_RELAXATION,
-            tolerance=STATED_TOLERANCE,
-            follows_curvature=True,
-        )
 
     def _short_schedule(self, entry: Entry) -> BarrierSchedule:
         """Stages of the stated level where there is time for few iterations."""

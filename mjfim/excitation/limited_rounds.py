@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.rescue import Rescue
 from mjfim.excitation.rounds import RoundPlan
 from mjfim.excitation.run_result import RunResult, Runs
@@ -61,7 +62,9 @@ class LimitedRounds(RoundPlan):
         Returns:
             The results, of which the best one is replaced.
         """
-        results = yield from run_within_tighter_limits(self.searches, self.repair, results)
+        results = yield from run_within_tighter_limits(
+            self.searches, self.repair, results, self.sharpest
+        )
         results = self.repair.repaired(results)
         if (
             any(np.isfinite(result.cost) for result in results)
@@ -73,6 +76,11 @@ class LimitedRounds(RoundPlan):
             searches=self.searches, repair=self.repair, max_iterations=self.max_iterations
         )
         return (yield from rescue.run(results))
+
+    @property
+    def sharpest(self) -> BarrierSchedule:
+        """Stages of the barrier on the stated level."""
+        return BarrierSchedule()
 
     @cached_property
     def repair(self) -> WinnerRepair:

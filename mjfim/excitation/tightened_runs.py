@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +24,10 @@ TIGHTENED_RUN_ITERATIONS = 60
 
 
 def run_within_tighter_limits(
-    searches: LimitedSearches, repair: WinnerRepair, results: Sequence[RunResult]
+    searches: LimitedSearches,
+    repair: WinnerRepair,
+    results: Sequence[RunResult],
+    sharpest: BarrierSchedule,
 ) -> Runs:
     """Optimise the best result again while it violates a limit on the unmodified model.
 
@@ -31,6 +35,7 @@ def run_within_tighter_limits(
         searches: Runs the searches.
         repair: Tells whether the best result violates a limit.
         results: Result of every start.
+        sharpest: Stages of the last round of the design.
 
     Yields:
         Every iterate.
@@ -47,17 +52,32 @@ def run_within_tighter_limits(
             break
 
         tightening = updated_tightening(tightening, winner.margins)
+        result = results[winner.index]
         repeated = yield from searches.run(
             repair.cost.level,
-            continued(results[winner.index]),
+            continued(result),
             SearchTerms(
-                schedule=BarrierSchedule(first=TIGHTENED_RUN_MU),
+                schedule=_schedule_after(result, sharpest),
                 max_iterations=TIGHTENED_RUN_ITERATIONS,
                 seconds=searches.budget.seconds_left,
                 tightening=tightening,
             ),
         )
         if repeated is not None and np.isfinite(repeated.cost):
-            results[winner.index] = append_run(results[winner.index], repeated)
+            results[winner.index] = append_run(result, repeated)
 
     return results
+
+
+def _schedule_after(result: RunResult, sharpest: BarrierSchedule) -> BarrierSchedule:
+    """Stages of a run within tighter limits: as sharp as those that the result has reached.
+
+    A result that has not reached such stages had no time for them.
+
+    Args:
+        result: The result that is continued.
+        sharpest: Stages of the last round of the design.
+    """
+    usual = BarrierSchedule()
+    is_sharp = bool(result.history) and result.history[-1].mu < usual.last
+    return replace(sharpest if is_sharp else usual, first=TIGHTENED_RUN_MU)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,14 +18,16 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import initial_controls_of
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.levels import DescentLevel, has_similar_cost
-from mjfim.excitation.limited_searches import LimitedSearches
+from mjfim.excitation.limited_searches import LimitedSearches, SearchTerms
 from mjfim.excitation.objective import DIVERGED
 from mjfim.excitation.rounds import Entry
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.running_rounds import EndedSearch, RunningRounds
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.tightened_runs import run_within_tighter_limits
+from mjfim.excitation.winner_repair import ViolatingWinner, WinnerRepair
 from mjfim.experiment.schema import Experiment
-from mjfim.records.design import Status
+from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 from tests.support.paths import MODELS
 
@@ -237,6 +241,45 @@ def test_few_iterations_are_not_spent_on_many_stages(
 
     # Without a limit of time, all stages have time for steps.
     assert search.terms(entry, np.inf).schedule.barrier_weights()[-1] == pytest.approx(1e-5)
+
+
+@pytest.mark.parametrize(("reached", "last"), [(3e-5, 1e-5), (1e-4, 1e-4)])
+def test_runs_within_tighter_limits_are_as_sharp_as_the_result_before(
+    reached: float, last: float, search: CoarseToFine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    control = search.searches.stated.task.control
+    row = HistoryRow(
+        iteration=7,
+        cost=1.0,
+        criterion=1.0,
+        min_eigenvalue=1.0,
+        slope=0.1,
+        gamma=1.0,
+        seconds=1.0,
+        steps=100,
+        mu=reached,
+    )
+    result = RunResult(name="a", control=control, cost=1.0, history=(row,))
+
+    def first_one(*args: object) -> ViolatingWinner:
+        """The first result violates a limit."""
+        return ViolatingWinner(index=0, margins={"position": -0.1})
+
+    asked: list[SearchTerms] = []
+
+    def run(*args: Any) -> Generator[DesignEvent, None, None]:
+        """Keep the terms; the search finds nothing."""
+        asked.append(args[-1])
+        yield from ()
+
+    monkeypatch.setattr(WinnerRepair, "violating", first_one)
+    monkeypatch.setattr(LimitedSearches, "run", run)
+    consume(
+        run_within_tighter_limits(search.searches, search.repair, [result], search.sharpest), None
+    )
+    schedule = asked[0].schedule
+    assert (schedule.first, schedule.last) == (1e-3, last)
+    assert schedule.follows_curvature is (last < 1e-4)
 
 
 def test_only_staircases_are_smoothed(comparison: CoarseComparison) -> None:
