@@ -50,6 +50,12 @@ def search_of(task: DesignTask, factor: float = 1.0) -> ConstrainedSearch:
     )
 
 
+def sharp_search_of(task: DesignTask) -> ConstrainedSearch:
+    """A search whose directions follow the curvature of the barrier after some of its steps."""
+    schedule = BarrierSchedule(first=1e-3, last=1e-5, patience=5, follows_curvature=True)
+    return replace(search_of(task), schedule=schedule)
+
+
 @pytest.fixture(scope="module")
 def searches(task: DesignTask) -> list[ConstrainedSearch]:
     return [search_of(task, factor) for factor in (1.0, 0.8, 0.6)]
@@ -82,6 +88,15 @@ def assert_same(found: RunResult, whole: RunResult) -> None:
     assert rows[0] == rows[1]
 
 
+def slices_of(order: ConstrainedSlice) -> list[SearchSlice[Any]]:
+    """All slices of a search; each is pickled, as on its way to another process."""
+    slices = [run_in_worker(pickle.loads(pickle.dumps(order)))]
+    while slices[-1].state is not None:
+        following = replace(order, before=slices[-1])
+        slices.append(run_in_worker(pickle.loads(pickle.dumps(following))))
+    return slices
+
+
 @pytest.mark.parametrize("iterations", [4, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_search_in_slices_equals_the_whole_one_to_the_last_digit(
     iterations: int,
@@ -89,14 +104,10 @@ def test_a_search_in_slices_equals_the_whole_one_to_the_last_digit(
     whole: RunResult,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each slice is pickled, as on its way to another process."""
     offered: list[SearchSlice[Any]] = []
     monkeypatch.setattr(constrained, "offer_result", offered.append)
     order = ConstrainedSlice(search=searches[0], task_key="slices", iterations=iterations)
-    slices = [run_in_worker(pickle.loads(pickle.dumps(order)))]
-    while slices[-1].state is not None:
-        following = replace(order, before=slices[-1])
-        slices.append(run_in_worker(pickle.loads(pickle.dumps(following))))
+    slices = slices_of(order)
 
     assert len(slices) >= ITERATIONS // iterations
     assert_same(slices[-1].result, whole)
@@ -104,6 +115,20 @@ def test_a_search_in_slices_equals_the_whole_one_to_the_last_digit(
     # After Ctrl-C counts what a worker has offered last, with the controls of earlier stages.
     pairs = zip(offered[-1].result.earlier, whole.earlier, strict=True)
     assert whole.earlier and all(np.array_equal(one, other) for one, other in pairs)
+
+
+@pytest.mark.slow
+def test_directions_that_follow_the_curvature_of_the_barrier_do_so_in_the_next_slice(
+    task: DesignTask,
+) -> None:
+    search = sharp_search_of(task)
+    order = ConstrainedSlice(search=search, task_key="sharp", iterations=1)
+    slices = slices_of(order)
+    assert_same(slices[-1].result, consume(search.run(), None))
+
+    # Some slices begin with such a direction, others without.
+    states = [each.state.opened() for each in slices if each.state is not None]
+    assert {state.barrier.begun.direction.is_bent for state in states} == {True, False}
 
 
 def test_an_order_can_be_done_again(searches: list[ConstrainedSearch]) -> None:
