@@ -140,7 +140,7 @@ class LimitedQuantities(Protocol):
         ...
 
 
-class Constraint(LimitedQuantities, Protocol):
+class Constraint(Protocol):
     """Inequality constraints of one or several kinds along a trajectory."""
 
     @property
@@ -666,21 +666,3 @@ class ClearanceConstraint:
             .barrier(measured, delta, values.weight)
             .value
         )
-
-    def slacks(self, values: ConstraintValues) -> Array:
-        """See `LimitedQuantities.slacks`."""
-        return self.quantities_between_bounds.slacks(values)
-
-    def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
-        """See `LimitedQuantities.slack_changes`."""
-        return self.quantities_between_bounds.slack_changes(values, step)
-
-    def add_expansion(
-        self,
-        values: ConstraintValues,
-        delta: float,
-        sums: ExpansionSums,
-        factors: Array | None = None,
-    ) -> None:
-        """See `LimitedQuantities.add_expansion`."""
-        self.quantities_between_bounds.add_expansion(values, delta, sums, factors)
