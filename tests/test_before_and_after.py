@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from io import StringIO
 from math import inf, nan
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
+from mjfim.records.comparison import DESIGN
+from scripts.benchmarks import anytime, measurements
 from scripts.benchmarks import before_and_after as script
-from scripts.benchmarks.before_and_after import Line, Measurement, Result
-from scripts.benchmarks.checkouts import ROOT, earlier_checkout, run_command
+from scripts.benchmarks.before_and_after import Earlier, Line, Measurement, Result
+from scripts.benchmarks.checkouts import ROOT, commit_hash, earlier_checkout, run_command
 from scripts.benchmarks.measurements import Figure, Figures
 from scripts.benchmarks.run_in_subprocess import run_in_subprocess
 
@@ -29,6 +33,7 @@ def line(goal: float | None = 2.0, is_larger_better: bool = False) -> Line:
         (5.0, line(), "missed by a factor 2.5"),
         (inf, line(), "missed"),
         (nan, line(), "missed"),
+        (0.0, line(), "met"),
         (3.0, line(None), ""),
         (403.2, line(403.15, True), "met"),
         (403.0, line(403.15, True), "missed by 0.037 %"),
@@ -42,7 +47,30 @@ def test_a_verdict_says_how_far_the_goal_is(value: float, stated: Line, expected
 
 def test_a_failed_measurement_misses_its_goal() -> None:
     assert script.verdict(None, line()) == "missed"
-    assert script.text_of(None, "s") == "failed"
+    assert script.text_of(None, line()) == "failed"
+
+
+def test_a_design_that_alone_finds_a_motion_meets_its_goal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def costs(design: float, baseline: float) -> Figure:
+        """J over the best baseline, with these costs."""
+        found = {DESIGN: design, "random": baseline}
+        results = SimpleNamespace(
+            cost=lambda method, seconds: found[method],
+            best_baseline=lambda seconds: (baseline, "random"),
+        )
+        monkeypatch.setattr(anytime, "run", lambda *arguments: [])
+        monkeypatch.setattr(anytime, "Results", lambda *arguments: results)
+        return measurements.beside_baselines("cart_pendulum", 1.0)["over best baseline"]
+
+    goal = line(1.0)
+    assert script.verdict(costs(2.0, 4.0), goal) == "met"
+    assert script.verdict(costs(2.0, inf), goal) == "met"
+    assert script.text_of(costs(2.0, inf), goal) == "0"
+    assert script.verdict(costs(inf, 4.0), goal) == "missed"
+    assert script.verdict(costs(inf, inf), goal) == "missed"
+    assert script.text_of(costs(inf, inf), goal) == "none found"
 
 
 def test_ratios_are_those_of_the_wall_and_of_the_processors() -> None:
@@ -53,10 +81,12 @@ def test_ratios_are_those_of_the_wall_and_of_the_processors() -> None:
 
 
 def test_numbers_have_their_unit_and_the_time_of_the_processors() -> None:
-    assert script.text_of(Figure(1.2345, 2.3456), "s") == "1.23 s (2.35)"
-    assert script.text_of(Figure(403.15), "") == "403.15"
-    assert script.text_of(Figure(330000.0), "") == "330,000"
-    assert script.text_of(Figure(inf), "s") == "none found"
+    seconds = Line(name="", figure="", unit="s")
+    assert script.text_of(Figure(1.2345, 2.3456), seconds) == "1.23 s (2.35)"
+    assert script.text_of(Figure(403.15), line()) == "403.15"
+    assert script.text_of(Figure(330000.0), line()) == "330,000"
+    assert script.text_of(Figure(inf), seconds) == "none found"
+    assert script.text_of(Figure(0.0), line(is_larger_better=True)) == "none found"
 
 
 def test_medians_are_those_of_each_figure() -> None:
@@ -67,27 +97,53 @@ def test_medians_are_those_of_each_figure() -> None:
     assert script.medians([]) is None
 
 
-def counting(calls: list[Path], wall: float) -> Callable[[Path], Figures | None]:
-    """A measurement that fails with the earlier version and becomes slower with each call."""
+def counting(calls: list[Path], failing: Path | None = None) -> Callable[[Path], Figures]:
+    """A measurement that fails with one version and becomes slower with each call."""
 
-    def run(package: Path) -> Figures | None:
+    def run(package: Path) -> Figures:
         calls.append(package)
-        return {"time": Figure(wall * len(calls), 1.0)} if package == ROOT else None
+        if package == failing:
+            raise RuntimeError("no such option")
+        return {"time": Figure(float(len(calls)), 1.0)}
 
     return run
 
 
 def test_versions_take_turns_and_kept_measurements_are_not_made_again(tmp_path: Path) -> None:
     calls: list[Path] = []
-    before = tmp_path / "before"
-    stated = Measurement(name="made_up", run=counting(calls, 1.0), lines=(), repeats=2)
+    said: list[str] = []
+    earlier = Earlier(commit="1234567", folder=tmp_path / "before")
+    stated = Measurement(name="made_up", run=counting(calls), lines=(), repeats=2)
+
+    expected = Result(before={"time": Figure(2.0, 1.0)}, now={"time": Figure(3.0, 1.0)})
+    assert script.measured(stated, earlier, tmp_path, said.append) == expected
+    assert calls == [earlier.folder, ROOT] * 2
+
+    assert script.measured(stated, earlier, tmp_path, said.append) == expected
+    assert len(calls) == 4
+
+    # Another commit, or another number of runs, is another measurement.
+    other = replace(earlier, commit="89abcde")
+    assert script.measured(stated, other, tmp_path, said.append) != expected
+    assert len(calls) == 8
+    script.measured(replace(stated, repeats=1), other, tmp_path, said.append)
+    assert len(calls) == 10
+    assert not said
+
+
+def test_a_run_that_fails_is_told_and_its_measurement_is_made_again(tmp_path: Path) -> None:
+    calls: list[Path] = []
+    said: list[str] = []
+    earlier = Earlier(commit="1234567", folder=tmp_path / "before")
+    stated = Measurement(name="made_up", run=counting(calls, earlier.folder), lines=(), repeats=2)
 
     expected = Result(before=None, now={"time": Figure(3.0, 1.0)})
-    assert script.measured(stated, before, tmp_path) == expected
-    assert calls == [before, ROOT, before, ROOT]
+    assert script.measured(stated, earlier, tmp_path, said.append) == expected
+    assert said == ["made_up, before: no such option"] * 2
+    assert not list(tmp_path.iterdir())
 
-    assert script.measured(stated, before, tmp_path) == expected
-    assert len(calls) == 4
+    script.measured(stated, earlier, tmp_path, said.append)
+    assert len(calls) == 8
 
 
 def test_a_derived_figure_uses_the_earlier_steps() -> None:
@@ -102,6 +158,9 @@ def test_a_derived_figure_uses_the_earlier_steps() -> None:
     assert found is not None
     assert found.value == pytest.approx(3.0)
     assert script.figure_of(derived, Result(before=None, now=own), own) is None
+
+    earlier["steps"] = Figure(0.0)
+    assert script.figure_of(derived, Result(before=earlier, now=own), own) == Figure(inf)
 
 
 def test_every_part_has_measurements_with_names_of_their_own(tmp_path: Path) -> None:
@@ -146,6 +205,8 @@ def test_an_unknown_commit_is_named() -> None:
         earlier_checkout("no_such_commit"),
     ):
         pass
+    with pytest.raises(SystemExit, match="no_such_commit"):
+        commit_hash("no_such_commit")
 
 
 def test_a_process_uses_the_package_of_a_folder_and_these_benchmarks(tmp_path: Path) -> None:

@@ -62,6 +62,22 @@ def earlier_checkout(commit: str) -> Iterator[Path]:
         yield folder
 
 
+def commit_hash(commit: str) -> str:
+    """Return the whole hash of a commit, which no later commit changes.
+
+    Args:
+        commit: The commit, such as the name of a branch.
+
+    Raises:
+        SystemExit: There is no such commit.
+    """
+    git = ["git", "-C", str(ROOT), "rev-parse", "--verify", f"{commit}^{{commit}}"]
+    found = subprocess.run(git, capture_output=True, text=True, check=False)
+    if found.returncode != 0:
+        raise SystemExit(f"{commit}: {found.stderr.strip()}")
+    return found.stdout.strip()
+
+
 def run_command(package: Path, words: Sequence[str]) -> CommandRun:
     """Run `mjfim` with the package of a folder, and measure it.
 

@@ -12,6 +12,7 @@ import resource
 import tempfile
 import time
 from collections.abc import Mapping
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -212,7 +213,8 @@ def beside_baselines(example: str, seconds: float) -> Figures:
         seconds: Budget of every method [s of the processor].
 
     Returns:
-        J of the design, and the same over the lowest J of the baselines.
+        J of the design, and the same over the lowest J of the baselines: zero where only the design
+        finds a motion, and infinite where it finds none.
     """
     from mjfim.records.comparison import DESIGN
     from scripts.benchmarks import anytime
@@ -222,7 +224,12 @@ def beside_baselines(example: str, seconds: float) -> Figures:
     found = anytime.Results(example, rows)
     cost = found.cost(DESIGN, seconds)
     best, _ = found.best_baseline(seconds)
-    return {"cost": Figure(cost), "over best baseline": Figure(cost / best)}
+    return {"cost": Figure(cost), "over best baseline": Figure(_over(cost, best))}
+
+
+def _over(cost: float, best: float) -> float:
+    """A cost over the lowest one of others; infinite where it is infinite, whatever the others."""
+    return cost / best if isfinite(cost) else inf
 
 
 def short_fit() -> Figures:
