@@ -25,7 +25,9 @@ class CommandRun:
     Attributes:
         wall: Wall time [s].
         processor: Time of the processors of the process and of all that it has started [s].
-        gigabytes: Largest memory of the process, or of one that it has started [GiB].
+        gigabytes: Largest memory of the process, or of one that it has started [GiB]. Linux counts
+            the memory that the calling process had when it started this one, so that it is never
+            less.
         code: Exit code.
         messages: Text on stderr.
     """
