@@ -16,6 +16,9 @@ from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.noise import Noise
 
+# Relative change of a standard deviation below which a linearisation with the old one still holds.
+LASTING_CHANGE = 0.01
+
 
 class EstimatedNoiseProblem:
     """Parameters and noise as one problem; a `levenberg_marquardt.Problem`.
@@ -37,6 +40,9 @@ class EstimatedNoiseProblem:
 
         # A linearisation follows the cost at the same unknowns, and needs the same squares.
         self._latest: tuple[UnknownValues, Array | None] | None = None
+
+        # The problem with the noise with which the latest linearisation is weighted.
+        self.linearised = problem
 
     @property
     def lower(self) -> Array:
@@ -88,7 +94,24 @@ class EstimatedNoiseProblem:
         """
         if self._squares(at) is None:
             return None
-        return self.weighted(at).condense(at)
+        weighted = self.weighted(at)
+        condensed = weighted.condense(at)
+        if condensed is not None:
+            self.linearised = weighted
+        return condensed
+
+    def lasting_noise(self, at: UnknownValues) -> Noise | None:
+        """Noise with which the latest linearisation is weighted, where it still holds.
+
+        Args:
+            at: Unknowns to which the linearisation led.
+
+        Returns:
+            The noise; None where the noise of the residuals at the unknowns is another one.
+        """
+        noise = self.linearised.noise
+        change = np.abs(self.weighted(at).noise.sigma / noise.sigma - 1.0)
+        return noise if change.max() < LASTING_CHANGE else None
 
     def weighted(self, at: UnknownValues) -> FitProblem:
         """The problem with the noise of the residuals.
@@ -107,10 +130,11 @@ class EstimatedNoiseProblem:
         variances = np.where(self._counts > 0, variances, noise.sigma**2)
         return self.problem.with_noise(Noise(covariance=np.diag(variances), strides=noise.strides))
 
-    def weighted_cost(self, at: UnknownValues) -> float:
-        """Cost of the weighted problem at the same unknowns.
+    def cost_of_squares(self, noise: Noise, at: UnknownValues) -> float:
+        """Cost of the problem with some noise of independent outputs.
 
         Args:
+            noise: The noise, such as that of the latest linearisation.
             at: The unknowns.
 
         Returns:
@@ -119,8 +143,7 @@ class EstimatedNoiseProblem:
         squares = self._squares(at)
         if squares is None:
             return np.inf
-        variances = np.maximum(self._variances(squares), self._smallest**2)
-        return 0.5 * float(np.sum(squares / variances)) + self.problem.prior_cost(at)
+        return 0.5 * float(np.sum(squares / noise.sigma**2)) + self.problem.prior_cost(at)
 
     def _variances(self, squares: Array) -> Array:
         """(ny,) variances of the residuals from their (ny,) sums of squares."""

@@ -58,6 +58,7 @@ class ProblemOrder:
         pins: Combinations that no recording determines.
         with_priors: Whether priors count.
         difference_step: Relative step of the differences.
+        central: Whether they are two-sided; None where that depends on the amount of data.
     """
 
     system: SharedValue[SystemOrder]
@@ -70,6 +71,7 @@ class ProblemOrder:
     pins: Pins
     with_priors: bool
     difference_step: float
+    central: bool | None
 
 
 class SharedRecording(SharedValue[AlignedRecording]):
@@ -238,6 +240,7 @@ class PartOrder:
             pins=order.pins,
             with_priors=order.with_priors,
             difference_step=order.difference_step,
+            central=order.central,
         )
 
     def _all_segments(self, rows: Sequence[int]) -> tuple[Segment, ...]:

@@ -61,6 +61,7 @@ class FitProblem:
         pins: Combinations that no recording determines, and their values.
         with_priors: Whether priors of the parameters count.
         difference_step: Relative step of the two-sided differences of a linearisation.
+        central: True for two-sided differences; None for two-sided ones unless there is much data.
         workers: Does the work on batches of segments; None for this process.
     """
 
@@ -71,6 +72,7 @@ class FitProblem:
     pins: Pins
     with_priors: bool
     difference_step: float = SENSITIVITY_STEP
+    central: bool | None = None
     workers: BatchWorkers | None = None
 
     @classmethod
@@ -167,7 +169,8 @@ class FitProblem:
         """This problem with longer steps of the differences that linearise it.
 
         They give the slope of the trend where contacts, dry friction or chaos make the residuals
-        rough, and are less accurate where the residuals are smooth.
+        rough, and are less accurate where the residuals are smooth. They are two-sided, also with
+        much data: one side alone shows the slope of the roughness as well.
 
         Args:
             factor: Factor by which the steps are longer.
@@ -175,7 +178,7 @@ class FitProblem:
         Returns:
             The problem.
         """
-        return replace(self, difference_step=factor * self.difference_step)
+        return replace(self, difference_step=factor * self.difference_step, central=True)
 
     def of_segments(self, indices: np.ndarray) -> FitProblem:
         """The problem of some segments only; only their rows count.
@@ -505,7 +508,9 @@ class FitProblem:
         m = self.simulation.private_count + self.layout.column_count + 1
         blocks = np.zeros((self.blocks.count, m, m))
 
-        batches = self.simulation.batches(derivatives=True, step=self.difference_step)
+        batches = self.simulation.batches(
+            derivatives=True, central=self.central, step=self.difference_step
+        )
         for found in self.of_batches(FitProblem.blocks_of_batch, batches, at):
             if found is None:
                 return None

@@ -266,6 +266,7 @@ class FitWorkers:
             pins=problem.pins,
             with_priors=problem.with_priors,
             difference_step=problem.difference_step,
+            central=problem.central,
         )
 
     def _shared_system(self, system: System, threads: int) -> SharedValue[SystemOrder]:

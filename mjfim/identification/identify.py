@@ -25,10 +25,21 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.report import FitResult, estimate_from
-from mjfim.identification.searches import NEWTON, FitSearch, of_subset, quick_subset
+from mjfim.identification.searches import (
+    NEWTON,
+    FitSearch,
+    first_subset,
+    of_subset,
+    quick_subset,
+)
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import FitTask, Method
-from mjfim.information.null_space import CLEAR_SINGULAR_VALUE, NullSpace, find_null_space
+from mjfim.information.null_space import (
+    CLEAR_SINGULAR_VALUE,
+    NullSpace,
+    find_null_space,
+    has_weak_column,
+)
 from mjfim.optimize.levenberg_marquardt import (
     InterruptedPassError,
     SearchSettings,
@@ -261,7 +272,7 @@ def _first_fit(
     """The fit from the best start.
 
     After a request to stop before the first pass over all data is complete, it is a fit to the
-    subset alone.
+    segments alone on which the search began. Initial states were improved only there.
 
     Args:
         search: The searches of the identification.
@@ -274,19 +285,20 @@ def _first_fit(
         the noise of the fit and its solution.
     """
     count = len(problem.segments)
+    searched = first_subset(problem)
     try:
         begin = search.best_start(problem, begin)
-        if not search.interrupted() or len(subset) == count:
+        if not search.interrupted() or len(searched) == count:
             return problem, subset, search.solve(problem, begin)
     except InterruptedPassError:
         pass
 
-    part = replace(problem.of_segments(subset), workers=None)
-    weighted, solution = search.solve(part, of_subset(begin, subset))
-    if len(subset) < count:
-        status = f"{solution.status}, from {len(subset)} of {count} segments"
+    part = replace(problem.of_segments(searched), workers=None)
+    weighted, solution = search.solve(part, of_subset(begin, searched))
+    if len(searched) < count:
+        status = f"{solution.status}, from {len(searched)} of {count} segments"
         solution = replace(solution, status=status)
-    return part, np.arange(len(subset)), (weighted, solution)
+    return part, np.arange(len(searched)), (weighted, solution)
 
 
 def _require_finite_cost(
@@ -328,7 +340,8 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
     """Directions of theta, at the start, about which the data contain no information.
 
     The data are the recordings and the priors. What a part of them determines clearly, all of them
-    determine as well, and one difference step is enough to see it.
+    determine as well, and one difference step is enough to see it, unless an effect is so weak that
+    it may be round-off.
     """
     count = len(problem.segments)
     wanted = int(SHARE_THAT_DETERMINES * count)
@@ -337,33 +350,42 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
         if wanted
         else problem.of_first_parts(SHARE_THAT_DETERMINES)
     )
-    quick = _null_space(task, part, with_error=False)
-    if not quick.count and quick.smallest > CLEAR_SINGULAR_VALUE:
-        return quick
-    return _null_space(task, problem, with_error=True)
+    J, change = _stacked_sensitivity(task, part, with_error=False)
+    if not has_weak_column(J, task.system.parameters.magnitude):
+        quick = _null_space(task, J, change)
+        if not quick.count and quick.smallest > CLEAR_SINGULAR_VALUE:
+            return quick
+    return _null_space(task, *_stacked_sensitivity(task, problem, with_error=True))
 
 
-def _null_space(task: FitTask, problem: FitProblem, *, with_error: bool) -> NullSpace:
-    """Directions of theta, at the start, about which some segments and priors tell nothing.
+def _stacked_sensitivity(
+    task: FitTask, problem: FitProblem, *, with_error: bool
+) -> tuple[Array, Array]:
+    """(n, p) rows of the sensitivity of some segments and of the priors, and their error.
 
     Args:
         task: The task.
         problem: Problem of the segments.
         with_error: Whether to simulate with a second difference step, which shows round-off.
     """
-    parameters = task.system.parameters
     rows = sensitivity_rows(problem, problem.begin(task.start), with_error=with_error)
     J = np.concatenate([row for row, _ in rows])
     change = np.concatenate([error for _, error in rows])
 
     # Priors are further rows, which have no error of finite differences.
-    prior = np.sqrt(np.diag(np.diag(parameters.prior_information)))
-    exact = np.zeros_like(prior)
+    prior = np.sqrt(np.diag(np.diag(task.system.parameters.prior_information)))
+    return np.concatenate([J, prior]), np.concatenate([change, np.zeros_like(prior)])
+
+
+def _null_space(task: FitTask, J: Array, change: Array) -> NullSpace:
+    """Directions of theta without effect on (n, p) rows, whose error is `change`."""
+    parameters = task.system.parameters
+    count = len(parameters)
     return find_null_space(
-        np.concatenate([J, prior]),
-        np.concatenate([change, exact]),
+        J,
+        change,
         parameters.magnitude,
         parameters.scale,
-        np.arange(len(parameters)),
-        exact,
+        np.arange(count),
+        np.zeros((count, count)),
     )

@@ -165,7 +165,7 @@ def _linearise(
     theta[places] = at.theta
 
     wider = FitProblem.of(extended, recordings).of_segments(segments).with_noise(problem.noise)
-    wider = replace(wider, difference_step=problem.difference_step)
+    wider = replace(wider, difference_step=problem.difference_step, central=problem.central)
     condensed = wider.condense(replace(at, theta=theta))
     if condensed is None:
         return None

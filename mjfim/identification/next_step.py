@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import NextStepLength, UnknownValues
+from mjfim.plant.noise import Noise
 
 # Share of the segments of the test, and their smallest number.
 TESTED_SHARE = 0.1
@@ -22,8 +24,14 @@ FAIR_SHARE = 0.5
 # Multiples of the golden ratio, modulo 1, spread evenly without a period.
 GOLDEN_RATIO = 0.6180339887498949
 
+# Noise with which the latest linearisation is weighted; None where it is another one at the
+# unknowns to which the linearisation led.
+LastingNoise = Callable[[UnknownValues], Noise | None]
 
-def next_step_on_part(problem: FitProblem) -> NextStepLength | None:
+
+def next_step_on_part(
+    problem: FitProblem, lasting_noise: LastingNoise | None = None
+) -> NextStepLength | None:
     """Make the test of a search over all segments of a problem.
 
     Some segments, spread over the data, are linearised anew. How much their gradients differ from
@@ -31,6 +39,8 @@ def next_step_on_part(problem: FitProblem) -> NextStepLength | None:
 
     Args:
         problem: Problem of all segments.
+        lasting_noise: Noise of the linearisations, where it is estimated; default: that of the
+            problem.
 
     Returns:
         The test; None where there are too few segments for it.
@@ -50,7 +60,12 @@ def next_step_on_part(problem: FitProblem) -> NextStepLength | None:
             return np.inf
         if _holds_too_little(condensed, tested, len(problem.layout.shared)):
             return np.inf
-        anew = part.condense(replace(at, private=at.private[tested]))
+
+        # Gradients can be compared only if they are weighted with the same noise.
+        noise = problem.noise if lasting_noise is None else lasting_noise(at)
+        if noise is None:
+            return np.inf
+        anew = part.with_noise(noise).condense(replace(at, private=at.private[tested]))
         if anew is None:
             return np.inf
 

@@ -13,7 +13,7 @@ from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.estimated_noise import EstimatedNoiseProblem
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.next_step import next_step_on_part
+from mjfim.identification.next_step import next_step_on_part, spread_over_data
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
 from mjfim.identification.task import FitTask
 from mjfim.model.parameter_samples import sample_parameters
@@ -131,9 +131,11 @@ def first_subset(problem: FitProblem) -> np.ndarray:
     quick = quick_subset(problem)
     wanted = int(FIRST_SHARE * len(problem.segments))
     enough = FIRST_SHARE * problem.sample_count >= MIN_FIRST_SAMPLES
-    if not enough or not MIN_FIRST_SEGMENTS <= wanted < len(quick):
+    if not enough or wanted < MIN_FIRST_SEGMENTS:
         return quick
-    return evenly_spread_indices(len(problem.segments), wanted)
+
+    # Recordings that repeat in turn, such as one of each joint, are not met in step.
+    return spread_over_data(len(problem.segments), min(wanted, len(quick)))
 
 
 def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
@@ -147,6 +149,12 @@ def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
         The unknowns of these segments.
     """
     return replace(at, private=at.private[subset])
+
+
+def _without_neighbourhood(solution: Solution) -> Solution:
+    """A solution beside which the simulation diverges, so that no search goes on from there."""
+    status = "stopped: the simulation diverges next to the estimate"
+    return replace(solution, success=False, status=status)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -170,14 +178,19 @@ class FitSearch:
     def best_start(self, problem: FitProblem, begin: UnknownValues) -> UnknownValues:
         """Find where the search over all data begins.
 
-        This is the best result of short searches on a subset of the segments.
+        This is the best result of short searches on a subset of the segments, or the stated start
+        where all segments together cost less there.
 
         Args:
             problem: Problem of all segments.
             begin: Unknowns at the stated start.
 
         Returns:
-            Unknowns of all segments.
+            Unknowns of all segments. After a request to stop, initial states are improved only in
+            the segments of `first_subset`.
+
+        Raises:
+            InterruptedPassError: A request to stop ended the first pass over the subset.
         """
         subset = first_subset(problem)
         starts = self.task.settings.starts
@@ -189,11 +202,13 @@ class FitSearch:
         if is_whole and starts == 1:
             return placed
 
+        # Costs of several starts can be compared only if all searches come close to their minimum.
+        is_rough = starts == 1 and not self.task.noise_is_stated
         settings = replace(
             self._final_settings(problem),
             tolerance=FIRST_TOLERANCE,
             relinearise_at_end=False,
-            rough_share=0.0 if self.task.noise_is_stated else ROUGH_SHARE,
+            rough_share=ROUGH_SHARE if is_rough else 0.0,
             next_step_length=None,
         )
         found = [self._minimise(part, placed, settings, "part of the data")]
@@ -208,7 +223,18 @@ class FitSearch:
         private[subset] = best.private
         whole = replace(best, private=private)
         first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
-        return self.with_initial_states(first_parts, whole, INITIAL_STATE_ITERATIONS)
+        found_of_all = self.with_initial_states(first_parts, whole, INITIAL_STATE_ITERATIONS)
+        if self.interrupted():
+            return whole
+
+        # The other segments may diverge at the theta that suits the subset, or contradict it.
+        try:
+            is_better = problem.cost(found_of_all) < problem.cost(begin)
+        except InterruptedPassError:
+            return whole
+        if is_better:
+            return found_of_all
+        return self.with_initial_states(first_parts, begin, INITIAL_STATE_ITERATIONS)
 
     def solve(
         self,
@@ -238,7 +264,7 @@ class FitSearch:
         if self.task.noise_is_stated:
             return problem, self._minimise(problem, begin, settings, phase)
         if self.task.settings.loss != "linear":
-            return self._solve_in_turn_with_noise(problem, begin, settings, phase)
+            return self._solve_in_turn_with_noise(problem, begin, max_iterations, phase)
 
         # The stated noise is only the first guess: its minimum is left as soon as it is near.
         near = replace(
@@ -250,23 +276,29 @@ class FitSearch:
 
         smallest = MIN_NOISE_SHARE * self.task.system.noise.sigma
         likelihood = EstimatedNoiseProblem(problem, smallest)
+        if settings.next_step_length is not None:
+            estimate = next_step_on_part(problem, likelihood.lasting_noise)
+            settings = replace(settings, next_step_length=estimate)
         try:
             found = self._minimise(
                 likelihood, first.unknowns, settings, f"{phase}, noise estimated"
             )
         except InterruptedPassError:
             return problem, replace(first, interrupted=True)
-        weighted = completed(partial(likelihood.weighted, found.unknowns))
-        return weighted, replace(
-            found,
-            cost=likelihood.weighted_cost(found.unknowns),
-            iterates=(*first.iterates, *found.iterates[1:]),
-        )
+        except SimulationDivergedError:
+            return problem, _without_neighbourhood(first)
+
+        # The linearisation of the solution is weighted with this noise. After a request to stop, it
+        # may be that of the unknowns before the last step.
+        weighted = likelihood.linearised
+        cost = completed(partial(likelihood.cost_of_squares, weighted.noise, found.unknowns))
+        return weighted, replace(found, cost=cost, iterates=(*first.iterates, *found.iterates[1:]))
 
     def _solve_in_turn_with_noise(
-        self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
+        self, problem: FitProblem, begin: UnknownValues, max_iterations: int | None, phase: str
     ) -> tuple[FitProblem, Solution]:
         """Search, and estimate the noise robustly, in turn until the noise stays the same."""
+        settings = self._final_settings(problem, max_iterations)
         solution = self._minimise(problem, begin, settings, phase)
         for _ in range(MAX_NOISE_ROUNDS):
             if solution.interrupted:
@@ -277,12 +309,15 @@ class FitSearch:
             change = float(np.abs(sigma / problem.noise.sigma - 1.0).max())
             noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
             reweighted = problem.with_noise(noise)
+            settings = self._final_settings(reweighted, max_iterations)
             try:
                 refined = self._minimise(
                     reweighted, solution.unknowns, settings, f"{phase}, noise estimated"
                 )
             except InterruptedPassError:
                 return problem, replace(solution, interrupted=True)
+            except SimulationDivergedError:
+                return problem, _without_neighbourhood(solution)
             problem = reweighted
             solution = replace(refined, iterates=(*solution.iterates, *refined.iterates[1:]))
             if change < NOISE_TOLERANCE:

@@ -152,6 +152,17 @@ def find_null_space(
     )
 
 
+def has_weak_column(J: Array, size: Array) -> bool:
+    """Whether a parameter has so little effect that only the error of G tells it from round-off.
+
+    Args:
+        J: (n, p) rows of the stacked, whitened G [1 / theta-unit].
+        size: (p,) magnitudes of the parameters [theta-unit].
+    """
+    length = np.linalg.norm(J * size, axis=0)
+    return bool((length <= LEAST_RELATIVE_EFFECT * length.max(initial=0.0)).any())
+
+
 def _wanted_columns(
     J: Array, error: Array | None, size: Array, interest: np.ndarray, prior: Array
 ) -> _Columns:

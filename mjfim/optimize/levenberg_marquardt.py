@@ -59,6 +59,11 @@ MAX_STAGNANT_ITERATIONS = 3
 # predicted step is shorter and does not lower the cost, the search has converged.
 SHORT_STEP = 0.3
 
+# Length of the step before the first one [standard deviations], which is assumed. The first step of
+# a search counts as the last one only if it is so short that a quadratic decrease of this step
+# explains it.
+ASSUMED_LENGTH = 1.0
+
 # A step is complete if the predicted step is shorter than this multiple of it.
 COMPLETE_STEP = 1.1
 
@@ -109,11 +114,12 @@ def completed(passes: Callable[[], T]) -> T:
 
 
 class Problem(Protocol):
-    """Least-squares cost as a function of the unknowns.
+    """Cost as a function of the unknowns, whose gradient is that of a sum of squares.
 
-    The cost is half of the sum of squared residuals and priors; a robust loss may replace the
-    square. Where workers do the passes over the data, `cost` and `condense` raise
-    `InterruptedPassError` after a request to stop.
+    The cost is half of the sum of squared residuals and priors. A robust loss may replace the
+    square, and minus the logarithm of the likelihood the whole, where the noise is estimated.
+    Where workers do the passes over the data, `cost` and `condense` raise `InterruptedPassError`
+    after a request to stop.
     """
 
     @property
@@ -125,7 +131,7 @@ class Problem(Protocol):
         """(c,) upper bounds of the common unknowns, inf without a bound."""
 
     def cost(self, at: UnknownValues) -> float:
-        """Half of the sum of squares.
+        """The cost, up to a constant.
 
         Args:
             at: The unknowns.
@@ -173,7 +179,7 @@ class IterationReport:
 
     Attributes:
         iteration: Number of the iteration, from 1.
-        cost: Half of the sum of squared whitened residuals and priors.
+        cost: Cost of the problem at the new unknowns.
         step_length: Length of the step of the common unknowns [standard deviations].
     """
 
@@ -322,7 +328,7 @@ class _Search:
             self.damping = WEAK_DAMPING
         self.damping_growth = 2.0
         self.stagnant_iterations = 0
-        self.previous_length = np.inf
+        self.previous_length = ASSUMED_LENGTH
         self.iterates: list[UnknownValues] = []
 
     def run(self, start: UnknownValues, cost: float, condensed: Condensed) -> Solution:

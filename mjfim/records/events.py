@@ -31,7 +31,8 @@ class FitEvent:
         phase: Data to which the model is fitted: "all data", or a part of the search for an initial
             guess.
         iteration: Number of the iterate in this phase.
-        cost: Half of the sum of squared whitened residuals.
+        cost: Half of the sum of squared whitened residuals; in a phase "noise estimated" with the
+            loss "linear", minus the logarithm of the likelihood, without a constant.
         step: Length of the last step [standard deviations].
     """
 

@@ -9,15 +9,26 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import Budget
+from mjfim.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import next_step, searches
+from mjfim.identification.estimated_noise import EstimatedNoiseProblem
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.identify import _first_fit
 from mjfim.identification.next_step import next_step_on_part, spread_over_data
+from mjfim.identification.searches import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.optimize.condensed_least_squares import Condensed, Step
-from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
+from mjfim.optimize.levenberg_marquardt import (
+    Problem,
+    SearchSettings,
+    Solution,
+    UnknownValues,
+    minimise,
+)
+from mjfim.plant.noise import Noise
+from mjfim.records.events import FitEvent
 from tests.support.paths import MODELS
 
 # Segments of the cart-pendulum, whose initial states are free.
@@ -90,6 +101,99 @@ def test_the_first_step_ends_a_search_that_began_near_the_minimum(task: FitTask)
 
 
 @pytest.mark.slow
+def test_the_test_of_estimated_noise_is_weighted_as_the_linearisation(
+    task: FitTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Gradients with the stated noise are no continuation of those with the estimated one."""
+    problem = task.problem()
+    stated = problem.with_noise(_scaled(problem.noise, 10.0))
+    exact = minimise(problem, problem.begin(task.start), SearchSettings(), Budget())
+    assert exact is not None
+    likelihood = EstimatedNoiseProblem(stated, 1e-3 * stated.noise.sigma)
+    estimate = next_step_on_part(stated, likelihood.lasting_noise)
+    assert estimate is not None
+
+    # A step of 0.35 standard deviations to the minimum, and the one that follows.
+    away = np.linalg.cholesky(np.linalg.inv(exact.condensed.information())) @ np.full(3, 0.2)
+    near = replace(exact.unknowns, theta=exact.unknowns.theta + away)
+    condensed, step = first_step(likelihood, near)
+    at = problem.moved(near, step, 1.0)
+    found = estimate(condensed, step, at)
+    with_stated = next_step_on_part(stated)
+    assert with_stated is not None
+    wrong = with_stated(condensed, step, at)
+    _, following = first_step(likelihood, at)
+    assert found == pytest.approx(following.common_length, rel=0.4)
+    assert wrong > 3.0 * following.common_length
+
+
+@pytest.mark.slow
+def test_the_search_for_estimated_noise_has_a_test_that_is_weighted_so(
+    task: FitTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(searches, "SUBSET_SAMPLES", 100)
+    monkeypatch.setattr(searches, "SAMPLES_OF_MUCH_DATA", 100)
+    searched = []
+
+    def recorded(
+        problem: FitProblem, begin: UnknownValues, settings: SearchSettings, *more: Any
+    ) -> Solution | None:
+        """Search, and keep the linearisation and the settings."""
+        found = minimise(problem, begin, settings, *more)
+        searched.append((problem, settings.next_step_length, begin))
+        return found
+
+    monkeypatch.setattr(searches, "minimise", recorded)
+    experiment = task.system.experiment.replace(fit={**FIT, "noise": "estimated"})
+    estimated = FitTask.resolve(experiment, task.recordings, threads=1)
+    search = FitSearch(task=estimated, budget=Budget(), callback=None)
+    problem = estimated.problem()
+    search.solve(problem, problem.begin(task.start))
+    (_, without, _), (likelihood, estimate, begin) = searched
+    assert isinstance(likelihood, EstimatedNoiseProblem)
+    assert without is None and estimate is not None
+
+    # Where the noise becomes another one, the linearisation does not hold.
+    condensed, step = first_step(likelihood, begin)
+    assert np.isfinite(estimate(condensed, step, problem.moved(begin, step, 1.0)))
+    first_step(likelihood, problem.begin(1.2 * task.start))
+    assert estimate(condensed, step, problem.moved(begin, step, 1.0)) == np.inf
+
+
+@pytest.mark.slow
+def test_a_search_that_is_stopped_reports_on_the_segments_that_it_has_seen(
+    task: FitTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(searches, "MIN_FIRST_SAMPLES", 10)
+    monkeypatch.setattr(searches, "MIN_FIRST_SEGMENTS", 2)
+    stop = StopToken()
+
+    def callback(event: FitEvent) -> None:
+        """Stop at the first step of theta."""
+        if event.phase == "part of the data":
+            stop.request()
+
+    problem = task.problem()
+    seen = searches.first_subset(problem)
+    assert len(seen) < len(problem.segments)
+    search = FitSearch(task=task, budget=Budget(stop=stop), callback=callback)
+    begin = problem.begin(task.start)
+    whole = np.arange(len(problem.segments))
+    part, subset, (_, found) = _first_fit(search, problem, whole, begin)
+    assert [segment.begin for segment in part.segments] == [problem.segments[i].begin for i in seen]
+    assert len(subset) == len(seen)
+
+    # Their initial states are no longer the measured ones.
+    assert found.interrupted and f"from {len(seen)} of {len(whole)} segments" in found.status
+    assert found.unknowns.private.any(axis=1).all()
+
+
+def _scaled(noise: Noise, factor: float) -> Noise:
+    """Noise of other standard deviations."""
+    return Noise(covariance=factor**2 * noise.covariance, strides=noise.strides)
+
+
+@pytest.mark.slow
 def test_a_search_from_far_away_linearises_again(task: FitTask) -> None:
     problem = task.problem()
     settings = SearchSettings(
@@ -101,7 +205,7 @@ def test_a_search_from_far_away_linearises_again(task: FitTask) -> None:
     assert counting.linearisations > 1
 
 
-def first_step(problem: FitProblem, at: UnknownValues) -> tuple[Condensed, Step]:
+def first_step(problem: Problem, at: UnknownValues) -> tuple[Condensed, Step]:
     """The linearisation at some unknowns, and the undamped step from there."""
     condensed = problem.condense(at)
     assert condensed is not None

@@ -9,8 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+import mjfim
 from mjfim.budget import Budget
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification import searches, segment_simulation
+from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.searches import FitSearch, first_subset
+from mjfim.identification.segment_simulation import SegmentBatch
+from mjfim.identification.task import FitTask
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (
     SearchSettings,
@@ -19,6 +26,7 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from tests.support.numerics import Array
+from tests.support.paths import MODELS
 
 # Slope of the residuals: the standard deviation of the parameter is 0.01.
 SLOPE = 10.0
@@ -77,12 +85,13 @@ class Rough:
         return Rough(step=factor * self.step)
 
 
-def search(method: str = "least_squares") -> Any:
+def search(method: str = "least_squares", *, starts: int = 1, noise_is_stated: bool = True) -> Any:
     """The searches of an identification of one parameter."""
     task: Any = SimpleNamespace(
         method=method,
-        settings=SimpleNamespace(max_iterations=60),
-        system=SimpleNamespace(parameters=["slope"]),
+        noise_is_stated=noise_is_stated,
+        settings=SimpleNamespace(max_iterations=60, starts=starts, loss="linear"),
+        system=SimpleNamespace(parameters=["slope"], noise=SimpleNamespace(sigma=np.ones(1))),
     )
     return FitSearch(task=task, budget=Budget(), callback=None)
 
@@ -102,6 +111,29 @@ def test_longer_differences_lead_over_waves_to_the_minimum(begin: float) -> None
     assert found.success and found.cost < 1e-3 * stuck.cost
     assert problem.step > Rough().step
     assert abs(found.unknowns.theta[0] - 1.0) < 1e-3
+
+
+def test_longer_differences_are_two_sided_also_with_much_data(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.2)
+    design = DesignTask.resolve(experiment, threads=1)
+    recording = simulate_system(design.system, design.initial, 0)
+    problem = FitTask.resolve(experiment, [recording], threads=1).problem()
+    linearised = []
+
+    def recorded(self: FitProblem, at: UnknownValues, batch: SegmentBatch) -> None:
+        """Keep the batch."""
+        linearised.append(batch)
+
+    monkeypatch.setattr(segment_simulation, "SAMPLES_FOR_ONE_SIDED", 0)
+    monkeypatch.setattr(FitProblem, "blocks_of_batch", recorded)
+    begin = problem.begin(problem.system.parameters.guess)
+    problem.condense(begin)
+    problem.with_longer_differences(100.0).condense(begin)
+    usual, longer = linearised
+    assert longer.central and not usual.central
+    assert longer.step == pytest.approx(100.0 * problem.difference_step)
 
 
 def test_other_ends_of_a_search_stay() -> None:
@@ -130,4 +162,144 @@ def test_a_search_begins_on_a_part_that_is_large_enough(
 ) -> None:
     chosen = first_subset(of_segments(samples, count))
     assert len(chosen) == wanted
-    assert np.diff(chosen).max() - np.diff(chosen).min() <= 1
+
+    # One of each of equal stretches of the data.
+    stretch = np.arange(wanted) * count / wanted
+    assert (chosen >= np.floor(stretch)).all() and (chosen < stretch + count / wanted).all()
+
+
+def test_a_part_of_recordings_that_repeat_in_turn_holds_different_ones() -> None:
+    """Five joints are recorded in turn; every fourth or fifth recording would be of one joint."""
+    for count in (20, 21, 22, 25, 40):
+        chosen = first_subset(of_segments(1_000 * count, count))
+        assert len(chosen) < count / 3
+        assert len(set((chosen % 5).tolist())) >= 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """Segments of one parameter, some of which have another minimum and diverge beyond a limit.
+
+    Attributes:
+        segments: Minimum of each segment.
+        limit: Parameter from which the segments with the lower minimum diverge.
+    """
+
+    segments: tuple[float, ...]
+    limit: float = np.inf
+    sample_count = 24_800
+    workers = None
+    layout = SimpleNamespace(free_starts=False)
+    lower = np.array([-np.inf])
+    upper = np.array([np.inf])
+
+    def residuals(self, theta: float) -> Array:
+        """One residual of each segment."""
+        return np.asarray(SLOPE * (theta - np.array(self.segments)))
+
+    def cost(self, at: UnknownValues) -> float:
+        """Half of the sum of squares."""
+        theta = float(at.theta[0])
+        if theta > self.limit and min(self.segments) < 3.0:
+            return np.inf
+        return 0.5 * float(np.sum(self.residuals(theta) ** 2))
+
+    def condense(self, at: UnknownValues) -> Condensed:
+        """Linearise."""
+        r = self.residuals(at.theta[0])
+        rows = np.column_stack([np.full(len(r), SLOPE), r])
+        return Condensed(
+            blocks=np.linalg.qr(rows, mode="r")[None],
+            segment_of_block=np.zeros(1, dtype=int),
+            private_rows=np.zeros((1, 0, 2)),
+            common_rows=np.zeros((0, 2)),
+        )
+
+    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
+        """The unknowns after a fraction of a step."""
+        return replace(at, theta=at.theta + fraction * step.common)
+
+    def common_values(self, at: UnknownValues) -> Array:
+        """The parameter."""
+        return at.theta
+
+    def of_segments(self, indices: np.ndarray) -> Parts:
+        """Some segments."""
+        return replace(self, segments=tuple(self.segments[i] for i in indices))
+
+    def of_first_parts(self, share: float) -> Parts:
+        """The same, because there is no initial state."""
+        return self
+
+
+def parts(seen: float, others: float, limit: float = np.inf) -> Parts:
+    """25 segments with a minimum of those that the first search sees, and one of the others."""
+    minima = np.full(25, others)
+    minima[first_subset(of_segments(24_800, 25))] = seen
+    return Parts(segments=tuple(minima.tolist()), limit=limit)
+
+
+def begin_of(theta: float) -> UnknownValues:
+    """A parameter, without private unknowns."""
+    return UnknownValues(theta=np.array([theta]), private=np.zeros((25, 0)))
+
+
+@pytest.mark.parametrize(
+    ("problem", "expected"),
+    [
+        pytest.param(parts(3.0, 3.0), 3.0, id="the part is like the rest"),
+        pytest.param(parts(3.0, 1.0), 1.1, id="the rest costs more"),
+        pytest.param(parts(3.0, 2.9, limit=2.0), 1.1, id="the rest diverges"),
+    ],
+)
+def test_the_search_over_all_data_begins_where_all_data_cost_less(
+    problem: Parts, expected: float
+) -> None:
+    found = search(starts=1, noise_is_stated=True).best_start(problem, begin_of(1.1))
+    assert found.theta[0] == pytest.approx(expected, abs=0.1)
+    assert np.isfinite(problem.cost(found))
+
+
+def test_of_several_starts_the_stated_one_is_searched_as_far_as_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shares = []
+
+    def recorded(problem: Any, begin: Any, settings: SearchSettings, *more: Any) -> Any:
+        """Search, and keep the settings."""
+        shares.append(settings.rough_share)
+        return minimise(problem, begin, settings, *more)
+
+    monkeypatch.setattr(searches, "minimise", recorded)
+    monkeypatch.setattr(FitSearch, "_from_random_starts", lambda *_: [])
+    problem = parts(3.0, 3.0)
+    search(starts=1, noise_is_stated=False).best_start(problem, begin_of(1.1))
+    search(starts=3, noise_is_stated=False).best_start(problem, begin_of(1.1))
+    assert shares[0] > 0.0
+    assert shares[1] == 0.0
+
+
+class Edge:
+    """Stands for the problem with estimated noise, beside whose begin the simulation diverges."""
+
+    def __init__(self, problem: Any, smallest: Array) -> None:
+        self.linearised = problem
+
+    def cost(self, at: UnknownValues) -> float:
+        """The begin itself can be simulated."""
+        return 1.0
+
+    def condense(self, at: UnknownValues) -> None:
+        """Differences cannot."""
+
+
+def test_a_search_that_ends_next_to_divergence_is_kept_where_the_noise_is_estimated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(searches, "EstimatedNoiseProblem", Edge)
+    problem = parts(3.0, 3.0)
+    searched = search(starts=1, noise_is_stated=False)
+    kept, found = searched.solve(problem, begin_of(1.1))
+    assert kept is problem
+    assert not found.success and "diverges next to the estimate" in found.status
+    assert found.unknowns.theta[0] == pytest.approx(3.0, abs=0.1)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
@@ -78,3 +79,22 @@ def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> N
     between = problem.system.plant.engine_steps
     assert _unseen_directions(task, problem).count == 0
     assert problem.system.plant.engine_steps - between < 0.2 * (between - before)
+
+
+def test_an_effect_that_may_be_round_off_is_tested_with_its_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
+    design = DesignTask.resolve(experiment, threads=1)
+    recording = simulate_system(design.system, design.initial, 0)
+    task = FitTask.resolve(experiment, [recording], threads=1)
+    count = len(task.start)
+
+    def rows(problem: FitProblem, at: Any, *, with_error: bool) -> list[tuple[Array, Array]]:
+        """The last parameter has an effect of the size of its error."""
+        J = 1e3 * np.eye(count) / task.system.parameters.magnitude
+        J[-1] *= 1e-8
+        return [(J, 0.5 * J * (np.arange(count) == count - 1) * with_error)]
+
+    monkeypatch.setattr("mjfim.identification.identify.sensitivity_rows", rows)
+    assert _unseen_directions(task, task.problem()).silent == (count - 1,)

@@ -460,6 +460,27 @@ def test_the_last_linearisation_is_at_the_solution() -> None:
     np.testing.assert_allclose(saved.condensed.information(), fresh.information(), rtol=1e-3)
 
 
+def halving(theta: Array, private: Array) -> Array:
+    """A residual beside a constant one; each Gauss-Newton step is half of the one before."""
+    return np.array([theta[0] ** 2, np.sqrt(10.0) + 0.0 * theta[0]])
+
+
+def test_a_first_step_is_the_last_one_only_where_it_is_short() -> None:
+    """A step tells nothing about the one that follows, if there was none before it."""
+    start = alone(0.5)
+    p = problem(halving, lower=[-5.0])
+    condensed = p.condense(start)
+    assert condensed is not None
+    settings = SearchSettings(tolerance=1e-2, relinearise_at_end=False, damped=True)
+    free = np.array([FREE])
+    first = condensed.step(0.0, condensed.column_norms, -free, free)
+    assert 0.22 < first.common_length < 0.3
+    assert solved(p, start, settings).iterations > 1
+
+    # A much shorter one suffices.
+    assert solved(p, alone(0.3), settings).iterations == 1
+
+
 def test_a_rough_search_ends_where_a_step_hardly_lowers_the_cost() -> None:
     start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
     p = problem(*decays(), lower=[0.0, -5.0])

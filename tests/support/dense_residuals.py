@@ -42,7 +42,9 @@ def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
     jacobians = []
 
     simulation = problem.simulation
-    for batch in simulation.batches(derivatives=True, step=problem.difference_step):
+    for batch in simulation.batches(
+        derivatives=True, central=problem.central, step=problem.difference_step
+    ):
         for rows in simulation.rows_of_batch(at, batch):
             if rows is None:
                 return None
