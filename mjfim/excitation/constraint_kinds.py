@@ -430,20 +430,29 @@ class ControlRateConstraint:
         Returns:
             (N+1, nu) rates [u-unit / s], zero at an end where the control is free.
         """
-        first = ctrl[0] if self.control_before is None else self.control_before
-        last = ctrl[-1] if self.control_after is None else self.control_after
+        return self._rates_between(ctrl, self.control_before, self.control_after)
+
+    def _rates_between(self, curve: Array, before: Array | None, after: Array | None) -> Array:
+        """Compute the rates of a curve and at its ends.
+
+        Args:
+            curve: (N, nu) control, or a change of it [u-unit].
+            before: (nu,) value before the first sample; None where it is free.
+            after: (nu,) value after the last sample; None where it is free.
+        """
+        first = curve[0] if before is None else before
+        last = curve[-1] if after is None else after
         if self.periodic:
-            last = ctrl[0]
-        return np.diff(ctrl, axis=0, prepend=first[None], append=last[None]) / self.dt
+            last = curve[0]
+        return np.diff(curve, axis=0, prepend=first[None], append=last[None]) / self.dt
 
     def slack_changes(self, values: ConstraintValues, step: TangentCurve) -> Array:
         """See `LimitedQuantities.slack_changes`."""
-        v = step.v
-        first = v[0] if self.control_before is None else np.zeros(v.shape[1])
-        last = v[-1] if self.control_after is None else np.zeros(v.shape[1])
-        last = v[0] if self.periodic else last
-        rates = np.diff(v, axis=0, prepend=first[None], append=last[None]) / self.dt
-        return self.bounds.slack_changes(rates)
+        # Controls that are stated beside the curve do not change.
+        unchanged = np.zeros(step.v.shape[1])
+        before = None if self.control_before is None else unchanged
+        after = None if self.control_after is None else unchanged
+        return self.bounds.slack_changes(self._rates_between(step.v, before, after))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""

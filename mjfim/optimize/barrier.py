@@ -268,7 +268,7 @@ class StepCurvature(Protocol):
         ...
 
     def scaled(self, mu: float) -> StepCurvature:
-        """The same for a multiple of the barrier.
+        """Return the curvature of a multiple of the barrier.
 
         Args:
             mu: Factor of the barrier.

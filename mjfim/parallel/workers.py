@@ -33,7 +33,7 @@ TASKS_PER_WORKER = 2
 
 
 class ExecutorLike(Protocol):
-    """Where a verb does its work: an executor of `concurrent.futures`, a Dask client, or `Workers`.
+    """Executor of the work of a verb: one of `concurrent.futures`, a Dask client, or `Workers`.
 
     Every argument `executor` of mjfim takes one. None means this process; a number of processes is
     stated by `mjfim.Pool(4)`. A verb does not end the executor: its owner does.

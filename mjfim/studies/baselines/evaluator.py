@@ -195,7 +195,7 @@ class ControlEvaluator:
         self.method, self.rng = copy.deepcopy((before.method, before.rng))
 
     def state(self) -> SearchState | None:
-        """Where the search goes on after this slice; None where it has ended."""
+        """Return the state from which the search goes on; None where it has ended."""
         self._count_steps()
         if self.budget.exhausted is not None or not self.slice_is_over:
             return None
