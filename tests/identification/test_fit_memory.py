@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
@@ -36,7 +37,12 @@ def test_a_recording_keeps_nothing_of_the_parsed_file(tmp_path: Path) -> None:
     write_recording(tmp_path / "log.csv", recording, system)
     before = pyarrow.total_allocated_bytes()
     found = read_recording(tmp_path / "log.csv", system.channels)
-    assert pyarrow.total_allocated_bytes() == before
+
+    # A thread of the parser may give its last buffer back shortly after the file was read.
+    deadline = time.monotonic() + 10.0
+    while pyarrow.total_allocated_bytes() > before and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert pyarrow.total_allocated_bytes() <= before
 
     # A fit shares the arrays.
     aligned = FitTask.of(system, [found]).problem().recordings[0]
