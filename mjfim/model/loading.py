@@ -141,8 +141,9 @@ MAX_EDITED_MODELS = 512
 class ModelSource:
     """An MJCF file that is parsed only once.
 
-    It is compiled once for each set of bodies whose inertia may change. All variants of a plant are
-    copies of these compiled models with other settings.
+    It is compiled once more for each set of bodies whose inertia may change, where MuJoCo treats
+    one of them as "simple". All variants of a plant are copies of these compiled models with other
+    settings.
 
     Attributes:
         path: The MJCF file.
@@ -205,6 +206,9 @@ class ModelSource:
         Returns:
             MjModel that callers copy and never change.
         """
+        if not self._has_simple(moved_bodies):
+            return self.model
+
         with self._lock:
             if moved_bodies not in self._compiled:
                 spec = self._editable_spec(moved_bodies)
@@ -236,6 +240,20 @@ class ModelSource:
                 edit(spec)
                 self._edited[place] = compile_spec(spec, self.path, files=self._files)
             return self._edited[place]
+
+    def _has_simple(self, moved_bodies: frozenset[str] | None) -> bool:
+        """Whether the user's compiled model treats a moved body as "simple".
+
+        If it does not, another compile would give the same model.
+        """
+        simple = self.model.body_simple
+        if moved_bodies is None:
+            return bool(simple[1:].any())
+        kind = mujoco.mjtObj.mjOBJ_BODY
+        numbers = [mujoco.mj_name2id(self.model, kind, name) for name in sorted(moved_bodies)]
+
+        # A body without a number was merged with its parent.
+        return any(number < 0 or simple[number] for number in numbers)
 
     def _editable_spec(self, moved_bodies: frozenset[str] | None) -> Any:
         """A copy of the spec in which the moved bodies are not compiled as "simple"."""
