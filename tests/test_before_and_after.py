@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from io import StringIO
 from math import inf, nan
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+import mjfim
+from mjfim.excitation.task import DesignTask
 from mjfim.records.comparison import DESIGN
-from scripts.benchmarks import anytime, measurements
+from mjfim.studies import compare
+from scripts import benchmarks
+from scripts.benchmarks import anytime, measurements, seven_hinges
 from scripts.benchmarks import before_and_after as script
 from scripts.benchmarks.before_and_after import Earlier, Line, Measurement, Result
 from scripts.benchmarks.checkouts import ROOT, commit_hash, earlier_checkout, run_command
@@ -242,3 +249,106 @@ def test_the_help_states_the_minutes_of_the_parts() -> None:
     words = script.parts_in_words()
     for name, part in script.PARTS.items():
         assert f"{name:12s} {part.minutes[0]:4g} ({part.minutes[1]:g})" in words
+
+
+def test_a_measurement_without_an_earlier_one_is_kept_and_leaves_its_cell_empty(
+    tmp_path: Path,
+) -> None:
+    calls: list[Path] = []
+    earlier = Earlier(commit="1234567", folder=tmp_path / "before")
+    stated = Measurement(
+        name="new",
+        run=counting(calls),
+        lines=(Line(name="an error", figure="time", goal=2.0),),
+        has_before=False,
+    )
+    expected = Result(before=None, now={"time": Figure(1.0, 1.0)})
+    for _ in range(2):
+        assert script.measured(stated, earlier, tmp_path, pytest.fail) == expected
+    assert calls == [ROOT]
+
+    table = script.empty_table("1234567")
+    script.add_lines(table, stated, expected)
+    assert [list(column.cells) for column in table.columns] == [
+        ["an error"],
+        [""],
+        ["1"],
+        [""],
+        ["≤ 2"],
+        ["met"],
+    ]
+
+
+def test_a_part_that_cannot_be_measured_says_why(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(script, "find_spec", lambda name: None)
+    monkeypatch.setattr(script, "earlier_checkout", lambda commit: nullcontext(tmp_path / "before"))
+    monkeypatch.setattr(script, "commit_hash", lambda commit: "1234567")
+    written = StringIO()
+    args = SimpleNamespace(
+        before="1234567", results=tmp_path / "kept", quick=True, hours=1.0, only=["oracle"]
+    )
+    table = script.empty_table("1234567")
+    script.fill(table, args, Console(file=written, width=150))
+    assert "mjfim[oracle]" in written.getvalue()
+    assert list(table.columns[-1].cells) == ["not measured"]
+
+
+def test_errors_beside_automatic_derivatives_are_those_of_the_oracle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    errors = {"psi": 1e-9, "A": 2e-9, "B": 3e-9, "mixed": 4e-7}
+    found = SimpleNamespace(**errors, psi_closed=nan, mixed_closed=nan)
+    oracle = ModuleType("mjx_oracle")
+    oracle.CASES = [SimpleNamespace(model=name) for name in ("one", "other")]  # type: ignore[attr-defined]
+    oracle.agreement = lambda case: found if case.model == "other" else None  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "scripts.benchmarks.mjx_oracle", oracle)
+    monkeypatch.setattr(benchmarks, "mjx_oracle", oracle, raising=False)
+
+    figures = measurements.automatic_derivatives("other")
+    assert {name: figures[name].value for name in errors} == errors
+
+
+def test_the_arm_of_seven_hinges_starts_within_its_limits(tmp_path: Path) -> None:
+    task = DesignTask.resolve(seven_hinges.experiment(2.0, tmp_path), threads=1)
+    model = task.system.model
+    assert model.nv == model.nu == 7
+    assert task.is_limited
+    assert len(task.theta) == 11
+
+    # The control at the beginning holds the pose against gravity.
+    qpos = task.initial.qpos
+    assert np.abs(qpos[:3] - seven_hinges.HOME).max() < 1e-4
+    assert np.abs(task.initial.qvel).max() < min(seven_hinges.SPEEDS)
+
+
+def test_a_design_is_compared_with_the_best_series_that_keeps_the_limits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def row(method: str, sigma: float, is_sound: bool = True) -> SimpleNamespace:
+        return SimpleNamespace(method=method, worst_relative_std=sigma, sound=is_sound)
+
+    rows = [row("fourier5", 0.5), row("fourier15", 0.1, False), row(DESIGN, 0.4)]
+    monkeypatch.setattr(
+        compare, "compare_task", lambda *args, **options: SimpleNamespace(rows=rows)
+    )
+    found = measurements.design_over_series(2.0, 1.0)
+    assert found["series"].value == 0.5
+    assert found["over best series"].value == pytest.approx(0.8)
+
+    # A design that leaves a limit has no figure.
+    rows[-1] = row(DESIGN, 0.4, False)
+    assert measurements.design_over_series(2.0, 1.0)["over best series"].value == inf
+
+
+def test_the_parses_and_compilations_of_a_design_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def resolved_twice(experiment: mjfim.Experiment, **options: object) -> None:
+        for _ in range(2):
+            DesignTask.resolve(experiment, threads=1)
+
+    monkeypatch.setattr(mjfim, "design", resolved_twice)
+    found = measurements.model_work("cart_pendulum")
+    assert (found["parses"].value, found["compilations"].value) == (2.0, 2.0)

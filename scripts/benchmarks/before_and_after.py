@@ -1,7 +1,7 @@
 """What became faster or better than at an earlier commit, and whether it meets its goal: one table.
 
-    python -m scripts.benchmarks before_and_after                       # 40 minutes
-    python -m scripts.benchmarks before_and_after --quick               # 10 minutes
+    python -m scripts.benchmarks before_and_after                       # 70 minutes
+    python -m scripts.benchmarks before_and_after --quick               # 12 minutes
     python -m scripts.benchmarks before_and_after --only limits starts  # some parts
     python -m scripts.benchmarks before_and_after --results FOLDER      # go on from there
 
@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,11 @@ BUDGETS = {
     "cart_pendulum_limits": (2.0, 3.0, 5.0),
     "quadrotor": (3.0,),
     "servo_arm": (3.0,),
+    "sliding_block": (2.0, 3.0, 5.0),
 }
+
+# Budgets of the SO-ARM100 [s], which is compared with smooth and with dry joints.
+ARM_BUDGETS = (2.0, 3.0, 5.0)
 
 # Those of them that a quick run compares.
 QUICK_EXAMPLES = ("cart_pendulum_limits",)
@@ -78,8 +83,24 @@ QUICK_EXAMPLES = ("cart_pendulum_limits",)
 # Wall time of a fit of an hour at 1 kHz [s], its memory [GiB], and wall time of a fit of 4 s [s].
 HOUR, HOUR_MEMORY, SHORT = 70.0, 1.0, 0.5
 
-# Ratio of the time of a design to that of the engine, with short iterations.
-SHORT_RATIO = 1.3
+# Ratio of the time of a design to that of the engine, with short iterations, and with those of at
+# least 40 ms in the engine.
+SHORT_RATIO, LONG_RATIO = 1.3, 1.15
+
+# Worst relative standard deviation of a design of the arm of seven hinges over that of the best
+# series, and duration of the motion [s].
+OVER_SERIES, SERIES_HORIZON = 0.9, 4.0
+
+# Numbers of parameters for which the survey of what is identifiable is timed.
+SURVEYS = (30, 70)
+
+# Examples whose parses and compilations are counted.
+COUNTED = ("cart_pendulum", "servo_arm")
+
+# Models whose derivatives are compared with automatic ones, and largest relative differences of
+# first and of mixed second derivatives.
+AUTOMATIC = ("cart_pendulum", "two_joint_arm", "servo_arm")
+AUTOMATIC_FIRST, AUTOMATIC_MIXED = 1e-7, 1e-5
 
 # Factor from which a goal is said to be missed by a factor instead of a percentage.
 FACTOR = 1.1
@@ -119,12 +140,14 @@ class Measurement:
         run: Makes it with the package of a folder.
         lines: The lines.
         repeats: Number of times that it is made with each version.
+        has_before: Whether the earlier commit can make it.
     """
 
     name: str
     run: Callable[[Path], Figures | None]
     lines: tuple[Line, ...]
     repeats: int = 1
+    has_before: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,11 +173,27 @@ class Part:
         title: The subject.
         minutes: Time expected on two idle cores, and that of the quick ones [min].
         measurements: Lists them.
+        absent: Says in a sentence why they cannot be made here; empty where they can.
     """
 
     title: str
     minutes: tuple[float, float]
     measurements: Callable[[Sizes], Iterator[Measurement]]
+    absent: Callable[[], str] = str
+
+
+def absent_arms() -> str:
+    """Say that the models of the arms are absent, where they are."""
+    if arms.MODELS.is_dir():
+        return ""
+    return "left out, because the models of the arms are not part of this repository"
+
+
+def absent_oracle() -> str:
+    """Say that MJX is absent, where it is."""
+    if all(find_spec(name) for name in ("jax", "mujoco.mjx")):
+        return ""
+    return "left out, because MJX or JAX is not installed (pip install 'mjfim[oracle]')"
 
 
 def start_ups(sizes: Sizes) -> Iterator[Measurement]:
@@ -191,10 +230,33 @@ def starts(sizes: Sizes) -> Iterator[Measurement]:
     )
 
 
+def surveys(sizes: Sizes) -> Iterator[Measurement]:
+    """What is identifiable of the Panda, which a design finds out before its first iterate."""
+    for p in SURVEYS[:1] if sizes.is_quick else SURVEYS:
+        yield _of(
+            "survey",
+            f"survey_{p}",
+            Line(name=f"Panda, p = {p}: survey of what is identifiable", figure="time", unit="s"),
+            Line(name="its engine steps", figure="steps"),
+            repeats=1 if sizes.is_quick else 2,
+            p=p,
+        )
+
+
+def model_work(sizes: Sizes) -> Iterator[Measurement]:
+    """How often a design parses and compiles its model."""
+    for example in COUNTED:
+        yield _of(
+            "model_work",
+            f"model_work_{example}",
+            Line(name=f"{example}: parses of the model in a design", figure="parses", goal=1),
+            Line(name="compilations of the model", figure="compilations", goal=1),
+            example=example,
+        )
+
+
 def iterations(sizes: Sizes) -> Iterator[Measurement]:
     """Iterations of the Panda, and what a design takes beside them."""
-    if not benchmark_arm.ARM.is_file():
-        return
     count = 3 if sizes.is_quick else 8
     for p in (10, 30, 70):
         is_limited = p == 10
@@ -225,6 +287,33 @@ def iterations(sizes: Sizes) -> Iterator[Measurement]:
             p=p,
             iterations=count,
             is_limited=is_limited,
+        )
+
+
+def arm_ratios(sizes: Sizes) -> Iterator[Measurement]:
+    """Time of an iteration of the Panda over that of the engine for its steps.
+
+    In closed form there are few steps, and most of the time is linear algebra in their place. So
+    the same version with differences is measured as well, whose time is that of the engine.
+    """
+    count = 2 if sizes.is_quick else 6
+    for by_differences in (False, True):
+        kind = "by differences" if by_differences else "as it is"
+        yield _of(
+            "arm_iterations",
+            f"panda_ratio_{'differences' if by_differences else 'own'}_{count}",
+            Line(
+                name=f"Panda, p = 30, one level, {kind}: engine's time of an iteration",
+                figure="engine",
+                unit="s",
+            ),
+            Line(name="wall time on all cores over it", figure="wall ratio", goal=LONG_RATIO),
+            Line(name="time of the processors over it", figure="ratio", goal=LONG_RATIO),
+            repeats=1 if sizes.is_quick else 2,
+            p=30,
+            iterations=count,
+            is_limited=False,
+            by_differences=by_differences,
         )
 
 
@@ -274,8 +363,6 @@ def limits(sizes: Sizes) -> Iterator[Measurement]:
 
 def arm_cells(sizes: Sizes) -> Iterator[Measurement]:
     """Designs of arms under hard limits with equal time."""
-    if not arms.MODELS.is_dir():
-        return
     if sizes.is_quick:
         wanted = [(cell, 20.0, CELLS[cell]) for cell in CELLS_AIM]
     else:
@@ -314,6 +401,67 @@ def comparisons(sizes: Sizes) -> Iterator[Measurement]:
                 example=example,
                 seconds=seconds,
             )
+
+
+def arm_comparisons(sizes: Sizes) -> Iterator[Measurement]:
+    """Designs of the SO-ARM100 beside the best baseline at every budget."""
+    for dry in (False, True):
+        joints = "dry" if dry else "smooth"
+        for seconds in ARM_BUDGETS:
+            if sizes.is_quick and (dry or seconds > 2.0):
+                continue
+            name = f"so_arm100, {joints}, {seconds:g} s"
+            yield _of(
+                "arm_beside_baselines",
+                f"beside_baselines_so_arm100_{joints}_{seconds:g}s",
+                Line(name=f"{name}: J over the best baseline", figure="over best baseline", goal=1),
+                Line(name=f"{name}: J of the design", figure="cost"),
+                arm="so_arm100",
+                dry=dry,
+                seconds=seconds,
+            )
+
+
+def series_comparisons(sizes: Sizes) -> Iterator[Measurement]:
+    """The design of an arm on which a series of 15 harmonics does well, beside Fourier series."""
+    for seconds in (10.0,) if sizes.is_quick else (30.0, 60.0):
+        name = f"arm of seven hinges, {seconds:g} s"
+        yield _of(
+            "design_over_series",
+            f"design_over_series_{seconds:g}s",
+            Line(
+                name=f"{name}: worst relative sigma over that of the best series",
+                figure="over best series",
+                goal=OVER_SERIES,
+            ),
+            Line(name="that of the design", figure="design"),
+            Line(name="that of the best series", figure="series"),
+            horizon=SERIES_HORIZON,
+            seconds=seconds,
+        )
+
+
+def automatic_derivatives(sizes: Sizes) -> Iterator[Measurement]:
+    """Derivatives beside those of MJX by automatic differentiation."""
+    names = {
+        "psi": ("psi", AUTOMATIC_FIRST),
+        "A": ("A", AUTOMATIC_FIRST),
+        "B": ("B", AUTOMATIC_FIRST),
+        "mixed": ("mixed second derivatives", AUTOMATIC_MIXED),
+        "psi_closed": ("psi in closed form", None),
+        "mixed_closed": ("mixed second derivatives in closed form", None),
+    }
+    for model in AUTOMATIC[1:2] if sizes.is_quick else AUTOMATIC:
+        yield _of(
+            "automatic_derivatives",
+            f"automatic_{model}",
+            *(
+                Line(name=f"{model}: relative error of {name}", figure=figure, goal=goal)
+                for figure, (name, goal) in names.items()
+            ),
+            has_before=False,
+            model=model,
+        )
 
 
 def fits(sizes: Sizes) -> Iterator[Measurement]:
@@ -376,7 +524,14 @@ def _hour(hours: float, folder: Path, package: Path) -> Figures:
     }
 
 
-def _of(function: str, name: str, *lines: Line, repeats: int = 1, **arguments: Any) -> Measurement:
+def _of(
+    function: str,
+    name: str,
+    *lines: Line,
+    repeats: int = 1,
+    has_before: bool = True,
+    **arguments: Any,
+) -> Measurement:
     """A measurement by a function of `scripts.benchmarks.measurements`."""
 
     def run(package: Path) -> Figures | None:
@@ -384,7 +539,7 @@ def _of(function: str, name: str, *lines: Line, repeats: int = 1, **arguments: A
         found = measure_in_subprocess(function, package, **arguments)
         return None if found is None else figures_from(found)
 
-    return Measurement(name=name, run=run, lines=lines, repeats=repeats)
+    return Measurement(name=name, run=run, lines=lines, repeats=repeats, has_before=has_before)
 
 
 def figures_from(stored: dict[str, Any]) -> Figures:
@@ -395,21 +550,59 @@ def figures_from(stored: dict[str, Any]) -> Figures:
 # The parts, in the order of the table.
 PARTS = {
     "starts": Part(title="Starts side by side", minutes=(1.0, 0.3), measurements=starts),
+    "survey": Part(
+        title="Survey of what is identifiable",
+        minutes=(1.5, 0.5),
+        measurements=surveys,
+        absent=absent_arms,
+    ),
+    "model": Part(
+        title="Parses and compilations of a model", minutes=(0.3, 0.3), measurements=model_work
+    ),
     "iterations": Part(
         title="Iterations of an arm, and the survey before",
         minutes=(4.0, 2.0),
         measurements=iterations,
+        absent=absent_arms,
     ),
     "ratios": Part(
         title="Time of a design over the engine's", minutes=(1.0, 0.3), measurements=ratios
     ),
+    "arm_ratios": Part(
+        title="Time of an iteration of an arm over the engine's",
+        minutes=(3.0, 1.0),
+        measurements=arm_ratios,
+        absent=absent_arms,
+    ),
     "limits": Part(title="Hard limits on a small problem", minutes=(4.0, 0.5), measurements=limits),
-    "arms": Part(title="Arms under hard limits", minutes=(19.0, 1.5), measurements=arm_cells),
+    "arms": Part(
+        title="Arms under hard limits",
+        minutes=(19.0, 1.5),
+        measurements=arm_cells,
+        absent=absent_arms,
+    ),
+    "series": Part(
+        title="An arm on which Fourier series do well",
+        minutes=(9.5, 1.2),
+        measurements=series_comparisons,
+    ),
     "compare": Part(
-        title="Beside baselines at every budget", minutes=(3.0, 1.0), measurements=comparisons
+        title="Beside baselines at every budget", minutes=(5.0, 1.0), measurements=comparisons
+    ),
+    "compare_arm": Part(
+        title="An arm beside baselines at every budget",
+        minutes=(5.0, 0.5),
+        measurements=arm_comparisons,
+        absent=absent_arms,
     ),
     "identify": Part(title="Fits", minutes=(7.0, 1.0), measurements=fits),
     "start_up": Part(title="Start of the command line", minutes=(1.0, 0.5), measurements=start_ups),
+    "oracle": Part(
+        title="Derivatives beside automatic differentiation",
+        minutes=(5.0, 1.0),
+        measurements=automatic_derivatives,
+        absent=absent_oracle,
+    ),
 }
 
 
@@ -418,7 +611,7 @@ class Result:
     """Medians of a measurement with both versions.
 
     Attributes:
-        before: Figures of the earlier commit; None where it failed.
+        before: Figures of the earlier commit; None where it failed or was not measured.
         now: Figures of this folder; None where it failed.
     """
 
@@ -452,13 +645,14 @@ def measured(
     """
     file = kept / f"{measurement.name}.json"
     settings = {"commit": earlier.commit, "repeats": measurement.repeats}
+    versions = ("before", "now") if measurement.has_before else ("now",)
     stored = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     if any(stored.get(name) != value for name, value in settings.items()):
         runs = _runs(measurement, earlier, say)
         stored = {**settings, **runs}
 
         # A failure may have passed when the measurements go on.
-        if all(len(found) == measurement.repeats for found in runs.values()):
+        if all(len(runs[version]) == measurement.repeats for version in versions):
             file.write_text(json.dumps(stored), encoding="utf-8")
 
     return Result(
@@ -474,6 +668,8 @@ def _runs(
     runs: dict[str, list[Figures]] = {"before": [], "now": []}
     for _ in range(measurement.repeats):
         for version, package in (("before", earlier.folder), ("now", ROOT)):
+            if version == "before" and not measurement.has_before:
+                continue
             try:
                 found = measurement.run(package)
             except RuntimeError as error:
@@ -597,7 +793,7 @@ def add_lines(table: Table, measurement: Measurement, result: Result) -> None:
         now = figure_of(line, result, result.now)
         table.add_row(
             line.name,
-            text_of(before, line),
+            text_of(before, line) if measurement.has_before else "",
             text_of(now, line),
             ratio_of(before, now),
             goal_of(line),
@@ -627,6 +823,11 @@ def fill(table: Table, args: argparse.Namespace, console: Console) -> None:
         sizes = Sizes(is_quick=args.quick, hours=args.hours, folder=folder)
         for name in args.only:
             table.add_section()
+            absent = PARTS[name].absent()
+            if absent:
+                say(f"{PARTS[name].title}: {absent}.")
+                table.add_row(PARTS[name].title, "", "", "", "", "not measured")
+                continue
             for measurement in PARTS[name].measurements(sizes):
                 console.print(f"{PARTS[name].title}: {measurement.name} ...", style="dim")
                 result = measured(measurement, earlier, kept, say)

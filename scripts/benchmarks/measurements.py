@@ -11,10 +11,12 @@ from __future__ import annotations
 import resource
 import tempfile
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import mjfim
 from mjfim.parallel import cores
@@ -22,6 +24,9 @@ from scripts.benchmarks.checkouts import ROOT
 
 # Folder of the examples.
 MODELS = ROOT / "models"
+
+# Fourier series with which designs of the arm of seven hinges are compared.
+SERIES = ("fourier5-mjfim", "fourier15-mjfim")
 
 
 class Figure(NamedTuple):
@@ -115,12 +120,70 @@ def starts_side_by_side(starts: int) -> Figures:
     return {"time": Figure(*clock.read()), "cost": Figure(design.final.cost)}
 
 
-def arm_iterations(p: int, iterations: int, is_limited: bool) -> Figures:
-    """Design a motion of the Panda for p inertial parameters, for some iterations.
+def survey(p: int) -> Figures:
+    """Find what is identifiable of p inertial parameters of the Panda, along its first motion."""
+    from mjfim.excitation.task import DesignTask
+    from scripts.benchmarks.benchmark_arm import ARM, tables_of
 
-    `iteration` is the mean of one iteration, `rest` all that is not iterations: what is
-    identifiable, the first iterate, and the verification. `steps` are the engine steps of an
-    iteration, and `bare step` is the time of one step of the bare engine.
+    task = DesignTask.resolve(mjfim.Experiment(**tables_of(ARM, p, 1)))
+    sensitivity = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    if sensitivity is None:
+        raise RuntimeError("the arm diverges")
+
+    steps, clock = task.plant.engine_steps, Clock()
+    task.identifiability_test.along(task.initial, sensitivity)
+    return {
+        "time": Figure(*clock.read()),
+        "steps": Figure(float(task.plant.engine_steps - steps)),
+    }
+
+
+def model_work(example: str) -> Figures:
+    """Count how often one design of an example parses and compiles its model."""
+    import mujoco
+
+    counts: Counter[str] = Counter()
+
+    def counted(name: str) -> Callable[..., Any]:
+        """The function of MuJoCo, which counts its calls."""
+        function = getattr(mujoco.MjSpec, name)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            counts[name] += 1
+            return function(*args, **kwargs)
+
+        return call
+
+    experiment = mjfim.Experiment.from_file(MODELS / f"{example}.toml")
+    with (
+        mock.patch.object(mujoco.MjSpec, "from_file", staticmethod(counted("from_file"))),
+        mock.patch.object(mujoco.MjSpec, "compile", counted("compile")),
+    ):
+        mjfim.design(experiment.replace(descent={"max_iterations": 3}), progress=False)
+    return {
+        "parses": Figure(float(counts["from_file"])),
+        "compilations": Figure(float(counts["compile"])),
+    }
+
+
+def arm_iterations(
+    p: int, iterations: int, is_limited: bool, by_differences: bool = False
+) -> Figures:
+    """Design a motion of the Panda for p inertial parameters, for some iterations, on one level.
+
+    Args:
+        p: Number of parameters.
+        iterations: Number of iterations.
+        is_limited: Whether the limits of the model are hard.
+        by_differences: Whether all derivatives are differences of the engine, also in a version
+            that has them in closed form.
+
+    Returns:
+        `iteration` is the mean of one iteration, `rest` all that is not iterations: what is
+        identifiable, the first iterate, and the verification. `steps` are the engine steps of an
+        iteration, `bare step` is the time of one step of the bare engine, and `engine` that of all
+        steps of an iteration. `wall ratio` is the wall time of an iteration on all cores over it,
+        and `ratio` the time of the processors over it.
     """
     from mjfim.excitation.design import design_task
     from mjfim.excitation.task import DesignTask
@@ -135,6 +198,8 @@ def arm_iterations(p: int, iterations: int, is_limited: bool) -> Figures:
 
     clock = Clock()
     task = DesignTask.resolve(mjfim.Experiment(**tables))
+    if by_differences and hasattr(task.plant, "closed_form_memory"):
+        task.plant.closed_form_memory.tree = None
 
     def note(event: DesignEvent) -> None:
         """Note the time and the engine steps of an iterate."""
@@ -147,11 +212,16 @@ def arm_iterations(p: int, iterations: int, is_limited: bool) -> Figures:
     count = max(len(readings) - 1, 1)
     wall = readings[-1].wall - readings[0].wall
     processors = readings[-1].processors - readings[0].processors
+    bare_step = bare_step_time(task.plant.source.model, task)
+    engine = (steps[-1] - steps[0]) * bare_step
     return {
         "iteration": Figure(wall / count, processors / count),
         "rest": Figure(end.wall - wall, end.processors - processors),
         "steps": Figure((steps[-1] - steps[0]) / count),
-        "bare step": Figure(bare_step_time(task.plant.source.model, task)),
+        "bare step": Figure(bare_step),
+        "engine": Figure(engine / count),
+        "wall ratio": Figure(wall * cores() / engine if engine > 0.0 else inf),
+        "ratio": Figure(processors / engine if engine > 0.0 else inf),
     }
 
 
@@ -211,6 +281,28 @@ def beside_baselines(example: str, seconds: float) -> Figures:
     Args:
         example: Name of the experiment.
         seconds: Budget of every method [s of the processor].
+    """
+    experiment = mjfim.Experiment.from_file(MODELS / f"{example}.toml")
+    return _beside_baselines(example, experiment, seconds)
+
+
+def arm_beside_baselines(arm: str, dry: bool, seconds: float) -> Figures:
+    """Compare a design of an arm with its baselines, each in one thread.
+
+    Args:
+        arm: Name of the arm.
+        dry: Whether its joints have dry friction.
+        seconds: Budget of every method [s of the processor].
+    """
+    from scripts.benchmarks import anytime, arms
+
+    with tempfile.TemporaryDirectory() as folder:
+        experiment = arms.experiment(arm, anytime.HORIZON, dry, Path(folder))
+        return _beside_baselines(arm, experiment, seconds)
+
+
+def _beside_baselines(case: str, experiment: mjfim.Experiment, seconds: float) -> Figures:
+    """Compare a design with its baselines.
 
     Returns:
         J of the design, and the same over the lowest J of the baselines: zero where only the design
@@ -219,16 +311,64 @@ def beside_baselines(example: str, seconds: float) -> Figures:
     from mjfim.records.comparison import DESIGN
     from scripts.benchmarks import anytime
 
-    experiment = mjfim.Experiment.from_file(MODELS / f"{example}.toml")
-    rows = anytime.run(example, experiment, seconds, list(anytime.METHODS))
-    found = anytime.Results(example, rows)
+    rows = anytime.run(case, experiment, seconds, list(anytime.METHODS))
+    found = anytime.Results(case, rows)
     cost = found.cost(DESIGN, seconds)
     best, _ = found.best_baseline(seconds)
     return {"cost": Figure(cost), "over best baseline": Figure(_over(cost, best))}
 
 
+def design_over_series(horizon: float, seconds: float) -> Figures:
+    """Compare a design of the arm of seven hinges with the best Fourier series, each in one thread.
+
+    Args:
+        horizon: Duration of the motion [s].
+        seconds: Budget of every method [s of the processor].
+
+    Returns:
+        Worst relative standard deviations of the design and of the best series, infinite where
+        nothing keeps the limits, and the first one over the second one.
+    """
+    from mjfim.budget import measured_by
+    from mjfim.excitation.task import DesignTask
+    from mjfim.records.comparison import DESIGN
+    from mjfim.studies.compare import compare_task
+    from scripts.benchmarks import seven_hinges
+
+    with tempfile.TemporaryDirectory() as folder:
+        experiment = seven_hinges.experiment(horizon, Path(folder))
+        task = DesignTask.resolve(experiment, threads=1)
+        with measured_by(time.process_time):
+            found = compare_task(task, seconds=seconds, methods=list(SERIES))
+
+    sigmas = {row.method: row.worst_relative_std for row in found.rows if row.sound}
+    design = sigmas.pop(DESIGN, inf)
+    series = min(sigmas.values(), default=inf)
+    return {
+        "design": Figure(design),
+        "series": Figure(series),
+        "over best series": Figure(_over(design, series)),
+    }
+
+
+def automatic_derivatives(model: str) -> Figures:
+    """Compare derivatives with those of MJX; the figures are the relative differences.
+
+    Args:
+        model: Name of the model.
+    """
+    from scripts.benchmarks import mjx_oracle
+
+    (case,) = (each for each in mjx_oracle.CASES if each.model == model)
+    found = mjx_oracle.agreement(case)
+    return {
+        name: Figure(getattr(found, name))
+        for name in ("psi", "A", "B", "mixed", "psi_closed", "mixed_closed")
+    }
+
+
 def _over(cost: float, best: float) -> float:
-    """A cost over the lowest one of others; infinite where it is infinite, whatever the others."""
+    """A figure over the lowest of others; infinite where it is infinite, whatever the others."""
     return cost / best if isfinite(cost) else inf
 
 
