@@ -7,9 +7,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from mjfim.cli import main as cli
 from tests.support.cli import MODELS, loads, names, run
 
 
@@ -75,8 +74,8 @@ def test_a_model_without_joints_is_refused(tmp_path: Path) -> None:
 
 def asked(file: Path, *answers: str) -> Result:
     """`mjfim init --ask` for a slide with a pendulum, with these answers."""
-    words = ["init", str(MODELS / "cart_pendulum.xml"), "-o", str(file), "--ask"]
-    return CliRunner().invoke(cli.app, words, input="".join(f"{each}\n" for each in answers))
+    words = ("init", MODELS / "cart_pendulum.xml", "-o", file, "--ask")
+    return run(*words, answers="".join(f"{each}\n" for each in answers))
 
 
 def test_enter_takes_what_init_proposes_without_questions(tmp_path: Path) -> None:

@@ -8,9 +8,13 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+import typer.testing
+from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from mjfim.cli import main as cli
@@ -55,9 +59,20 @@ STUDY = {
 PROCESS = [sys.executable, "-W", "error", "-m", "mjfim"]
 
 
-def run(*words: object) -> Result:
-    """Run `mjfim` with these words in this process."""
-    return CliRunner().invoke(cli.app, [str(word) for word in words])
+# The command of an app. Typer's runner builds it from the signatures of all verbs at each call,
+# which takes longer than most calls.
+command_of = cache(get_command)
+
+
+def run(*words: object, answers: str | None = None) -> Result:
+    """Run `mjfim` with these words in this process.
+
+    Args:
+        *words: The words.
+        answers: Standard input.
+    """
+    with patch.object(typer.testing, "_get_command", command_of):
+        return CliRunner().invoke(cli.app, [str(word) for word in words], input=answers)
 
 
 def run_script(name: str, *words: object) -> subprocess.CompletedProcess[str]:
