@@ -107,19 +107,6 @@ def in_units(rescaled: Rescaled, found: Any) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("tables", [{}, {"limits": LIMITS, "cost": {"control": 0.0}}])
-@pytest.mark.parametrize("name", SCALES)
-def test_a_design_is_the_same_in_all_units(tmp_path, name: str, tables: dict[str, Any]) -> None:
-    original = stated(tmp_path / "original", **tables)
-    expected = in_units(rescale(original, Units(), tmp_path / "own"), design(original))
-
-    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
-    found = in_units(rescaled, design(rescaled.experiment))
-
-    # Powers of two are exact; only linear algebra that mixes units may round differently.
-    assert_same(found, expected, exact=("status", "warnings", "iterations"))
-
-
 # Limits with a single bound, also zero.
 ONE_SIDED = {
     "position": {"slide": (-0.3, np.inf)},
@@ -129,6 +116,43 @@ ONE_SIDED = {
     "control_rate": {"force": (-60.0, np.inf)},
     "force": {"force": (-5.0, np.inf)},
 }
+
+# Tables of experiments whose designs take different paths.
+DESIGNS: dict[str, dict[str, Any]] = {
+    "weights": {},
+    "limits": {"limits": LIMITS, "cost": {"control": 0.0}},
+    "single bounds": {"limits": ONE_SIDED},
+}
+
+# The last rows combine all units, which is enough for designs that differ in limits alone.
+COMBINED = ("long, light, slow", "short, heavy, quick")
+UNITS_OF_DESIGNS = [
+    (tables, name) for tables in DESIGNS for name in SCALES if tables != "single bounds"
+] + [("single bounds", name) for name in COMBINED]
+
+
+@pytest.fixture(scope="module")
+def own_designs(tmp_path_factory) -> dict[str, dict[str, Any]]:
+    """Numbers of each design of `DESIGNS` in the units of the experiment."""
+    found = {}
+    for key, tables in DESIGNS.items():
+        folder = tmp_path_factory.mktemp("own")
+        original = stated(folder / "original", **tables)
+        found[key] = in_units(rescale(original, Units(), folder / "own"), design(original))
+    return found
+
+
+@pytest.mark.parametrize(("tables", "name"), UNITS_OF_DESIGNS)
+def test_a_design_is_the_same_in_all_units(
+    tmp_path, own_designs: dict[str, dict[str, Any]], tables: str, name: str
+) -> None:
+    original = stated(tmp_path / "original", **DESIGNS[tables])
+    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
+    found = in_units(rescaled, design(rescaled.experiment))
+
+    # Powers of two are exact; only linear algebra that mixes units may round differently.
+    assert_same(found, own_designs[tables], exact=("status", "warnings", "iterations"))
+
 
 # A bob and walls of several shapes. MuJoCo searches for the distance of an ellipsoid with constants
 # of its own.
@@ -172,16 +196,6 @@ def test_a_clearance_of_nearly_nothing_has_finite_margins(tmp_path) -> None:
     clearance = constraint_set_of(DesignTask.resolve(original)).clearance
     assert clearance is not None
     assert clearance.scale > 1e-9
-
-
-@pytest.mark.parametrize("name", ["long, light, slow", "short, heavy, quick"])
-def test_a_design_within_single_bounds_is_the_same_in_all_units(tmp_path, name: str) -> None:
-    original = stated(tmp_path / "original", limits=ONE_SIDED)
-    expected = in_units(rescale(original, Units(), tmp_path / "own"), design(original))
-
-    rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
-    found = in_units(rescaled, design(rescaled.experiment))
-    assert_same(found, expected, exact=("status", "warnings", "iterations"))
 
 
 @pytest.mark.parametrize("name", ["long", "short", "heavy", "light", "slow", "quick"])
@@ -237,30 +251,49 @@ def fit_in_units(rescaled: Rescaled, found: Estimate) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("path", FITS)
-@pytest.mark.parametrize("name", ["long", "short", "heavy", "light", "slow", "quick"])
-def test_estimates_and_misfits_are_the_same_in_all_units(
-    tmp_path, recording: Recording, name: str, path: str
-) -> None:
-    original = stated(tmp_path / "original", **FITS[path])
-    own = rescale(original, Units(), tmp_path / "own")
-    expected = fit_in_units(own, identify(original, [recording]))
-    assert expected["misfit"]
+@pytest.fixture(scope="module")
+def own_fits(tmp_path_factory, recording: Recording) -> dict[str, dict[str, Any]]:
+    """Numbers and verdicts of each fit of `FITS` in the units of the experiment."""
+    found = {}
+    for key, tables in FITS.items():
+        folder = tmp_path_factory.mktemp("own")
+        original = stated(folder / "original", **tables)
+        own = rescale(original, Units(), folder / "own")
+        found[key] = fit_in_units(own, identify(original, [recording]))
+    return found
 
+
+LARGER, SMALLER = ("long", "heavy", "slow"), ("short", "light", "quick")
+
+# Each unit larger and smaller; with smaller units, only the plainest path is fast.
+UNITS_OF_FITS = [
+    *((path, name) for path in FITS for name in LARGER),
+    *(("stated start", name) for name in SMALLER),
+    *(
+        pytest.param(path, name, marks=pytest.mark.slow)
+        for path in FITS
+        for name in SMALLER
+        if path != "stated start"
+    ),
+]
+
+
+@pytest.mark.parametrize(("path", "name"), UNITS_OF_FITS)
+def test_estimates_and_misfits_are_the_same_in_all_units(
+    tmp_path, recording: Recording, own_fits: dict[str, dict[str, Any]], name: str, path: str
+) -> None:
+    expected = own_fits[path]
+    assert expected["misfit"]
+    if path == "stated start":
+        assert "dry friction of slide" in expected["terms"]
+
+    original = stated(tmp_path / "original", **FITS[path])
     rescaled = rescale(original, SCALES[name], tmp_path / "rescaled")
     found = fit_in_units(rescaled, identify(rescaled.experiment, [rescaled.recording(recording)]))
 
     # MuJoCo solves for dry friction to a tolerance that depends on the acceleration's unit.
     exact = ("status", "misfit", "terms", "warnings")
     assert_same(found, expected, exact=exact, rough=("term", "sigmas"))
-
-
-def test_a_missing_term_is_named_in_all_units(tmp_path, recording: Recording) -> None:
-    original = stated(tmp_path / "original")
-    for name in ("short", "light", "slow"):
-        rescaled = rescale(original, SCALES[name], tmp_path / name)
-        found = identify(rescaled.experiment, [rescaled.recording(recording)])
-        assert "dry friction of slide" in [term.description for term in found.missing_terms]
 
 
 @pytest.mark.parametrize("name", ["long, light, slow", "short, heavy, quick"])
