@@ -116,6 +116,7 @@ def test_a_press_during_trials_keeps_those_that_are_done(
     assert mjfim.MonteCarloStudy.load(out).sets["initial"].trials == done
 
 
+@pytest.mark.usefixtures("empty_figures")
 def test_an_interrupted_check_is_written_and_marked_as_incomplete(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -180,7 +180,7 @@ def assert_inside(task: DesignTask, ctrl: Array) -> None:
 
 def test_an_infeasible_start_is_made_feasible(tmp_path: Path) -> None:
     wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
-    task = cart_inside(tmp_path, control=wild)
+    task = cart_inside(tmp_path, control=wild, descent={"max_iterations": 6})
     outside = constraint_set_of(task)
     watched = task.plant.observe(task.theta, task.control, outside.observations)
     assert watched is not None
@@ -214,7 +214,7 @@ def test_an_infeasible_start_is_made_feasible(tmp_path: Path) -> None:
 def test_an_infeasible_result_with_a_feasible_motion_inside_is_shrunk(tmp_path: Path) -> None:
     """No start ended inside the limits; a smaller control about the centre is inside them."""
     wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
-    task = cart_inside(tmp_path, control=wild)
+    task = cart_inside(tmp_path, control=wild, descent={"max_iterations": 6})
     free = task.relaxed()
     none = RunResult(name="none")
     outside = RunResult(name="wild", control=task.control, status=Status.INFEASIBLE)
@@ -429,14 +429,14 @@ def test_limits_that_no_control_can_keep_end_as_infeasible(tmp_path: Path) -> No
 
 
 def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path: Path) -> None:
-    task = cart_inside(tmp_path, descent={"max_iterations": 4})
+    task = cart_inside(tmp_path, descent={"max_iterations": 2})
     search = ConstrainedSearch(
         experiment=task.experiment,
         start=InitialControl(
             name="wild", control=1e9 * np.ones((100, 1)) * np.sin(9.0 * task.t)[:, None]
         ),
         schedule=BarrierSchedule(),
-        max_iterations=4,
+        max_iterations=2,
     )
     result = run_in_worker(ConstrainedSlice(search=search, task_key="wild")).result
     assert result.status is Status.INFEASIBLE
@@ -454,7 +454,7 @@ def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> No
 
     A design that leaves the limits continues with a barrier, from its last feasible control.
     """
-    heavy = {"cost": {"control": 0.05}, "descent": {"max_iterations": 60}}
+    heavy = {"horizon": 0.5, "cost": {"control": 0.05}, "descent": {"max_iterations": 20}}
     wide = {"control": {"force": (-30.0, 30.0)}, "position": {"slide": (-3.0, 3.0)}}
     kept = design_task(cart_inside(tmp_path, limits=wide, **heavy))
     free = design_task(cart_inside(tmp_path, limits={}, **heavy))
@@ -488,7 +488,7 @@ def test_a_design_does_not_use_a_clamp(weight: Any, tmp_path: Path) -> None:
         noise={"state": 0.05},
         initial={"qpos": (0.0, 3.0), "control": control},
         cost={"control": weight},
-        descent={"max_iterations": 25},
+        descent={"max_iterations": 12},
     )
     design = design_task(task)
 
@@ -499,6 +499,7 @@ def test_a_design_does_not_use_a_clamp(weight: Any, tmp_path: Path) -> None:
     assert not any("clamp" in sentence for sentence in design.warnings)
 
 
+@pytest.mark.slow
 def test_limits_that_are_not_enforced_may_be_violated_while_the_boundary_holds(
     tmp_path: Path,
 ) -> None:
@@ -510,7 +511,7 @@ def test_limits_that_are_not_enforced_may_be_violated_while_the_boundary_holds(
         }
     }
     task = swinging_task(
-        tmp_path, **tables, cost={"control": 1e-4}, descent={"max_iterations": 12, "coarse": 1}
+        tmp_path, **tables, cost={"control": 1e-4}, descent={"max_iterations": 6, "coarse": 1}
     )
     design = design_task(task)
     assert design.status is not Status.INFEASIBLE
@@ -523,7 +524,8 @@ def test_limits_that_are_not_enforced_may_be_violated_while_the_boundary_holds(
 
 def test_the_stated_tolerance_ends_the_last_stage_once_the_limits_hold(tmp_path: Path) -> None:
     """With a tolerance above every slope, a run ends at the first feasible iterate."""
-    task = cart_inside(tmp_path, descent={"max_iterations": 80, "tolerance": 100.0, "coarse": 1})
+    descent = {"max_iterations": 80, "tolerance": 100.0, "coarse": 1}
+    task = cart_inside(tmp_path, horizon=0.5, descent=descent)
     design = design_task(task)
     assert design.status is Status.CONVERGED
     sharpest = [row for row in design.history if row.mu == design.history[-1].mu]
@@ -615,15 +617,15 @@ def test_a_second_round_that_converges_at_a_higher_cost_is_not_reported() -> Non
 
 def several(folder: Path, **tables: Any) -> DesignTask:
     """Four starts on a short cart-pendulum."""
-    descent = {"max_iterations": 16, "starts": 4, "seed": 2}
-    return cart_inside(folder, horizon=0.6, **{"descent": descent, **tables})
+    descent = {"max_iterations": 8, "starts": 4, "seed": 2}
+    return cart_inside(folder, **{"horizon": 0.6, "descent": descent, **tables})
 
 
 @pytest.mark.parametrize("criterion", ["E", pytest.param("D", marks=pytest.mark.slow)])
 def test_starts_in_parallel_give_the_results_of_a_sequential_search(
     criterion: str, tmp_path: Path
 ) -> None:
-    task = several(tmp_path, cost={"control": 0.0, "criterion": criterion})
+    task = several(tmp_path, horizon=0.4, cost={"control": 0.0, "criterion": criterion})
     alone = design_task(task)
     with ThreadPoolExecutor(2) as executor:
         together = design_task(task, executor=executor)
@@ -644,9 +646,10 @@ def test_starts_in_parallel_give_the_results_of_a_sequential_search(
     assert_inside(task, alone.trajectory.ctrl)
 
 
+@pytest.mark.slow
 def test_an_interrupted_multistart_keeps_the_best_so_far(tmp_path: Path) -> None:
     """It is no worse than any reported iterate, in both rounds."""
-    task = several(tmp_path)
+    task = several(tmp_path, descent={"max_iterations": 16, "starts": 4, "seed": 2})
     reported: list[HistoryRow] = []
 
     def interrupted(mu: float | None = None) -> Design:
@@ -699,7 +702,7 @@ def arm_task(folder: Path, **tables: Any) -> DesignTask:
         "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
         "control": {"kind": "sine", "amplitude": 0.1, "frequency": 2.0},
         "cost": {"control": 0.0},
-        "descent": {"max_iterations": 24, "coarse": 1},
+        "descent": {"max_iterations": 12, "coarse": 1},
     }
     limits = {
         "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
@@ -785,7 +788,7 @@ def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_p
         tmp_path,
         boundary=boundary,
         limits={"bandwidth": 9.0},
-        descent={"max_iterations": 24, "coarse": coarse},
+        descent={"max_iterations": 12, "coarse": coarse},
     )
     hold, ctrl = standstill(task), design.trajectory.ctrl
     basis = spline_basis(task.t, 0.5, 9.0, True, True, False)
@@ -833,9 +836,8 @@ def nearest(task: DesignTask, ctrl: Array) -> float:
     return min(near)
 
 
-@pytest.mark.parametrize(
-    "has_time", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["shrunk", "tightened"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("has_time", [False, True], ids=["shrunk", "tightened"])
 def test_a_design_that_comes_too_close_between_its_samples_is_corrected(
     has_time: bool, tmp_path: Path
 ) -> None:
@@ -848,7 +850,7 @@ def test_a_design_that_comes_too_close_between_its_samples_is_corrected(
         rate=20.0,
         horizon=1.0,
         limits={"clearance": 0.15, "control_rate": 20.0},
-        descent={"max_iterations": 16, "coarse": 1},
+        descent={"max_iterations": 10, "coarse": 1},
     )
     free = task.relaxed()
     starts = [InitialControl(name="initial control", control=task.control)]
@@ -920,7 +922,7 @@ def test_repeated_designs_work_with_weights_and_with_odd_samples(
     tmp_path: Path, count: int, tables: dict[str, Any]
 ) -> None:
     wide = {"control": {"force": (-50.0, 50.0)}, "position": {"slide": (-9.0, 9.0)}}
-    descent = {"repeats": (count,), "max_iterations": 10}
+    descent = {"repeats": (count,), "max_iterations": 4}
     design = design_task(cart_inside(tmp_path, limits=wide, descent=descent, **tables))
     assert design.final.cost < design.initial.cost
     assert len(design.starts) == 2
@@ -948,7 +950,8 @@ def test_every_criterion_improves_within_limits(tmp_path: Path, tables: dict[str
         name: {**stated, **tables.get("parameters", {}).get(name, {})}
         for name, stated in CART_PARAMETERS.items()
     }
-    task = cart_inside(tmp_path, **{**tables, "parameters": known})
+    descent = {"max_iterations": 10}
+    task = cart_inside(tmp_path, descent=descent, **{**tables, "parameters": known})
     design = design_task(task)
     first = task.problem.point(
         task.plant.simulate(task.theta, 0.2 * task.control)

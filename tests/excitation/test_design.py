@@ -24,6 +24,18 @@ def experiment() -> Experiment:
     return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
 
 
+@pytest.fixture(scope="module")
+def short(experiment: Experiment) -> Experiment:
+    """A short horizon and a loose tolerance."""
+    return experiment.replace(horizon=1.0, descent={"tolerance": 0.1})
+
+
+@pytest.fixture(scope="module")
+def design_of_short(short: Experiment) -> mjfim.Design:
+    """The design of the short experiment."""
+    return mjfim.design(short)
+
+
 def altered(
     tmp_path: Path, experiment: Experiment, old: str, new: str, **tables: Any
 ) -> Experiment:
@@ -59,16 +71,18 @@ def test_actuator_delays_are_refused(experiment: Experiment, tmp_path: Path) -> 
         DesignTask.resolve(late)
 
 
-def test_saturation_is_reported(experiment: Experiment, tmp_path: Path) -> None:
+def test_saturation_is_reported(
+    short: Experiment, design_of_short: mjfim.Design, tmp_path: Path
+) -> None:
     old, new = 'joint="slide"/>', 'joint="slide" forcelimited="true" forcerange="-1.5 1.5"/>'
     # enforced limits keep a design off the clamp: the clamp acts only where they are not enforced
     tables = {"descent": {"max_iterations": 8}, "limits": {"enforce": False}}
     weak = altered(
-        tmp_path, experiment, f'<motor name="force" {old}', f'<motor name="force" {new}', **tables
+        tmp_path, short, f'<motor name="force" {old}', f'<motor name="force" {new}', **tables
     )
     design = mjfim.design(weak)
     assert any("forcerange clamps force" in sentence for sentence in design.warnings)
-    assert not any("forcerange" in sentence for sentence in mjfim.design(experiment).warnings)
+    assert not any("forcerange" in sentence for sentence in design_of_short.warnings)
 
 
 @pytest.mark.slow
@@ -83,11 +97,12 @@ def test_instability_is_reported(experiment: Experiment) -> None:
     assert not any("disturbance" in sentence for sentence in steady.warnings)
 
 
-def test_violated_limits_are_reported_and_are_no_success(experiment: Experiment) -> None:
+def test_violated_limits_are_reported_and_are_no_success(short: Experiment) -> None:
     # limits are enforced by default; here they are only checked
-    tight = experiment.replace(limits={"control": {"force": [-1.0, 1.0]}, "enforce": False})
+    tight = short.replace(limits={"control": {"force": [-1.0, 1.0]}, "enforce": False})
     design = mjfim.design(tight)
     assert design.limits["control"] < 0
+    assert design.status.success
     assert not design.success
     assert any("control limits are exceeded" in sentence for sentence in design.warnings)
 
@@ -97,6 +112,10 @@ def test_a_given_initial_control_is_checked(experiment: Experiment) -> None:
         mjfim.design(experiment, initial_control=np.zeros(400))
     with pytest.raises(UnidentifiableError, match="does not excite"):
         mjfim.design(experiment, initial_control=np.zeros((400, 1)))
+
+
+@pytest.mark.slow
+def test_a_given_initial_control_is_the_start(experiment: Experiment) -> None:
     t = np.arange(400) * 0.01
     design = mjfim.design(experiment, initial_control=np.sin(5 * t)[:, None])
     assert design.found_by == "given control"
@@ -110,7 +129,8 @@ def test_metric_weight_on_psi_needs_the_metric_descent(experiment: Experiment) -
 
 def test_callback_sees_levels_and_growing_numbers(experiment: Experiment) -> None:
     rows: list[HistoryRow] = []
-    design = mjfim.design(experiment, callback=lambda event: rows.append(event.row))
+    loose = experiment.replace(descent={"tolerance": 0.1})
+    design = mjfim.design(loose, callback=lambda event: rows.append(event.row))
     assert [row.iteration for row in rows] == list(range(len(rows)))
     assert [row.rate for row in rows] == sorted(row.rate for row in rows)
     assert {row.rate for row in rows} == {25.0, 100.0}

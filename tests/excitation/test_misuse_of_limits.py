@@ -292,7 +292,7 @@ def test_limits_that_no_control_can_keep_end_with_exit_code_one(
 ) -> None:
     """The pendulum falls faster than its limit allows; the message names the violated limit."""
     hard = "[limits]\nvelocity = { hinge = 0.5 }\ncontrol = { force = [-0.01, 0.01] }"
-    path = write_experiment(tmp_path, max_iterations=f"4\n{hard}")
+    path = write_experiment(tmp_path, horizon="0.3", max_iterations=f"4\n{hard}")
     model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
     (tmp_path / "cart_pendulum.xml").write_text(
         model.replace("3.141592653589793", "2.0"), encoding="utf-8"

@@ -18,9 +18,10 @@ CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics":
 
 
 def stated(**tables: object) -> mjfim.Experiment:
-    """The cart-pendulum under a multisine."""
+    """The cart-pendulum under a multisine for two seconds."""
     base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
-    return base.replace(initial={"control": CONTROL}, fit={"bootstrap": 0}, **tables)
+    horizon = {"horizon": 2.0, **tables}
+    return base.replace(initial={"control": CONTROL}, fit={"bootstrap": 0}, **horizon)
 
 
 def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> Recording:

@@ -258,7 +258,7 @@ def test_an_initial_position_that_no_output_shows_does_not_disturb_the_fit(
     Its derivatives are round-off, which must not influence the search.
     """
     noise = dict.fromkeys(names, 0.01)
-    unseen = cart_task(tmp_path, horizon=3.0, noise=noise, fit={**fit, "bootstrap": 0})
+    unseen = cart_task(tmp_path, horizon=1.5, noise=noise, fit={**fit, "bootstrap": 0})
     theta, y = 1.1 * unseen.parameters.guess, truth(unseen)
     y = y + 0.01 * np.random.default_rng(0).standard_normal(y.shape)
     found = identify_system(

@@ -227,7 +227,10 @@ def test_a_log_of_any_rate_is_fitted_where_engine_steps_end_at_its_rows(
 
 @pytest.mark.parametrize(
     ("rate", "remedy"),
-    [(125, 'timestep="0.008", and rate = 125'), (1000, 'timestep="0.001", and rate = 1000')],
+    [
+        (125, 'timestep="0.008", and rate = 125'),
+        pytest.param(1000, 'timestep="0.001", and rate = 1000', marks=pytest.mark.slow),
+    ],
 )
 def test_a_log_with_jumps_inside_engine_steps_is_a_misfit_with_its_remedy(
     rate: int, remedy: str, tmp_path: Path

@@ -47,7 +47,7 @@ from mjfim.studies.compare import _MethodRun
 from tests.support.baselines import pendulum, played
 from tests.support.paths import MODELS
 
-STEPS = 120_000
+STEPS = 40_000
 
 # One method of each kind that runs without `-m slow`: a sweep, random steps, a series, a series
 # refined by mjfim.
@@ -198,7 +198,7 @@ def test_seconds_end_a_search() -> None:
 
 def test_a_budget_of_steps_makes_it_repeatable() -> None:
     first, again, other = (
-        run_baseline(order(pendulum(), "chirp", steps=30_000, seed=s)) for s in (4, 4, 5)
+        run_baseline(order(pendulum(), "chirp", steps=8_000, seed=s)) for s in (4, 4, 5)
     )
     assert first.control is not None
     assert other.control is not None
@@ -232,7 +232,7 @@ def test_workers_share_the_steps() -> None:
 def test_excitations_lead_from_rest_to_rest_without_jumps(method: str) -> None:
     experiment = arm(bandwidth=6.0)
     task = DesignTask.resolve(experiment)
-    result = run_baseline(order(experiment, method, steps=400_000))
+    result = run_baseline(order(experiment, method, steps=100_000))
     assert result.control is not None
     assert np.isfinite(result.cost)
     padded = np.concatenate([task.initial_hold[None], result.control, task.initial_hold[None]])
@@ -251,7 +251,7 @@ def test_limits_that_no_control_keeps_show_in_a_negative_margin() -> None:
         initial={"keyframe": None, "qpos": (0.0, 1.0), "qvel": (0.0, 0.0)},
         boundary={"end": "periodic", "position": 1e-5, "velocity": 1e-5},
     )
-    result = run_baseline(order(swinging, "chirp", steps=40_000))
+    result = run_baseline(order(swinging, "chirp", steps=10_000))
     assert result.cost == np.inf
     assert result.margin < 0.0
     assert result.control is not None
@@ -318,6 +318,7 @@ def test_slopes_for_scipy_are_the_derivatives() -> None:
         )
 
 
+@pytest.mark.slow
 def test_many_runs_end_with_the_budget_and_the_best_one_reaches_the_smallest_barrier_weight() -> (
     None
 ):
@@ -343,7 +344,7 @@ def test_many_runs_end_with_the_budget_and_the_best_one_reaches_the_smallest_bar
 def test_the_best_control_of_a_search_never_becomes_worse() -> None:
     costs: list[float] = []
     evaluator = ControlEvaluator(
-        search=order(pendulum(), "steps", steps=60_000),
+        search=order(pendulum(), "steps", steps=20_000),
         callback=lambda used, best: costs.append(best.cost),
     )
     random_search(evaluator, RandomSteps)

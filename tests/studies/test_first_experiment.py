@@ -511,12 +511,12 @@ def test_wishes_are_fulfilled(tmp_path: Path) -> None:
     wished: dict[str, object] = {
         "keyframe": "settled",
         "groups": ("friction",),
-        "rate": 250.0,
-        "horizon": 1.0,
+        "rate": 125.0,
+        "horizon": 0.4,
     }
     proposal, experiment = proposed(MODELS / "servo_arm.xml", tmp_path, **wished)
     assert proposal.start.keyframe == experiment.initial.keyframe == "settled"
-    assert (experiment.rate, experiment.horizon) == (250.0, 1.0)
+    assert (experiment.rate, experiment.horizon) == (125.0, 0.4)
     assert {each.group for each in proposal.chosen} == {"friction"}
 
     # Noise is wished by kind of coordinate, where the MJCF states none.

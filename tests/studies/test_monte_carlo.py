@@ -15,6 +15,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify, identify_system
 from mjfim.records.events import Event, StudyEvent
 from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
 from mjfim.studies import monte_carlo as monte_carlo_module
 from mjfim.studies.monte_carlo import _statistics, monte_carlo, monte_carlo_system
 from tests.support.paths import ROOT
@@ -33,9 +34,27 @@ def design(experiment: Experiment) -> mjfim.Design:
     return mjfim.design(experiment)
 
 
+@pytest.fixture(scope="module")
+def curve(experiment: Experiment) -> Trajectory:
+    """The initial trajectory."""
+    return DesignTask.resolve(experiment).initial
+
+
+@pytest.fixture(scope="module")
+def short(experiment: Experiment) -> Experiment:
+    """The experiment over one second."""
+    return experiment.replace(horizon=1.0)
+
+
+@pytest.fixture(scope="module")
+def motion(short: Experiment) -> Trajectory:
+    """The initial trajectory of the short experiment."""
+    return DesignTask.resolve(short).initial
+
+
 @pytest.mark.slow
-def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Design) -> None:
-    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+def test_study_of_the_paper_at_25_hz(experiment: Experiment, curve: Trajectory) -> None:
+    curves = {"initial": design.initial.trajectory, "final": curve}
     study = monte_carlo(experiment, curves, trials=1500, seed=0, measure_rate=25.0)
     for s in study.sets.values():
         assert s.failed == 0
@@ -48,9 +67,7 @@ def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Desig
 
 
 @pytest.mark.slow
-def test_each_trial_is_a_least_squares_estimate(
-    experiment: Experiment, design: mjfim.Design
-) -> None:
+def test_each_trial_is_a_least_squares_estimate(experiment: Experiment, curve: Trajectory) -> None:
     study = monte_carlo(
         experiment, {"initial": design.initial.trajectory}, trials=20, seed=5, measure_rate=25.0
     )
@@ -72,9 +89,9 @@ def test_each_trial_is_a_least_squares_estimate(
         )
 
 
-def test_the_seed_determines_the_result(experiment: Experiment, design: mjfim.Design) -> None:
+def test_the_seed_determines_the_result(short: Experiment, motion: Trajectory) -> None:
     runs = [
-        monte_carlo(experiment, design.trajectory, trials=3, seed=seed).sets["final"].estimates
+        monte_carlo(short, motion, trials=3, seed=seed).sets["final"].estimates
         for seed in (1, 1, 2)
     ]
     np.testing.assert_array_equal(runs[0], runs[1])
@@ -109,13 +126,11 @@ def test_failed_trials_are_counted_not_averaged() -> None:
 
 
 def test_simulated_noise_is_white_gaussian_of_the_stated_size(
-    experiment: Experiment, design: mjfim.Design
+    experiment: Experiment, curve: Trajectory
 ) -> None:
     task = DesignTask.resolve(experiment)
-    exact, _ = task.plant.measure(task.parameters.true[None], design.trajectory.ctrl)
-    residual = (
-        (simulate_system(task.system, design.trajectory, seed=9).y - exact[0]) / 0.05
-    ).ravel()
+    exact, _ = task.plant.measure(task.parameters.true[None], curve.ctrl)
+    residual = ((simulate_system(task.system, curve, seed=9).y - exact[0]) / 0.05).ravel()
     assert 0.001 < chi2.cdf(residual @ residual, residual.size) < 0.999
     assert kstest(residual, norm.cdf).pvalue > 1e-3
 
@@ -131,12 +146,12 @@ VARIED = {
 
 
 def test_simulated_noise_is_correlated_and_sampled_as_stated(
-    experiment: Experiment, design: mjfim.Design
+    experiment: Experiment, curve: Trajectory
 ) -> None:
     task = DesignTask.resolve(experiment.replace(**VARIED))
-    exact, _ = task.plant.measure(task.parameters.true[None], design.trajectory.ctrl)
+    exact, _ = task.plant.measure(task.parameters.true[None], curve.ctrl)
     residuals = np.stack(
-        [simulate_system(task.system, design.trajectory, seed=s).y - exact[0] for s in range(8)]
+        [simulate_system(task.system, curve, seed=s).y - exact[0] for s in range(8)]
     )
     for i, stride in enumerate(task.system.noise.strides):
         np.testing.assert_array_equal(
@@ -154,12 +169,12 @@ def test_simulated_noise_is_correlated_and_sampled_as_stated(
 
 @pytest.mark.slow
 def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estimates(
-    experiment: Experiment, design: mjfim.Design
+    experiment: Experiment, curve: Trajectory
 ) -> None:
     task = DesignTask.resolve(
         experiment.replace(**VARIED, nuisance={"bias": {"qpos:slide": 0.05}, "delay": 0.01})
     )
-    curve = design.trajectory
+    curve = curve
     study = monte_carlo_system(task.system, {"final": curve}, trials=6, seed=5)
     exact, _ = task.plant.measure(task.parameters.true[None], curve.ctrl)
     mask = task.system.noise.measured(400) > 0
@@ -187,29 +202,29 @@ def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estim
 
 
 def test_simulation_measures_at_the_measurement_rate(
-    experiment: Experiment, design: mjfim.Design
+    experiment: Experiment, curve: Trajectory
 ) -> None:
-    y = mjfim.simulate(experiment.replace(measure_rate=25.0), design.trajectory, seed=0).y
+    y = mjfim.simulate(experiment.replace(measure_rate=25.0), curve, seed=0).y
     measured = np.isfinite(y).all(axis=1)
     assert np.array_equal(np.flatnonzero(measured), np.arange(0, 401, 4))
 
 
-def test_too_few_trials_are_refused(experiment: Experiment, design: mjfim.Design) -> None:
+def test_too_few_trials_are_refused(experiment: Experiment, curve: Trajectory) -> None:
     with pytest.raises(ExperimentError, match="at least 2"):
-        monte_carlo(experiment, design.trajectory, trials=1)
+        monte_carlo(experiment, curve, trials=1)
 
 
 def test_a_parameter_that_only_its_prior_determines_is_named(
-    design: mjfim.Design, experiment: Experiment
+    curve: Trajectory, experiment: Experiment
 ) -> None:
     blind = {"target": "body/cart:inertia[0]", "guess": 0.01, "prior": 1e-4}
     with pytest.raises(UnidentifiableError, match="blind: no effect"):
-        monte_carlo(experiment.replace(parameters={"blind": blind}), design.trajectory, trials=4)
+        monte_carlo(experiment.replace(parameters={"blind": blind}), curve, trials=4)
 
 
-def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experiment) -> None:
-    sure = experiment.replace(parameters={"m": {"prior": 1e-6}})
-    plain, prior = (monte_carlo(e, design.trajectory, trials=3, seed=1) for e in (experiment, sure))
+def test_priors_do_not_enter_the_study(short: Experiment, motion: Trajectory) -> None:
+    sure = short.replace(parameters={"m": {"prior": 1e-6}})
+    plain, prior = (monte_carlo(e, motion, trials=3, seed=1) for e in (short, sure))
     np.testing.assert_allclose(
         plain.sets["final"].estimates, prior.sets["final"].estimates, rtol=1e-9
     )
@@ -218,10 +233,10 @@ def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experim
 
 @pytest.mark.slow
 def test_a_request_to_stop_keeps_the_finished_trials(
-    design: mjfim.Design, experiment: Experiment, monkeypatch: pytest.MonkeyPatch
+    curve: Trajectory, experiment: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(monte_carlo_module, "MIN_CHUNK", 64)
-    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+    curves = {"initial": design.initial.trajectory, "final": curve}
     token = StopToken()
 
     def stop_in_the_third_chunk(event: StudyEvent) -> None:
@@ -241,10 +256,8 @@ def test_a_request_to_stop_keeps_the_finished_trials(
     )
 
 
-def test_a_request_to_stop_keeps_the_finished_sets(
-    design: mjfim.Design, experiment: Experiment
-) -> None:
-    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+def test_a_request_to_stop_keeps_the_finished_sets(short: Experiment, motion: Trajectory) -> None:
+    curves = {"initial": motion, "final": motion}
     token = StopToken()
     events: list[StudyEvent] = []
 
@@ -254,7 +267,7 @@ def test_a_request_to_stop_keeps_the_finished_sets(
         if event.part == "final":
             token.request()
 
-    study = monte_carlo(experiment, curves, trials=6, callback=stop_in_the_second_set, stop=token)
+    study = monte_carlo(short, curves, trials=6, callback=stop_in_the_second_set, stop=token)
     assert set(study.sets) == {"initial"}
     assert [event.share for event in events if event.part == "initial"][-1] == 1.0
     assert {(event.index, event.count) for event in events} == {(0, 2), (1, 2)}

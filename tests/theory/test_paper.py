@@ -73,12 +73,12 @@ def test_gradient_of_the_information_term() -> None:
 @pytest.mark.parametrize(
     ("case", "starts"),
     [
-        ("a", 1),
         ("b", 1),
         ("c", 1),
-        ("d", 1),
-        pytest.param("e", 4, marks=pytest.mark.slow),
-        pytest.param("f", 1, marks=pytest.mark.slow),
+        *(
+            pytest.param(case, starts, marks=pytest.mark.slow)
+            for case, starts in (("a", 1), ("d", 1), ("e", 4), ("f", 1))
+        ),
     ],
 )
 def test_the_design_reaches_the_best_known_cost(case: str, starts: int) -> None:
@@ -144,7 +144,8 @@ def casadi_solvers() -> ModuleType:
     return importlib.import_module("scripts.benchmarks.casadi_peer")
 
 
-@pytest.mark.parametrize("case", [pytest.param("b", marks=pytest.mark.slow), "c"])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["b", "c"])
 def test_the_optimum_agrees_with_exact_derivatives_of_the_hand_derived_model(
     casadi_solvers: ModuleType, case: str
 ) -> None:
