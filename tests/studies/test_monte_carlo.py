@@ -53,8 +53,8 @@ def motion(short: Experiment) -> Trajectory:
 
 
 @pytest.mark.slow
-def test_study_of_the_paper_at_25_hz(experiment: Experiment, curve: Trajectory) -> None:
-    curves = {"initial": design.initial.trajectory, "final": curve}
+def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Design) -> None:
+    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     study = monte_carlo(experiment, curves, trials=1500, seed=0, measure_rate=25.0)
     for s in study.sets.values():
         assert s.failed == 0
@@ -67,7 +67,9 @@ def test_study_of_the_paper_at_25_hz(experiment: Experiment, curve: Trajectory) 
 
 
 @pytest.mark.slow
-def test_each_trial_is_a_least_squares_estimate(experiment: Experiment, curve: Trajectory) -> None:
+def test_each_trial_is_a_least_squares_estimate(
+    experiment: Experiment, design: mjfim.Design
+) -> None:
     study = monte_carlo(
         experiment, {"initial": design.initial.trajectory}, trials=20, seed=5, measure_rate=25.0
     )
@@ -169,12 +171,12 @@ def test_simulated_noise_is_correlated_and_sampled_as_stated(
 
 @pytest.mark.slow
 def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estimates(
-    experiment: Experiment, curve: Trajectory
+    experiment: Experiment, design: mjfim.Design
 ) -> None:
     task = DesignTask.resolve(
         experiment.replace(**VARIED, nuisance={"bias": {"qpos:slide": 0.05}, "delay": 0.01})
     )
-    curve = curve
+    curve = design.trajectory
     study = monte_carlo_system(task.system, {"final": curve}, trials=6, seed=5)
     exact, _ = task.plant.measure(task.parameters.true[None], curve.ctrl)
     mask = task.system.noise.measured(400) > 0
@@ -233,10 +235,10 @@ def test_priors_do_not_enter_the_study(short: Experiment, motion: Trajectory) ->
 
 @pytest.mark.slow
 def test_a_request_to_stop_keeps_the_finished_trials(
-    curve: Trajectory, experiment: Experiment, monkeypatch: pytest.MonkeyPatch
+    design: mjfim.Design, experiment: Experiment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(monte_carlo_module, "MIN_CHUNK", 64)
-    curves = {"initial": design.initial.trajectory, "final": curve}
+    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     token = StopToken()
 
     def stop_in_the_third_chunk(event: StudyEvent) -> None:
