@@ -5,9 +5,9 @@ result and its length are kept, so that the same work can be scheduled again on 
 workers within seconds. What is simulated is the time alone: the scheduler (`mjfim.parallel`, and
 what decides between slices of searches) is that of the package, and what the caller computes
 between tasks counts with its measured CPU time, during which the workers go on. So does the time in
-which it pickles orders and unpickles results. Beyond that, a cluster needs the latency, and the
-time in which each of its workers resolves the experiment at its first task: here one task does this
-for all of them.
+which it pickles orders and unpickles results, which is measured once for equal tasks. Beyond that,
+a cluster needs the latency, and the time in which each of its workers resolves the experiment at
+its first task: here one task does this for all of them.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ from unittest.mock import patch
 
 from mjfim.parallel import Workers, dispatch
 
+# Number of times that an order is pickled, and its result unpickled, to measure how long it takes.
+PICKLED_TIMES = 3
+
 
 @dataclass(kw_only=True)
 class MeasuredTasks:
@@ -34,10 +37,13 @@ class MeasuredTasks:
     Attributes:
         key_of: Key of a task by its arguments; tasks with the same key have the same result.
         kept: Result and CPU time [s] by key.
+        pickling: CPU times in which the caller pickles the order and unpickles the result [s], by
+            key.
     """
 
     key_of: Callable[[tuple[Any, ...]], Hashable] = pickle.dumps
     kept: dict[Hashable, tuple[Any, float]] = field(default_factory=dict)
+    pickling: dict[Hashable, tuple[float, float]] = field(default_factory=dict)
 
     def done(self, fn: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, float]:
         """Result of a task and its CPU time [s].
@@ -53,6 +59,46 @@ class MeasuredTasks:
             self.kept[key] = result, time.process_time() - begun
         return self.kept[key]
 
+    def pickled(
+        self, fn: Callable[..., Any], args: tuple[Any, ...], result: Any
+    ) -> tuple[float, float]:
+        """CPU times in which the caller pickles an order and unpickles its result [s].
+
+        Args:
+            fn: Function of the task.
+            args: Its arguments.
+            result: Its result.
+        """
+        key = self.key_of(args)
+        if key not in self.pickling:
+            sent = pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
+            self.pickling[key] = (
+                _mean_time(lambda: pickle.dumps((fn, args), pickle.HIGHEST_PROTOCOL)),
+                _mean_time(lambda: pickle.loads(sent)),
+            )
+        return self.pickling[key]
+
+
+def _mean_time(action: Callable[[], object]) -> float:
+    """CPU time of an action, the mean of some runs [s]."""
+    begun = time.process_time()
+    for _ in range(PICKLED_TIMES):
+        action()
+    return (time.process_time() - begun) / PICKLED_TIMES
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Arrival:
+    """Result of a task on its way.
+
+    Attributes:
+        result: The result.
+        receiving: CPU time in which the caller unpickles it [s].
+    """
+
+    result: Any
+    receiving: float
+
 
 class SimulatedCluster(Executor):
     """An executor whose tasks end on a simulated clock.
@@ -67,6 +113,7 @@ class SimulatedCluster(Executor):
         now: Simulated time [s].
         busy: Length of all tasks together [s].
         caller: CPU time of the caller between the tasks, such as for choosing survivors [s].
+        pickling: The part of it in which orders are pickled and results unpickled [s].
         searching: Time from the submission of the first task to the arrival of the last one [s].
         count: Number of tasks.
     """
@@ -76,13 +123,14 @@ class SimulatedCluster(Executor):
         self.now = 0.0
         self.busy = 0.0
         self.caller = 0.0
+        self.pickling = 0.0
         self.searching = 0.0
         self.count = 0
         self._first: float | None = None
         self._tasks = tasks
         self._latency = latency
         self._free_at = [0.0] * count
-        self._running: list[tuple[float, int, Future[Any], bytes]] = []
+        self._running: list[tuple[float, int, Future[Any], _Arrival]] = []
         self._submitted = 0
         self._mark = time.process_time()
 
@@ -95,10 +143,10 @@ class SimulatedCluster(Executor):
         """Submit a task to the worker that is free first."""
         if kwargs:
             raise TypeError("a simulated task takes no keywords")
-        pickle.dumps((fn, args), pickle.HIGHEST_PROTOCOL)
         self.account()
         result, seconds = self._tasks.done(fn, args)
-        sent = pickle.dumps(result, pickle.HIGHEST_PROTOCOL)
+        sending, receiving = self._tasks.pickled(fn, args, result)
+        self._pickle(sending)
         self.count += 1
         self._mark = time.process_time()
 
@@ -110,7 +158,8 @@ class SimulatedCluster(Executor):
         self.busy += seconds
 
         future: Future[Any] = Future()
-        heapq.heappush(self._running, (end + self._latency, self._submitted, future, sent))
+        arrival = _Arrival(result=result, receiving=receiving)
+        heapq.heappush(self._running, (end + self._latency, self._submitted, future, arrival))
         self._submitted += 1
         return future
 
@@ -125,14 +174,19 @@ class SimulatedCluster(Executor):
         """Move the clock on to the end of the next task, which then has its result."""
         self.account()
         if self._running:
-            end, _, future, sent = heapq.heappop(self._running)
+            end, _, future, arrival = heapq.heappop(self._running)
             self.now = max(self.now, end)
             self.searching = self.now - (self._first or 0.0)
-            self._mark = time.process_time()
+            self._pickle(arrival.receiving)
             if future.set_running_or_notify_cancel():
-                future.set_result(pickle.loads(sent))
-        else:
-            self._mark = time.process_time()
+                future.set_result(arrival.result)
+        self._mark = time.process_time()
+
+    def _pickle(self, seconds: float) -> None:
+        """Move the clock on by the time in which the caller pickles or unpickles [s]."""
+        self.now += seconds
+        self.caller += seconds
+        self.pickling += seconds
 
 
 class _SimulatedQueue:

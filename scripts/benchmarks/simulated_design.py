@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,9 @@ class Efficiency:
         of_searches: The same from the first task to the last one, without what the caller does
             before and after them.
         caller: CPU time of the caller, whom all workers wait for if it is busy [s].
+        pickling: The part of it in which orders are pickled and results unpickled [s].
         tasks: Number of tasks.
+        task_seconds: Mean length of a task [s].
     """
 
     workers: int
@@ -45,11 +47,15 @@ class Efficiency:
     efficiency: float
     of_searches: float
     caller: float
+    pickling: float
     tasks: int
+    task_seconds: float
 
 
-def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterator[Efficiency]:
-    """Schedule a design from many starts on 1, 2, 4 and more workers.
+def efficiencies(
+    experiment: mjfim.Experiment, starts: int, counts: Sequence[int]
+) -> Iterator[Efficiency]:
+    """Schedule a design from many starts on one worker and on more.
 
     The searches from the initial controls that the experiment states are carried out once. Every
     further start takes as long as one of them, and finds the same.
@@ -58,7 +64,7 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterat
         experiment: Experiment under hard limits; its number of starts is that of the searches that
             are carried out.
         starts: Number of starts that are scheduled.
-        most: Largest number of workers, a power of 2.
+        counts: Numbers of workers.
 
     Yields:
         The efficiency on each number of workers.
@@ -68,7 +74,7 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterat
 
     # One worker carries out all tasks, the others schedule them again.
     alone = _simulated_seconds(task, tasks, starts, 1)
-    for number in (2**k for k in range(most.bit_length())):
+    for number in counts:
         found = alone if number == 1 else _simulated_seconds(task, tasks, starts, number)
         yield Efficiency(
             workers=number,
@@ -76,7 +82,9 @@ def efficiencies(experiment: mjfim.Experiment, starts: int, most: int) -> Iterat
             efficiency=alone.whole / (number * found.whole),
             of_searches=found.busy / (number * found.searches),
             caller=found.caller,
+            pickling=found.pickling,
             tasks=found.tasks,
+            task_seconds=found.busy / found.tasks,
         )
 
 
@@ -89,6 +97,7 @@ class _Times:
         searches: From the first task to the last one.
         busy: All tasks together.
         caller: The caller's own work.
+        pickling: The part of it in which it pickles and unpickles.
         tasks: Number of tasks.
     """
 
@@ -96,6 +105,7 @@ class _Times:
     searches: float
     busy: float
     caller: float
+    pickling: float
     tasks: int
 
 
@@ -120,6 +130,7 @@ def _simulated_seconds(
         searches=cluster.searching,
         busy=cluster.busy,
         caller=cluster.caller,
+        pickling=cluster.pickling,
         tasks=cluster.count,
     )
 
@@ -164,23 +175,26 @@ def _start(order: ConstrainedSlice | JudgeOrder) -> InitialControl:
     return order.begun if isinstance(order, JudgeOrder) else order.search.start
 
 
-def save_curve(rows: Sequence[Efficiency], wanted: float, path: Path) -> None:
+def save_curves(curves: Mapping[str, Sequence[Efficiency]], wanted: float, path: Path) -> None:
     """Draw the efficiency over the number of workers.
 
     Args:
-        rows: The efficiencies.
+        curves: The efficiencies of each experiment, by its name.
         wanted: Efficiency that is wanted.
         path: PNG to write.
     """
     import matplotlib.pyplot as plt
 
-    workers = [row.workers for row in rows]
     figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
-    axes.semilogx(workers, [row.efficiency for row in rows], "o-", base=2, label="whole design")
-    axes.semilogx(workers, [row.of_searches for row in rows], "s--", base=2, label="searches alone")
+    for number, (name, rows) in enumerate(curves.items()):
+        workers = [row.workers for row in rows]
+        colour = f"C{number}"
+        whole, searches = [[row.efficiency for row in rows], [row.of_searches for row in rows]]
+        axes.semilogx(workers, whole, "o-", base=2, color=colour, label=name)
+        axes.semilogx(workers, searches, "s--", base=2, color=colour, label=f"{name}, searches")
+        axes.set_xticks(workers, [str(number) for number in workers])
     axes.axhline(wanted, color="0.5", lw=1.0, label=f"wanted: {wanted:g}")
     axes.set(xlabel="simulated workers", ylabel="efficiency", ylim=(0.0, 1.05))
-    axes.set_xticks(workers, [str(number) for number in workers])
     axes.legend()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
