@@ -26,6 +26,7 @@ from mjfim.excitation.levels import DescentLevel, coarse_level
 from mjfim.excitation.limited_search import LimitedSearch
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.short_budget import enlarged
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import verify
@@ -57,6 +58,7 @@ class ControlSearch:
         budget: Time of the search and the token that stops it.
         limited: Cost of controls that keep the hard limits; None without limits.
         outside: The initial control where it violates a limit; None where it keeps them.
+        is_brief: Whether the time allows few evaluations only.
     """
 
     stage: DescentLevel
@@ -65,6 +67,7 @@ class ControlSearch:
     budget: Budget
     limited: LimitedCost | None = None
     outside: OutsideStart | None = None
+    is_brief: bool = False
 
     def run(self, starts: Iterable[InitialControl]) -> Runs:
         """Yield every iterate of all runs; return their results on the stated plant."""
@@ -81,6 +84,11 @@ class ControlSearch:
 
         levels = [DescentLevel(level, basis) for level in tasks]
 
+        # Without a coarse level an iteration takes several evaluations, and a larger control often
+        # costs less.
+        if self.is_brief and coarse is None:
+            starts = self._enlarged(list(starts))
+
         # Starts without limits are independent of each other.
         if self.executor is not None and not task.is_limited:
             starts = list(starts)
@@ -95,6 +103,15 @@ class ControlSearch:
         )
         return (yield from search.run_all(starts))
 
+    def _enlarged(self, starts: list[InitialControl]) -> list[InitialControl]:
+        """The starts, of which the initial control is enlarged if it keeps all limits."""
+        start = starts[0]
+        is_initial = start.control is self.stage.task.control
+        if self.limited is None or self.outside is not None or not is_initial:
+            return starts
+        control = enlarged(self.limited, start.control, self.first.cost, self.budget)
+        return [replace(start, control=control), *starts[1:]]
+
     def _run_within_limits(self, starts: list[InitialControl], limited: LimitedCost) -> Runs:
         """Optimise under hard limits.
 
@@ -103,7 +120,8 @@ class ControlSearch:
         results: list[RunResult] = []
         steps_without_barrier = 0
 
-        if _is_bounded_by_weights(self.stage.task):
+        is_bounded = _is_bounded_by_weights(self.stage.task)
+        if is_bounded:
             results = yield from self._run_without_barrier(starts)
             if not results[-1].left_limits:
                 return results
@@ -128,6 +146,7 @@ class ControlSearch:
             executor=self.executor,
             budget=self.budget,
             first=self.first,
+            is_brief=self.is_brief and not is_bounded,
         )
         constrained = yield from search.run(starts, inside)
         results += self._not_worse(self._evaluated(constrained), inside)
@@ -146,6 +165,10 @@ class ControlSearch:
             return False
         if self.limited is not None and self.limited.level.task.system.variant.smoothing_speeds:
             return True
+
+        # The check takes as long as an evaluation of the cost.
+        if self.is_brief and not _is_bounded_by_weights(task):
+            return False
 
         # Derivatives exist where nothing touches, rubs, stops or clamps.
         model = task.system.model_at(task.theta)

@@ -21,6 +21,7 @@ from mjfim.excitation.release_search import ReleaseSearch
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.sample_workers import SampleWorkers
+from mjfim.excitation.short_budget import allows_few_evaluations
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start
 from mjfim.experiment.schema import Experiment
@@ -137,7 +138,9 @@ def design_task(
     steps_before = task.plant.engine_steps
 
     # Evaluate the initial control and find the combinations that can be identified.
+    evaluated = budget.seconds_used
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
+    is_brief = allows_few_evaluations(budget, budget.seconds_used - evaluated)
     if initial_control is not None:
         initial_control = _checked_control(task, initial_control)
     starts = list(initial_controls_of(task, initial_control))
@@ -160,6 +163,7 @@ def design_task(
         budget=budget,
         limited=limited,
         outside=outside,
+        is_brief=is_brief,
     )
     results = consume(search.run(starts), callback)
     interrupted = budget.stop.requested

@@ -54,6 +54,7 @@ class LimitedSearch:
         budget: Time of the search and the token that stops it.
         first: The experiment's initial control, evaluated on the unmodified plant; None where it is
             not known.
+        is_brief: Whether the time allows few evaluations only.
     """
 
     limited: LimitedCost
@@ -61,6 +62,7 @@ class LimitedSearch:
     executor: ExecutorLike | None
     budget: Budget
     first: DesignPoint | None = None
+    is_brief: bool = False
 
     def run(self, starts: list[InitialControl], inside: InsideControl | None) -> Runs:
         """Descend from several starts, and change controls at random where that gains more.
@@ -118,7 +120,11 @@ class LimitedSearch:
         else:
             coarse = None if done else easier_level(free, self.first)
             search = Multistart(
-                searches=searches, starts=starts, coarse=coarse, iterations_done=done
+                searches=searches,
+                starts=starts,
+                coarse=coarse,
+                is_brief=self.is_brief,
+                iterations_done=done,
             )
         constrained = yield from search.run()
         return (yield from search.tighten_winner(constrained))

@@ -20,7 +20,7 @@ from mjfim.excitation.limited_searches import SearchTerms
 from mjfim.excitation.merged_results import better_of
 from mjfim.excitation.rounds import Entry, Judge, Round
 from mjfim.excitation.run_result import RunResult
-from mjfim.excitation.stated_comparison import StatedComparison
+from mjfim.excitation.stated_comparison import LargestShare, StatedComparison
 
 # Last barrier weight mu of the first round.
 FIRST_ROUND_MU = 0.01
@@ -35,6 +35,14 @@ MU_RESTART_FACTOR = 3.0
 # Share of the iterations and of the time for the first round.
 FIRST_ROUND_SHARE = 0.5
 
+# Last barrier weight mu of the first round, and its share of the time, where the time of a design
+# allows few evaluations only. The rest of the time is for the evaluation of the result.
+BRIEF_MU = 0.03
+BRIEF_SHARE = 0.75
+
+# Number of iterations for which there has to be time before the second round of such a design.
+FEWEST_ITERATIONS = 2.0
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Multistart(LimitedRounds):
@@ -42,9 +50,12 @@ class Multistart(LimitedRounds):
 
     Attributes:
         coarse: A level that is quicker to simulate, or smoother; None without one.
+        is_brief: Whether the time allows few evaluations on the stated plant only. Most of it then
+            is for the coarse level.
     """
 
     coarse: DescentLevel | None
+    is_brief: bool = False
 
     @cached_property
     def rounds(self) -> Sequence[Round]:
@@ -54,11 +65,14 @@ class Multistart(LimitedRounds):
 
         few_starts = len(self.starts) < HALVING_RATE and self._differs_by_timestep_only
         last_mu = FEW_STARTS_MU if few_starts else FIRST_ROUND_MU
+        share = FIRST_ROUND_SHARE
+        if self._is_coarse_only:
+            last_mu, share = BRIEF_MU, BRIEF_SHARE
         first = Round(
             level=self.coarse or self.searches.stated,
             last_mu=last_mu,
             next_mu=min(MU_RESTART_FACTOR * last_mu, FIRST_ROUND_MU),
-            share=FIRST_ROUND_SHARE,
+            share=share,
         )
         return [first, Round(level=self.searches.stated)]
 
@@ -76,7 +90,19 @@ class Multistart(LimitedRounds):
         """Who judges the result of a start, see `RoundPlan`."""
         is_last = entry.round == len(self.rounds) - 1
         is_stated = self.coarse is None and all(start.repeats == 1 for start in self.starts)
-        return None if is_last or is_stated else StatedComparison()
+        if is_last or is_stated:
+            return None
+        return LargestShare() if self._is_coarse_only else StatedComparison()
+
+    def may_begin(self, entry: Entry, *, has_feasible: bool) -> bool:
+        """Check whether there is time for a useful search, see `RoundPlan`."""
+        if not (self._is_coarse_only and has_feasible):
+            return True
+
+        # An iteration on the stated level takes longer, in proportion to its engine steps.
+        task = self.searches.stated.task
+        iteration = entry.seconds_per_step * task.samples * task.system.grid.substeps
+        return self.searches.budget.seconds_left >= FEWEST_ITERATIONS * iteration
 
     def late(self, entry: Entry, result: RunResult, *, is_tried: bool) -> RunResult:
         """Result of a start that was not judged, see `RoundPlan`.
@@ -90,6 +116,11 @@ class Multistart(LimitedRounds):
     def merged(self, before: RunResult | None, result: RunResult) -> RunResult:
         """Result of a start after a further round, see `RoundPlan`."""
         return result if before is None else better_of(before, result)
+
+    @property
+    def _is_coarse_only(self) -> bool:
+        """True where there is hardly any time for the stated level, but a coarse one."""
+        return self.is_brief and self.coarse is not None
 
     @property
     def _differs_by_timestep_only(self) -> bool:

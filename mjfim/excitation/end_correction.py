@@ -1,0 +1,81 @@
+"""Small changes of a control that bring the end of its motion back to its target.
+
+A motion that was optimised on a coarse level ends a little beside its target on the stated plant.
+Its tolerances there are narrow, so that a share of the control that keeps them would tell little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import SimulationDivergedError
+from mjfim.excitation.constraint_kinds import ConstraintValues
+from mjfim.excitation.controls_within_limits import LimitedCost
+
+# Singular values of the reachable ends, relative to the largest one, below which they count as
+# zero: no control of reasonable size reaches these directions.
+LEAST_REACH = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EndCorrection:
+    """The smallest change of a control that moves the last state, to first order.
+
+    Attributes:
+        cost: Cost of controls that keep all limits, whose plant is linearised.
+        change: (N, nu, nv) change of the control [u-unit] for a unit of each component of the last
+            state that has a tolerance [x-unit].
+    """
+
+    cost: LimitedCost
+    change: Array
+
+    @classmethod
+    def along(cls, cost: LimitedCost, values: ConstraintValues) -> EndCorrection | None:
+        """Linearise the plant along a motion; None with a free end, or where it diverges.
+
+        Args:
+            cost: Cost of controls that keep all limits.
+            values: Limited quantities along the motion.
+        """
+        constraints, task = cost.constraints, cost.level.task
+        if constraints.end is None:
+            return None
+        try:
+            A, B, _ = task.plant.derivatives.observation_jacobians(
+                task.theta, values.trajectory, constraints.observations
+            )
+        except SimulationDivergedError:
+            return None
+
+        # Derivative of the last state by the control of each sample, in sizes of the controls.
+        bounded = np.isfinite(constraints.end.bounds.scale)
+        sizes = constraints.control.bounds.scale
+        reach = np.eye(len(bounded))[bounded]
+        by_control = np.empty((len(A), len(reach), B.shape[2]))
+        for k in reversed(range(len(A))):
+            by_control[k] = reach @ B[k] * sizes
+            reach = reach @ A[k]
+
+        # States have several units, so that each row is divided by its tolerance.
+        tolerance = constraints.end.bounds.scale[bounded]
+        flat = by_control.transpose(1, 0, 2).reshape(len(tolerance), -1) / tolerance[:, None]
+        inverse = np.linalg.pinv(flat, rcond=LEAST_REACH) / tolerance
+        change = inverse.reshape(len(A), B.shape[2], len(tolerance)) * sizes[:, None]
+        return cls(cost=cost, change=change)
+
+    def corrected(self, control: Array, values: ConstraintValues) -> Array:
+        """Change a control so that its motion ends nearer to the target.
+
+        Args:
+            control: (N, nu) control [u-unit].
+            values: Limited quantities along its motion.
+        """
+        end = self.cost.constraints.end
+        assert end is not None
+        bounded = np.isfinite(end.bounds.scale)
+        difference = end.space.minus(values.trajectory.state[-1], end.target)[bounded]
+        return np.asarray(control - self.change @ difference)
