@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import mjfim
@@ -42,11 +43,14 @@ def test_every_model_has_an_experiment() -> None:
     assert {path.stem for path in MODELS.glob("*.xml")} == {*EXAMPLES, "cart_pendulum"}
 
 
+@pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize("name", slow_except("four_bar"))
 def test_check_names_the_subject_of_the_example(name: str, tmp_path: Path) -> None:
     result = run("check", design_file(name, tmp_path), "-o", tmp_path / "out")
     assert result.exit_code in (0, 1), result.output
     told = read(tmp_path / "out" / "check.json")
+    assert told["verdict"]
+    assert np.isfinite(told["self_test"]["slope"])
     assert told["self_test"]["passed"] == (name not in ROUGH)
     if name in ROUGH:
         assert told["self_test"]["rough"]["sample"] > 0
