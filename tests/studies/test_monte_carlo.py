@@ -55,10 +55,10 @@ def motion(short: Experiment) -> Trajectory:
 @pytest.mark.slow
 def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Design) -> None:
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = monte_carlo(experiment, curves, trials=1500, seed=0, measure_rate=25.0)
+    study = monte_carlo(experiment, curves, trials=600, seed=0, measure_rate=25.0)
     for s in study.sets.values():
         assert s.failed == 0
-        assert s.trials == 1500
+        assert s.trials == 600
         np.testing.assert_allclose(np.diag(s.covariance) / np.diag(s.crlb), 1.0, atol=0.10)
         assert np.all(s.efficiency_interval[:, 0] < s.efficiency)
         assert np.all(s.efficiency < s.efficiency_interval[:, 1])
@@ -235,20 +235,18 @@ def test_priors_do_not_enter_the_study(short: Experiment, motion: Trajectory) ->
 
 @pytest.mark.slow
 def test_a_request_to_stop_keeps_the_finished_trials(
-    design: mjfim.Design, experiment: Experiment, monkeypatch: pytest.MonkeyPatch
+    short: Experiment, motion: Trajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(monte_carlo_module, "MIN_CHUNK", 64)
-    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+    curves = {"initial": motion, "final": motion}
     token = StopToken()
 
     def stop_in_the_third_chunk(event: StudyEvent) -> None:
         if event.share > 0.5:
             token.request()
 
-    everything = monte_carlo(experiment, curves, trials=256)
-    study = monte_carlo(
-        experiment, curves, trials=256, callback=stop_in_the_third_chunk, stop=token
-    )
+    everything = monte_carlo(short, curves, trials=256)
+    study = monte_carlo(short, curves, trials=256, callback=stop_in_the_third_chunk, stop=token)
 
     # 256 trials are stepped in four chunks; the initial trajectory comes first.
     assert set(study.sets) == {"initial"}
