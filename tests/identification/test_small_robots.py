@@ -125,7 +125,7 @@ def test_its_verdicts_are_the_same_in_all_sizes(
     size: str, furuta: Experiment, tmp_path: Path
 ) -> None:
     rescaled = rescale(furuta, SIZES[size], tmp_path)
-    assert_is_complete(fits(System.resolve(rescaled.experiment), SEEDS))
+    assert_is_complete(fits(System.resolve(rescaled.experiment), SEEDS[:2]))
 
 
 @pytest.mark.slow
