@@ -621,7 +621,8 @@ def several(folder: Path, **tables: Any) -> DesignTask:
     return cart_inside(folder, **{"horizon": 0.6, "descent": descent, **tables})
 
 
-@pytest.mark.parametrize("criterion", ["E", pytest.param("D", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("criterion", ["E", "D"])
 def test_starts_in_parallel_give_the_results_of_a_sequential_search(
     criterion: str, tmp_path: Path
 ) -> None:

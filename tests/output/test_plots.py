@@ -41,7 +41,7 @@ from tests.support.paths import ROOT
 # Numbers of joints and of parameters of the records that are drawn.
 SIZES = [
     (1, 1),
-    (3, 5),
+    pytest.param(3, 5, marks=pytest.mark.slow),
     pytest.param(14, 30, marks=pytest.mark.slow),
     pytest.param(1, 70, marks=pytest.mark.slow),
 ]
