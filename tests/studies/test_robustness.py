@@ -507,7 +507,7 @@ def test_without_noise_the_true_values_are_found(
         )
 
 
-RUNS, FEW = 30, 12
+RUNS, FEW = 30, 8
 
 
 def judged(
