@@ -71,7 +71,7 @@ class CoarseComparison(Judge):
         if result.control is None:
             return Judgement(result=result, following=before, is_new=False)
 
-        control = self.without_jumps(cost, np.asarray(result.control))
+        control = without_jumps(cost, np.asarray(result.control), self.sample_factor)
         found = InitialControl(name=result.name, control=control)
         point = point_without_limits(cost.level, control)
         stated = np.inf if point is None else point.cost
@@ -117,41 +117,42 @@ class CoarseComparison(Judge):
             earlier=(),
         )
 
-    def without_jumps(self, cost: LimitedCost, control: Array) -> Array:
-        """A control without steps where rates of controls are limited.
-
-        Args:
-            cost: Cost of controls that keep all limits on the stated plant.
-            control: (N, nu) control of the coarse level [u-unit].
-
-        Returns:
-            (N, nu) control [u-unit].
-        """
-        factor = self.sample_factor
-        if factor == 1 or cost.constraints.rate is None:
-            return control
-
-        # A control that consists of curves, such as a Fourier series, is smooth already.
-        values = control[::factor]
-        if not np.array_equal(control, np.repeat(values, factor, axis=0)):
-            return control
-
-        # The values of the longer samples hold at their middles.
-        middles = factor * (np.arange(len(values)) + 0.5) - 0.5
-        times = np.arange(len(control))
-        columns = [np.interp(times, middles, column) for column in values.T]
-        return np.stack(columns, axis=1)
-
     def _inside(self, cost: LimitedCost, result: RunResult) -> InsideControl | None:
         """The largest share of a control of a coarse level that keeps all limits."""
         if result.control is None:
             return None
         centre = cost.level.task.centre
-        control = self.without_jumps(cost, result.control)
+        control = without_jumps(cost, result.control, self.sample_factor)
 
         # This takes a few simulations, also after a request to stop, so that nothing is lost.
         trials = ControlsWithinLimits(cost=cost, budget=Budget())
         return trials.largest(centre, control - centre)
+
+
+def without_jumps(cost: LimitedCost, control: Array, factor: int) -> Array:
+    """A control without steps where rates of controls are limited.
+
+    Args:
+        cost: Cost of controls that keep all limits on the stated plant.
+        control: (N, nu) control of a coarse level [u-unit].
+        factor: Factor by which the samples of the level are longer.
+
+    Returns:
+        (N, nu) control [u-unit].
+    """
+    if factor == 1 or cost.constraints.rate is None:
+        return control
+
+    # A control that consists of curves, such as a Fourier series, is smooth already.
+    values = control[::factor]
+    if not np.array_equal(control, np.repeat(values, factor, axis=0)):
+        return control
+
+    # The values of the longer samples hold at their middles.
+    middles = factor * (np.arange(len(values)) + 0.5) - 0.5
+    times = np.arange(len(control))
+    columns = [np.interp(times, middles, column) for column in values.T]
+    return np.stack(columns, axis=1)
 
 
 def point_without_limits(level: DescentLevel, control: Array) -> DesignPoint | None:

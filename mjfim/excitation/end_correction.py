@@ -9,10 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.constraint_kinds import ConstraintValues
+from mjfim.excitation.bandwidth import bandwidth_basis
+from mjfim.excitation.constraint_kinds import ConstraintValues, EndStateConstraint
 from mjfim.excitation.controls_within_limits import LimitedCost
 
 # Singular values of the reachable ends, relative to the largest one, below which they count as
@@ -23,6 +25,8 @@ LEAST_REACH = 1e-6
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EndCorrection:
     """The smallest change of a control that moves the last state, to first order.
+
+    It keeps the bandwidth that the experiment states. Without one it is free at each sample.
 
     Attributes:
         cost: Cost of controls that keep all limits, whose plant is linearised.
@@ -35,11 +39,15 @@ class EndCorrection:
 
     @classmethod
     def along(cls, cost: LimitedCost, values: ConstraintValues) -> EndCorrection | None:
-        """Linearise the plant along a motion; None with a free end, or where it diverges.
+        """Linearise the plant along a motion.
 
         Args:
             cost: Cost of controls that keep all limits.
             values: Limited quantities along the motion.
+
+        Returns:
+            The correction; None with a free end, and where the motion diverges or is so unstable
+            that its derivatives overflow.
         """
         constraints, task = cost.constraints, cost.level.task
         if constraints.end is None:
@@ -52,19 +60,29 @@ class EndCorrection:
             return None
 
         # Derivative of the last state by the control of each sample, in sizes of the controls.
-        bounded = np.isfinite(constraints.end.bounds.scale)
+        bounded = _has_tolerance(constraints.end)
         sizes = constraints.control.bounds.scale
         reach = np.eye(len(bounded))[bounded]
         by_control = np.empty((len(A), len(reach), B.shape[2]))
-        for k in reversed(range(len(A))):
-            by_control[k] = reach @ B[k] * sizes
-            reach = reach @ A[k]
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in reversed(range(len(A))):
+                by_control[k] = reach @ B[k] * sizes
+                reach = reach @ A[k]
 
-        # States have several units, so that each row is divided by its tolerance.
-        tolerance = constraints.end.bounds.scale[bounded]
-        flat = by_control.transpose(1, 0, 2).reshape(len(tolerance), -1) / tolerance[:, None]
+            # A control of limited bandwidth is a sum of splines, of which only the shares are free.
+            curves = bandwidth_basis(task, task.stated_times)
+            by_share = by_control if curves is None else np.tensordot(curves.T, by_control, axes=1)
+
+            # States have several units, so that each row is divided by its tolerance.
+            tolerance = constraints.end.bounds.scale[bounded]
+            flat = by_share.transpose(1, 0, 2).reshape(len(tolerance), -1) / tolerance[:, None]
+        if not np.isfinite(flat).all():
+            return None
+
         inverse = np.linalg.pinv(flat, rcond=LEAST_REACH) / tolerance
-        change = inverse.reshape(len(A), B.shape[2], len(tolerance)) * sizes[:, None]
+        change = inverse.reshape(len(by_share), B.shape[2], len(tolerance)) * sizes[:, None]
+        if curves is not None:
+            change = np.tensordot(curves, change, axes=1)
         return cls(cost=cost, change=change)
 
     def corrected(self, control: Array, values: ConstraintValues) -> Array:
@@ -76,6 +94,10 @@ class EndCorrection:
         """
         end = self.cost.constraints.end
         assert end is not None
-        bounded = np.isfinite(end.bounds.scale)
-        difference = end.space.minus(values.trajectory.state[-1], end.target)[bounded]
-        return np.asarray(control - self.change @ difference)
+        difference = end.space.minus(values.trajectory.state[-1], end.target)
+        return np.asarray(control - self.change @ difference[_has_tolerance(end)])
+
+
+def _has_tolerance(end: EndStateConstraint) -> NDArray[np.bool_]:
+    """(nx,) True for each component of the last state that has a tolerance."""
+    return np.isfinite(end.bounds.upper)

@@ -64,6 +64,11 @@ class DescentLevel:
         )
 
     @property
+    def engine_steps(self) -> int:
+        """Number of engine steps of one simulation."""
+        return self.task.samples * self.task.system.grid.substeps
+
+    @property
     def _lumped(self) -> LumpedParameters | None:
         """Parameters whose effect follows from that of others; None where all are identifiable."""
         if self.basis is None:

@@ -17,7 +17,7 @@ from mjfim.excitation.controls_within_limits import (
     LimitedCost,
 )
 from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.levels import easier_level
+from mjfim.excitation.levels import DescentLevel, easier_level
 from mjfim.excitation.limited_rounds import LimitedRounds
 from mjfim.excitation.limited_searches import LimitedSearches
 from mjfim.excitation.merged_results import append_run
@@ -25,6 +25,7 @@ from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.random_search import LEAST_PROGRESS, PATIENCE, RandomSearch
 from mjfim.excitation.run_result import RunResult, Runs
+from mjfim.excitation.short_budget import still_allows_few_evaluations
 from mjfim.excitation.task import DesignTask
 from mjfim.parallel import ExecutorLike
 from mjfim.records.design import Status
@@ -54,7 +55,7 @@ class LimitedSearch:
         budget: Time of the search and the token that stops it.
         first: The experiment's initial control, evaluated on the unmodified plant; None where it is
             not known.
-        is_brief: Whether the time allows few evaluations only.
+        is_brief: Whether the time allows few evaluations only, by the first one.
     """
 
     limited: LimitedCost
@@ -123,11 +124,28 @@ class LimitedSearch:
                 searches=searches,
                 starts=starts,
                 coarse=coarse,
-                is_brief=self.is_brief,
+                is_brief=coarse is not None and self._is_brief_with(coarse),
                 iterations_done=done,
             )
         constrained = yield from search.run()
         return (yield from search.tighten_winner(constrained))
+
+    def _is_brief_with(self, coarse: DescentLevel) -> bool:
+        """Check by an evaluation on a quicker level whether the time allows few evaluations.
+
+        The first evaluation of a design may include work that is done once: workers start, models
+        are copied. All that is done by now.
+        """
+        ratio = self.limited.level.engine_steps / coarse.engine_steps
+        if not self.is_brief or ratio <= 1.0:
+            return False
+        if self.budget.exhausted is not None:
+            return True
+
+        begun = self.budget.seconds_used
+        coarse.problem.point(coarse.task.initial)
+        seconds = self.budget.seconds_used - begun
+        return still_allows_few_evaluations(self.budget, ratio * seconds)
 
     def _helped_by_chance(
         self,

@@ -51,7 +51,7 @@ class Multistart(LimitedRounds):
     Attributes:
         coarse: A level that is quicker to simulate, or smoother; None without one.
         is_brief: Whether the time allows few evaluations on the stated plant only. Most of it then
-            is for the coarse level.
+            is for the coarse level, if that takes fewer engine steps.
     """
 
     coarse: DescentLevel | None
@@ -92,7 +92,15 @@ class Multistart(LimitedRounds):
         is_stated = self.coarse is None and all(start.repeats == 1 for start in self.starts)
         if is_last or is_stated:
             return None
-        return LargestShare() if self._is_coarse_only else StatedComparison()
+        if self.coarse is None or not self._is_coarse_only:
+            return StatedComparison()
+
+        # The first start begins with a control that is compared with the design in the end.
+        return LargestShare(
+            budget=self.searches.budget,
+            sample_factor=self.coarse.task.system.variant.sample_factor,
+            compares_begin=entry.index > 0,
+        )
 
     def may_begin(self, entry: Entry, *, has_feasible: bool) -> bool:
         """Check whether there is time for a useful search, see `RoundPlan`."""
@@ -100,9 +108,9 @@ class Multistart(LimitedRounds):
             return True
 
         # An iteration on the stated level takes longer, in proportion to its engine steps.
-        task = self.searches.stated.task
-        iteration = entry.seconds_per_step * task.samples * task.system.grid.substeps
-        return self.searches.budget.seconds_left >= FEWEST_ITERATIONS * iteration
+        iteration = entry.seconds_per_step * self.searches.stated.engine_steps
+        left = self.searches.budget.seconds_left - self.reserved_seconds
+        return left >= FEWEST_ITERATIONS * iteration
 
     def late(self, entry: Entry, result: RunResult, *, is_tried: bool) -> RunResult:
         """Result of a start that was not judged, see `RoundPlan`.
@@ -119,8 +127,13 @@ class Multistart(LimitedRounds):
 
     @property
     def _is_coarse_only(self) -> bool:
-        """True where there is hardly any time for the stated level, but a coarse one."""
-        return self.is_brief and self.coarse is not None
+        """True where there is hardly any time for the stated level, but for a quicker one.
+
+        A level that is only smoother is not quicker.
+        """
+        if not self.is_brief or self.coarse is None:
+            return False
+        return self.coarse.engine_steps < self.searches.stated.engine_steps
 
     @property
     def _differs_by_timestep_only(self) -> bool:

@@ -205,8 +205,10 @@ class RunningRounds:
         entry = ended.entry
         rows = ended.result.history
         done = entry.done + (rows[-1].iteration + 1 if rows else 0)
+
+        # A control that is played several times was optimised over one repetition.
         task = self.level(entry).task
-        steps = task.samples * task.system.grid.substeps
+        steps = task.samples // entry.start.repeats * task.system.grid.substeps
         assert judgement.following is not None
         return Entry(
             number=self._count,

@@ -8,23 +8,18 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget
-from mjfim.excitation.constraint_kinds import ConstraintValues
+from mjfim.excitation.coarse_comparison import without_jumps
 from mjfim.excitation.controls_within_limits import (
     ControlsWithinLimits,
     InsideControl,
     LimitedCost,
 )
-from mjfim.excitation.end_correction import EndCorrection
+from mjfim.excitation.corrected_shares import CorrectedShares
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.merged_results import continued
 from mjfim.excitation.rounds import Judge, Judgement
 from mjfim.excitation.run_result import RunResult
 from mjfim.records.design import Status
-
-# Shares of a control of a coarse level that are tried with a corrected end, and the largest number
-# of corrections of each.
-SHARES = (1.0, 0.98, 0.94, 0.85, 0.72, 0.55, 0.35)
-CORRECTIONS = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,8 +58,18 @@ class StatedComparison(Judge):
 class LargestShare(Judge):
     """Replaces a control of a coarse level by a large share that keeps all limits.
 
-    The end of the motion is corrected for each share. Only one of them is evaluated.
+    The end of the motion is corrected for each share. J is evaluated once, for the largest one.
+
+    Attributes:
+        budget: Time of the whole design, and the token that stops it.
+        sample_factor: Factor by which the samples of the level are longer.
+        compares_begin: Whether the initial control of the start may cost less. That of the first
+            start is compared with the design anyway.
     """
+
+    budget: Budget
+    sample_factor: int = 1
+    compares_begin: bool = True
 
     def judged(self, cost: LimitedCost, result: RunResult, begun: InitialControl) -> Judgement:
         """Judge the result of a start.
@@ -72,56 +77,52 @@ class LargestShare(Judge):
         Args:
             cost: Cost of controls that keep all limits on the stated plant.
             result: Its result in the first round.
-            begun: Its initial control, which is not evaluated again.
+            begun: Its initial control.
 
         Returns:
-            The result with the largest share of its control and the cost of it on the stated plant.
-            The second round continues from the control itself.
+            The result with the largest share of its control, or with the initial control where that
+            costs less, and the cost on the stated plant. The second round continues from the
+            control of the coarse level itself, or from the initial control where that costs less
+            than the share.
         """
-        if result.control is None:
-            return Judgement(result=replace(result, cost=np.inf))
+        found = result.control
+        following: InitialControl | None = None
+        inside: InsideControl | None = None
+        if found is not None:
+            found = without_jumps(cost, found, self.sample_factor)
+            following = InitialControl(name=result.name, control=found)
+            inside = self._inside(cost, found)
 
-        inside = self._inside(cost, result.control)
-        following = continued(result)
-        if inside is None:
-            outside = replace(result, cost=np.inf)
-            return Judgement(result=outside, following=following, cost=result.cost)
+        best = found if inside is None else inside.control
+        best_cost = np.inf if inside is None else inside.cost
+        ranking = result.cost if inside is None else inside.cost
+
+        # The initial control often costs little where it is an earlier design, for example.
+        if self.compares_begin and not self.budget.stop.requested:
+            begin_cost = cost(begun.over_horizon)
+            if begin_cost < best_cost:
+                best, best_cost = begun.over_horizon, begin_cost
+                if inside is not None or found is None:
+                    following, ranking = InitialControl(name=result.name, control=best), begin_cost
 
         # An optimum of a coarse level is none of the stated one.
-        is_optimum = result.status.success or result.status is Status.INFEASIBLE
-        status = Status.MAX_ITERATIONS if is_optimum else result.status
-        found = replace(result, control=inside.control, cost=inside.cost, status=status)
-        return Judgement(result=found, following=following, cost=inside.cost)
+        status = result.status
+        if np.isfinite(best_cost) and (status.success or status is Status.INFEASIBLE):
+            status = Status.MAX_ITERATIONS
+        compared = replace(result, control=best, cost=best_cost, status=status)
+        return Judgement(result=compared, following=following, cost=ranking)
 
     def _inside(self, cost: LimitedCost, control: Array) -> InsideControl | None:
-        """A large share of a control that keeps all limits, with a corrected end; None without one.
+        """A large share of a control that keeps all limits; None without one.
 
         This takes a few simulations, also when the time is over, so that nothing is lost.
         """
         centre = cost.level.task.centre
-        trials = ControlsWithinLimits(cost=cost, budget=Budget())
-        correction: EndCorrection | None = None
-        for share in SHARES:
-            candidate = np.asarray(centre + share * (control - centre))
-            for _ in range(1 + CORRECTIONS):
-                values = cost.values(candidate)
-                if values is not None and cost.constraints.is_feasible(values):
-                    found = trials.inside(centre, candidate - centre, share)
-                    if found is not None:
-                        return found
-                    break
-                if values is None or not _misses_end(cost, values):
-                    break
-
-                # The change of the control hardly depends on its size.
-                correction = correction or EndCorrection.along(cost, values)
-                if correction is None:
-                    break
-                candidate = correction.corrected(candidate, values)
+        trials = ControlsWithinLimits(cost=cost, budget=self.budget)
+        if cost.constraints.end is not None:
+            shares = CorrectedShares(cost, control, self.budget.stop)
+            for found in shares.largest():
+                inside = trials.inside(centre, found.control - centre, found.share)
+                if inside is not None:
+                    return inside
         return trials.largest(centre, control - centre)
-
-
-def _misses_end(cost: LimitedCost, values: ConstraintValues) -> bool:
-    """Check whether a motion ends outside the tolerances of its target."""
-    margins = cost.constraints.margins(values)
-    return any(margin < 0.0 for kind, margin in margins.items() if kind.startswith("end_"))

@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 
 from mjfim.budget import Budget
-from mjfim.excitation.coarse_comparison import CoarseComparison, point_without_limits
+from mjfim.excitation.coarse_comparison import (
+    CoarseComparison,
+    point_without_limits,
+    without_jumps,
+)
 from mjfim.excitation.coarse_to_fine import CoarseToFine
 from mjfim.excitation.coarser_levels import coarser_levels
 from mjfim.excitation.controls_within_limits import LimitedCost
@@ -282,16 +286,16 @@ def test_runs_within_tighter_limits_are_as_sharp_as_the_result_before(
     assert schedule.follows_curvature is (last < 1e-4)
 
 
-def test_only_staircases_are_smoothed(comparison: CoarseComparison) -> None:
+def test_only_staircases_are_smoothed() -> None:
     limited = LIMITS.replace(limits={"control_rate": 5.0})
     fine = DescentLevel(DesignTask.resolve(limited, threads=1).relaxed(), None)
     cost = LimitedCost(level=fine)
     assert cost.constraints.rate is not None
 
     curve = np.sin(np.arange(fine.task.samples) / 9.0)[:, None]
-    assert comparison.without_jumps(cost, curve) is curve
+    assert without_jumps(cost, curve, 8) is curve
     stairs = np.repeat(curve[::8], 8, axis=0)
-    smooth = comparison.without_jumps(cost, stairs)
+    smooth = without_jumps(cost, stairs, 8)
     assert np.abs(np.diff(smooth, axis=0)).max() < 0.3 * np.abs(np.diff(stairs, axis=0)).max()
 
 

@@ -10,23 +10,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from mjfim.budget import Budget, measured_by
-from mjfim.excitation.controls_within_limits import ControlsWithinLimits, LimitedCost
+from mjfim.excitation.controls_within_limits import LimitedCost
 from mjfim.excitation.design import design_task
-from mjfim.excitation.end_correction import EndCorrection
-from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.run_result import RunResult
-from mjfim.excitation.short_budget import allows_few_evaluations
-from mjfim.excitation.stated_comparison import LargestShare
+from mjfim.excitation.multistart import Multistart
+from mjfim.excitation.objective import DesignProblem
+from mjfim.excitation.short_budget import allows_few_evaluations, enlarged
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import StepCount
 from mjfim.records.design import Status
-from tests.support.limits import ARM, cart_inside
-from tests.support.numerics import make_task
+from tests.support.limits import cart_inside
+from tests.support.resting_arm import resting_arm
 from tests.support.stiff_servos import stiff_arm_task
 
 # Speed of the simulation on this clock [engine steps / s].
@@ -112,36 +109,6 @@ def test_a_design_uses_its_time_and_not_much_more(
 
 # ---- time for few evaluations
 
-# An arm that has to come to rest, whose initial control leaves its limits by far.
-RESTING_ARM = {
-    "horizon": 1.0,
-    "rate": 100.0,
-    "parameters": {
-        "m": {"target": "body/fore:mass"},
-        "c": {"target": "joint/elbow:damping"},
-        "a": {"target": "joint/shoulder:armature"},
-    },
-    "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
-    "boundary": {"end": "rest", "position": 1e-3, "velocity": 1e-2},
-    "limits": {
-        "position": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
-        "velocity": 6.0,
-        "control_rate": 20.0,
-    },
-    "initial": {
-        "control": {
-            "kind": "sine",
-            "amplitude": {"shoulder": 0.1, "elbow": 0.1},
-            "frequency": 1.0,
-        }
-    },
-}
-
-
-def resting_arm(folder: Path, descent: dict[str, Any]) -> DesignTask:
-    """An arm from rest to rest with five engine steps in each sample."""
-    return make_task(ARM, folder, **{**RESTING_ARM, "descent": descent})
-
 
 def small_control(folder: Path, descent: dict[str, Any]) -> DesignTask:
     """A control far within its limits, with a weight."""
@@ -171,29 +138,53 @@ def test_iterations_alone_never_make_a_design_brief() -> None:
     assert not allows_few_evaluations(Budget(seconds=10.0), 0.1)
 
 
-def test_a_control_that_misses_the_end_a_little_keeps_nearly_all_of_its_size(
-    tmp_path: Path,
+def test_work_that_is_done_once_does_not_make_a_design_brief(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Without the correction, no share of the control keeps the tolerances."""
-    task = resting_arm(tmp_path, {})
-    cost = LimitedCost(level=DescentLevel(task.relaxed(), None))
-    missing = task.centre + 0.5 * (task.control - task.centre)
-    values = cost.values(missing)
-    assert values is not None and cost.constraints.end is not None
-    before = cost.constraints.relative_margins(values)["end_velocity"]
-    assert before < -1.0
+    """Workers that start, for example, belong to the first evaluation only."""
 
-    correction = EndCorrection.along(cost, values)
-    assert correction is not None
-    corrected = cost.values(correction.corrected(missing, values))
-    assert corrected is not None
-    assert cost.constraints.relative_margins(corrected)["end_velocity"] > 0.5
-    assert cost.constraints.relative_margins(corrected)["end_position"] > 0.5
+    class Known(Exception):
+        """Ends a design when it is known whether its time allows few evaluations."""
 
-    found = RunResult(name="x", control=missing, cost=1.0)
-    result = LargestShare().judged(cost, found, InitialControl(name="x", control=missing)).result
-    centre = task.centre
-    plain = ControlsWithinLimits(cost=cost, budget=Budget()).largest(centre, missing - centre)
-    assert plain is None
-    assert result.control is not None and cost(result.control) == result.cost
-    assert np.linalg.norm(result.control - centre) > 0.5 * np.linalg.norm(missing - centre)
+    seconds: list[float] = []
+    now = [0.0]
+    evaluate = DesignProblem.point
+
+    def timed(*args: Any, **keys: Any) -> Any:
+        """Evaluate in the next number of seconds, of which the last one remains."""
+        now[0] += seconds.pop(0) if len(seconds) > 1 else seconds[0]
+        return evaluate(*args, **keys)
+
+    def begun(search: Multistart) -> None:
+        """Tell whether the time allows few evaluations."""
+        raise Known(search.is_brief)
+
+    monkeypatch.setattr(DesignProblem, "point", timed)
+    monkeypatch.setattr(Multistart, "run", begun)
+    task = resting_arm(tmp_path, {"seconds": 100.0})
+    for later, is_brief in ((0.01, False), (2.0, True)):
+        seconds[:] = [10.0, later]
+        with measured_by(lambda: now[0]), pytest.raises(Known) as known:
+            design_task(task)
+        assert known.value.args == (is_brief,)
+
+
+@pytest.mark.parametrize(("seconds", "trials"), [(0.1, 1), (9.0, 3)])
+def test_a_single_larger_control_is_tried_where_trials_are_quick(
+    seconds: float, trials: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    limited = LimitedCost(level=DescentLevel(small_control(tmp_path, {}).relaxed(), None))
+    now, costs = [0.0], [3.0, 2.0, 4.0]
+
+    def timed(cost: LimitedCost, control: Any) -> float:
+        """Evaluate in some seconds."""
+        now[0] += seconds
+        return costs.pop(0)
+
+    monkeypatch.setattr(LimitedCost, "__call__", timed)
+    task = limited.level.task
+    with measured_by(lambda: now[0]):
+        larger = enlarged(limited, task.control, 5.0, Budget(seconds=100.0))
+    assert len(costs) == 3 - trials
+    factor = 1.25 ** min(trials, 2)
+    assert larger - task.centre == pytest.approx(factor * (task.control - task.centre))
