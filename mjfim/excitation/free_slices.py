@@ -12,7 +12,12 @@ from mjfim.budget import Budget
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult, Runs, consume
-from mjfim.excitation.search_slices import SearchSlice, SliceOrder, worker_budget
+from mjfim.excitation.search_slices import (
+    SearchSlice,
+    SliceOrder,
+    slice_seconds,
+    worker_budget,
+)
 from mjfim.excitation.sent_task import SentTask
 from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.excitation.task import DesignTask
@@ -123,6 +128,7 @@ def run_free_starts(
         the engine steps of all levels.
     """
     stated = levels[-1].task
+    workers = Workers.of(executor)
     variants = tuple(level.task.system.variant for level in levels)
     sent = SentTask.of(stated)
     first = FreeSlice(
@@ -133,7 +139,8 @@ def run_free_starts(
         added_information=stated.added_information,
         variants=variants,
         budget=budget,
-        threads=Workers.of(executor).threads_for(len(starts)),
+        threads=workers.threads_for(len(starts)),
+        seconds=slice_seconds(min(workers.count, len(starts))),
     )
     orders = [replace(first, start=start) for start in starts]
     results = yield from run_in_slices(executor, orders, run_free_in_worker, budget)

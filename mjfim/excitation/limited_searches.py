@@ -14,6 +14,7 @@ from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult
+from mjfim.excitation.search_slices import slice_seconds
 from mjfim.excitation.sent_task import SentTask
 from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.parallel import ExecutorLike, Workers
@@ -105,12 +106,14 @@ class LimitedSearches:
             search: The search.
             count: Number of searches side by side, which share the threads.
         """
-        threads = Workers.of(executor).threads_for(count)
+        workers = Workers.of(executor)
+        threads = workers.threads_for(count)
         sent = replace(search, experiment=self._sent.experiment, threads=threads)
 
         # A worker keeps the plant together with its threads, of which later rounds have more.
         key = f"{self._sent.key_of(search.variant)} {threads}"
-        return ConstrainedSlice(search=sent, task_key=key)
+        seconds = slice_seconds(min(workers.count, count))
+        return ConstrainedSlice(search=sent, task_key=key, seconds=seconds)
 
     def run(
         self, level: DescentLevel, start: InitialControl, terms: SearchTerms

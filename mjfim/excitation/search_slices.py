@@ -26,6 +26,19 @@ S = TypeVar("S")
 # is over for which a request to stop waits, and is long enough that its state costs little.
 SLICE_SECONDS = 1.5
 
+# Largest number of slices that the caller takes and sends on per second. Each of them costs it some
+# milliseconds, so that with many workers the slices have to be longer: 5 s for 256 workers.
+MOST_SLICES_PER_SECOND = 50.0
+
+
+def slice_seconds(searches: int) -> float:
+    """Length of a slice, such that the caller keeps up with all workers [s].
+
+    Args:
+        searches: Number of searches that run side by side.
+    """
+    return max(SLICE_SECONDS, searches / MOST_SLICES_PER_SECOND)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SliceLength:

@@ -32,7 +32,8 @@ small. A table at the end says which figures are as wanted.
 
 In `simulate`, a start that goes on takes part in up to four searches one after the other, and the
 last one of them has to be waited for. So the efficiency depends on the number of starts for each
-worker: many starts (--simulated-starts) keep 256 workers busy, four starts for each do not.
+worker: many starts (--simulated-starts, --arm-starts) keep 256 workers busy, four starts for each
+do not.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ LEAST_EFFICIENCY, SIMULATED_WORKERS = 0.8, (1, 4, 16, 64, 256)
 # The arm whose starts are simulated as well, the duration of its motion [s], and the starts and
 # iterations that are carried out to measure the lengths of the orders.
 SIMULATED_ARM, ARM_HORIZON = "so_arm100", 5.0
-ARM_MEASURED, ARM_ITERATIONS = 4, 4
+ARM_MEASURED, ARM_ITERATIONS = 4, 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -667,7 +668,7 @@ def main() -> int:
     for name, value in vars(QUICK).items():
         parser.add_argument(f"--{name}", type=type(value), help=f"default: {value}")
     parser.add_argument("--simulated-starts", type=int, default=8192, help="of the cart-pendulum")
-    parser.add_argument("--arm-starts", type=int, default=1000, help="simulated starts of the arm")
+    parser.add_argument("--arm-starts", type=int, default=4096, help="simulated starts of the arm")
     parser.add_argument("--picture", type=Path, default=Path("out/scale.png"))
     return 0 if run(parser.parse_args()) else 1
 

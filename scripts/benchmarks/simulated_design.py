@@ -167,7 +167,10 @@ def _key(args: tuple[Any, ...]) -> Hashable:
     search = order.search
     common = name, str(search.variant), search.schedule.first, tuple(search.tightening.items())
     done = 0 if order.before is None else len(order.before.result.history)
-    return (*common, search.start.control.tobytes(), search.max_iterations, done)
+    begun = search.start.control.tobytes()
+
+    # Slices are longer on more workers.
+    return (*common, begun, search.max_iterations, done, order.seconds)
 
 
 def _start(order: ConstrainedSlice | JudgeOrder) -> InitialControl:

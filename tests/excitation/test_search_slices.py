@@ -20,10 +20,13 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.free_slices import FreeSlice
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
+from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.limited_searches import LimitedSearches
 from mjfim.excitation.run_result import RunResult, consume
-from mjfim.excitation.search_slices import SearchSlice
+from mjfim.excitation.search_slices import MOST_SLICES_PER_SECOND, SLICE_SECONDS, SearchSlice
 from mjfim.excitation.sliced_searches import run_in_slices
 from mjfim.excitation.task import DesignTask
+from mjfim.parallel import Workers
 from mjfim.records.design import Design, Status
 from mjfim.records.events import DesignEvent
 from tests.support.executors import LosingExecutor
@@ -264,3 +267,18 @@ def test_free_starts_on_workers_give_the_design_of_one_process(
     assert executor.count > 6
     assert len(levels) == (2 if horizon > 1.0 else 1)
     assert_same_design(found, serial)
+
+
+@pytest.mark.parametrize(("workers", "starts"), [(2, 1000), (256, 40), (256, 1000)])
+def test_slices_are_longer_where_many_workers_would_outrun_the_caller(
+    task: DesignTask, workers: int, starts: int
+) -> None:
+    executor = Workers(LosingExecutor(lambda *_: False), count=workers, threads=1)
+    stated = DescentLevel(task, np.eye(len(task.system.parameters.names)))
+    searches = LimitedSearches(stated=stated, executor=executor, budget=Budget())
+    order = searches.order(executor, search_of(task), starts)
+
+    # Searches end at about this rate, if all of them run.
+    assert min(workers, starts) / order.seconds <= MOST_SLICES_PER_SECOND
+    if workers * SLICE_SECONDS < MOST_SLICES_PER_SECOND or starts < workers:
+        assert order.seconds == SLICE_SECONDS
