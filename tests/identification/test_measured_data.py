@@ -115,14 +115,18 @@ def test_pendulum_predicts_the_other_file_far_better_than_published_and_both_agr
 @pytest.mark.slow
 def test_poor_data_are_named() -> None:
     poor = identified(
-        experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "sysid_measured.csv"], []
+        experiment("dfki_simple_pendulum", bootstrap=0, max_iterations=2),
+        [PENDULUM / "sysid_measured.csv"],
+        [],
     )
     remarks = [s for s in poor.warnings if s.startswith("poor data in sysid_measured.csv")]
     assert any("jumps from row to row" in s and "'torque'" in s for s in remarks)
     assert any("speed is rough" in s for s in remarks)
     assert any("ctrlrange" in s for s in remarks)
     good = identified(
-        experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "dircol_measured.csv"], []
+        experiment("dfki_simple_pendulum", bootstrap=0, max_iterations=2),
+        [PENDULUM / "dircol_measured.csv"],
+        [],
     )
     assert not any(s.startswith("poor data") for s in good.warnings)
 
@@ -130,7 +134,7 @@ def test_poor_data_are_named() -> None:
 @pytest.mark.slow
 def test_double_pendulum_in_base_parameters_and_its_held_out_file() -> None:
     files = [DOUBLE / f"A0_0{i}.csv.gz" for i in range(3)]
-    stated = experiment("dfki_double_pendulum", bootstrap=300, max_iterations=10)
+    stated = experiment("dfki_double_pendulum", bootstrap=300, max_iterations=5)
     found = identified(stated, files, [])
     for name, published in PUBLISHED_DOUBLE.items():
         j = found.parameters.index(name)
