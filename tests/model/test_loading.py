@@ -31,8 +31,9 @@ ROUGH = {
     "dfki_double_pendulum",
     "dfki_simple_pendulum",
 }  # contact and dry friction
-# The examples whose pictures are rendered: a ball joint, a free joint, a closed loop, limits, and an
-# actuator with a state of its own.
+
+# The examples whose pictures are rendered: a ball joint, a free joint, a closed loop, limits, and
+# an actuator with a state of its own.
 RENDERED = {"ball_pendulum", "quadrotor", "four_bar", "sliding_block", "filtered_drive"}
 TOGETHER = {"double_pendulum", "ball_pendulum"}  # not every parameter can be told alone
 
@@ -70,7 +71,7 @@ def test_check_names_the_subject_of_the_example(name: str, tmp_path: Path) -> No
 def test_a_short_design_improves_and_writes_all_files(
     name: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """The figures of all examples are made. To render them takes seconds, so some are not."""
+    """All figures are made. Those of most examples are not rendered, which takes seconds."""
     if name not in RENDERED:
         request.getfixturevalue("empty_figures")
 
