@@ -13,6 +13,7 @@ to R is therefore a derivative with respect to I~ with the directions P'w.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -84,6 +85,11 @@ class FisherInformation:
         """(t,) indices of the wanted parameters."""
         return np.arange(len(self.scale)) if self.interest is None else self.interest
 
+    @cached_property
+    def _nuisance(self) -> np.ndarray:
+        """Indices of the parameters that are not wanted."""
+        return np.setdiff1d(np.arange(len(self.scale)), self.wanted)
+
     # The information and the part that the criterion uses
 
     def matrix(self, sensitivity: Sensitivity) -> Array:
@@ -123,7 +129,7 @@ class FisherInformation:
         scaled = self.scaled(information)
         p = scaled.shape[-1]
         t = self.wanted
-        n = np.setdiff1d(np.arange(p), t)
+        n = self._nuisance
 
         P = np.array(np.broadcast_to(np.eye(p)[t], (*scaled.shape[:-2], len(t), p)))
         if len(n):

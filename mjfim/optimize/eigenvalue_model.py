@@ -13,6 +13,7 @@ step where the smallest eigenvalues reach them, although the larger ones change 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -33,9 +34,6 @@ SUFFICIENT_DECREASE = 1e-4
 
 # Shortest fraction of a Newton step.
 MIN_NEWTON_FRACTION = 1e-8
-
-# Step of the central differences of the gradient, for power 1.
-DIFFERENCE_STEP = 1e-5
 
 # Relative distance of two eigenvalues below which their divided difference is the derivative.
 EQUAL_EIGENVALUES = 1e-6
@@ -69,7 +67,18 @@ class EigenvalueModel:
         Returns:
             (m,) derivative by the coordinates.
         """
-        return self._value_and_gradient(d)[1]
+        return self._changed(d).gradient
+
+    def hessian(self, d: Array) -> Array:
+        """Second derivative of the model.
+
+        Args:
+            d: (m,) coordinates of B.
+
+        Returns:
+            (m, m) derivative of the gradient by the coordinates.
+        """
+        return self._changed(d).hessian
 
     def value(self, d: Array) -> float:
         """Change of the model from the point about which it was made.
@@ -80,25 +89,18 @@ class EigenvalueModel:
         Returns:
             h(d) - h(0).
         """
-        zero = np.zeros_like(d)
-        return self._value_and_gradient(d)[0] - self._value_and_gradient(zero)[0]
+        return self._changed(d).value - self._changed(np.zeros_like(d)).value
 
-    def _value_and_gradient(self, d: Array) -> tuple[float, Array]:
-        """The model, up to a constant, and its gradient: (m,), at coordinates d: (m,)."""
-        logs = np.log(self.eigenvalues / self.eigenvalues[0])
-        changed = np.diag(logs) + symmetric_matrix(d, len(logs))
-        changed_logs, vectors = np.linalg.eigh(changed)
-        smallest = changed_logs[0]
+    @cached_property
+    def _logs(self) -> Array:
+        """(r, r) diagonal matrix of the logarithms of the eigenvalues over the smallest one."""
+        return np.diag(np.log(self.eigenvalues / self.eigenvalues[0]))
 
-        # The smallest eigenvalue is factored out, so that the exponentials neither overflow nor
-        # vanish.
-        exponentials = np.exp(-self.power * (changed_logs - smallest))
-        total = exponentials.sum()
-        log_sum = float(np.log(total) / self.power - smallest)
-
-        shares = exponentials / total
-        P = (vectors * shares) @ vectors.T
-        return self.weight * log_sum, -self.weight * symmetric_coordinates(P)
+    def _changed(self, d: Array) -> _ChangedLogs:
+        """Eigenvalues of the changed logarithm at coordinates d: (m,)."""
+        changed = self._logs + symmetric_matrix(d, len(self.eigenvalues))
+        logs, vectors = np.linalg.eigh(changed)
+        return _ChangedLogs(logs=logs, vectors=vectors, power=self.power, weight=self.weight)
 
     def minimising_gradient(self, d0: Array, spread: Array) -> Array:
         """Gradient of the model at the minimum of `h(d) + 1/2 (d - d0)' spread^-1 (d - d0)`.
@@ -117,52 +119,131 @@ class EigenvalueModel:
         L = vectors * np.sqrt(np.maximum(values, 0.0))
 
         y = np.zeros(len(d0))
+        here = self._changed(d0)
         for _ in range(MAX_NEWTON_STEPS):
-            g = y + L.T @ self.gradient(d0 + L @ y)
+            g = y + L.T @ here.gradient
             if np.abs(g).max() <= NEWTON_TOLERANCE * max(1.0, np.abs(y).max()):
                 break
 
-            H = np.eye(len(y)) + L.T @ self._hessian(d0 + L @ y) @ L
+            H = np.eye(len(y)) + L.T @ here.hessian @ L
             step = -np.linalg.solve(0.5 * (H + H.T), g)
-            y = self._line_search(y, step, float(g @ step), L, d0)
+            y, here = self._line_search(y, here, step, float(g @ step), L, d0)
 
-        return self.gradient(d0 + L @ y)
+        return here.gradient
 
-    def _line_search(self, y: Array, step: Array, slope: float, L: Array, d0: Array) -> Array:
-        """(m,) point after a step that is halved until the proximal objective falls sufficiently.
+    def _line_search(
+        self, y: Array, here: _ChangedLogs, step: Array, slope: float, L: Array, d0: Array
+    ) -> tuple[Array, _ChangedLogs]:
+        """Halve a step until the proximal objective falls sufficiently.
+
+        The objective is the model at `d0 + L y` plus `1/2 |y|^2`.
 
         Args:
             y: (m,) point at which the step begins.
+            here: The model at this point.
             step: (m,) Newton step.
             slope: Directional derivative of the objective along the step, negative.
             L: (m, m) square root of spread.
             d0: (m,) centre of the proximal term.
+
+        Returns:
+            The point after the step, and the model there.
         """
-        here = self._proximal_objective(y, L, d0)
+        before = here.value + 0.5 * float(y @ y)
         fraction = 1.0
-        while fraction > MIN_NEWTON_FRACTION:
-            there = self._proximal_objective(y + fraction * step, L, d0)
-            if there <= here + SUFFICIENT_DECREASE * fraction * slope:
-                break
+        while True:
+            new = y + fraction * step
+            there = self._changed(d0 + L @ new)
+            after = there.value + 0.5 * float(new @ new)
+            if after <= before + SUFFICIENT_DECREASE * fraction * slope:
+                return new, there
+
             fraction *= 0.5
+            if fraction <= MIN_NEWTON_FRACTION:
+                return new, there
 
-        return y + fraction * step
 
-    def _proximal_objective(self, y: Array, L: Array, d0: Array) -> float:
-        """The model at `d0 + L y` plus `1/2 |y|^2`."""
-        return self._value_and_gradient(d0 + L @ y)[0] + 0.5 * float(y @ y)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ChangedLogs:
+    """The model of a logarithm of the information that has changed.
 
-    def _hessian(self, d: Array) -> Array:
-        """(m, m) Hessian at d: (m,), by central differences of the gradient.
+    Attributes:
+        logs: (r,) eigenvalues of the changed logarithm, ascending, up to a constant.
+        vectors: (r, r) their eigenvectors, in columns.
+        power: Power q of the smooth E-criterion.
+        weight: Weight of the criterion in the cost.
+    """
 
-        Differences are fast enough, because there are few coordinates.
+    logs: Array
+    vectors: Array
+    power: float
+    weight: float
+
+    @cached_property
+    def _exponentials(self) -> Array:
+        """(r,) `exp(-q log)` of the eigenvalues over that of the smallest one.
+
+        The smallest eigenvalue is factored out, so that they neither overflow nor vanish.
         """
-        h = DIFFERENCE_STEP / max(1.0, self.power)
-        rows = []
-        for move in h * np.eye(len(d)):
-            change = self.gradient(d + move) - self.gradient(d - move)
-            rows.append(change / (2.0 * h))
-        return np.stack(rows)
+        return np.asarray(np.exp(-self.power * (self.logs - self.logs[0])))
+
+    @cached_property
+    def _shares(self) -> Array:
+        """(r,) shares of the eigenvalues in the sum of exponentials."""
+        return np.asarray(self._exponentials / self._exponentials.sum())
+
+    @cached_property
+    def value(self) -> float:
+        """The model, up to a constant."""
+        log_sum = np.log(self._exponentials.sum()) / self.power - self.logs[0]
+        return self.weight * float(log_sum)
+
+    @cached_property
+    def gradient(self) -> Array:
+        """(m,) derivative by the coordinates of B."""
+        P = (self.vectors * self._shares) @ self.vectors.T
+        return -self.weight * symmetric_coordinates(P)
+
+    @cached_property
+    def hessian(self) -> Array:
+        """(m, m) second derivative by the coordinates of B.
+
+        The derivative of the matrix exponential has divided differences of the exponentials as its
+        entries, in the basis of the eigenvectors (Daleckii & Krein).
+        """
+        # The divided difference of two shares is the larger one times a factor that is q where the
+        # eigenvalues are equal.
+        distance = np.abs(self.logs[:, None] - self.logs)
+        is_equal = self.power * distance < EQUAL_EIGENVALUES
+        safe = np.where(is_equal, 1.0, distance)
+        factor = np.where(is_equal, self.power, -np.expm1(-self.power * distance) / safe)
+        divided = np.maximum(self._shares[:, None], self._shares) * factor
+
+        units = self.vectors.T @ symmetric_units(len(self.logs)) @ self.vectors
+        curvature = np.einsum("aij,ij,bij->ab", units, divided, units)
+        slopes = np.einsum("aii,i->a", units, self._shares)
+        return np.asarray(self.weight * (curvature - self.power * np.outer(slopes, slopes)))
+
+
+@cache
+def symmetric_units(r: int) -> Array:
+    """Symmetric matrices whose coordinates are the unit vectors.
+
+    Args:
+        r: Size of the matrices.
+
+    Returns:
+        (m, r, r) matrices, m = r (r + 1) / 2; the array is shared and cannot be written.
+    """
+    rows, columns = np.triu_indices(r)
+    entries = np.where(rows == columns, 1.0, 1.0 / SQRT_2)
+
+    units = np.zeros((len(rows), r, r))
+    each = np.arange(len(rows))
+    units[each, rows, columns] = entries
+    units[each, columns, rows] = entries
+    units.flags.writeable = False
+    return units
 
 
 def symmetric_matrix(d: Array, r: int) -> Array:
@@ -175,13 +256,7 @@ def symmetric_matrix(d: Array, r: int) -> Array:
     Returns:
         (r, r) matrix.
     """
-    rows, columns = np.triu_indices(r)
-    entries = d * np.where(rows == columns, 1.0, 1.0 / SQRT_2)
-
-    full = np.zeros((r, r))
-    full[rows, columns] = entries
-    full[columns, rows] = entries
-    return full
+    return np.asarray((d @ symmetric_units(r).reshape(-1, r * r)).reshape(r, r))
 
 
 def symmetric_coordinates(full: Array) -> Array:
@@ -194,8 +269,8 @@ def symmetric_coordinates(full: Array) -> Array:
         (m,) coordinates: diagonal entries, and sqrt(2) times the entries above the diagonal, row by
         row.
     """
-    rows, columns = np.triu_indices(len(full))
-    return np.asarray(full[rows, columns] * np.where(rows == columns, 1.0, SQRT_2))
+    r = len(full)
+    return np.asarray(symmetric_units(r).reshape(-1, r * r) @ full.reshape(r * r))
 
 
 def divided_log_differences(values: Array) -> Array:

@@ -1,7 +1,7 @@
 """Time-varying linear-quadratic problems: linear recursions, regulator and descent.
 
-A linear recursion over all samples is a banded system with a unit triangular matrix. One BLAS call
-solves it, without a Python loop.
+A linear recursion over all samples is a banded system with a unit triangular matrix. One LAPACK
+call solves it, without a Python loop, and for many right-hand sides at once.
 """
 
 from __future__ import annotations
@@ -36,11 +36,10 @@ class LinearRecursion:
         band[0] = 1.0
 
         # Entry (i, j) of block k couples z_{k+1, i} with z_{k, j}, which is n + i - j rows below
-        # the diagonal.
-        i, j = np.indices((n, n))
-        columns = (np.arange(N) * n)[:, None, None] + j
-        rows = np.broadcast_to(n + i - j, columns.shape)
-        band[rows, columns] = -self.A
+        # the diagonal. So the entries of a column lie side by side in memory, and those of the next
+        # column begin 2 n - 1 numbers later.
+        blocks = band.T[:-n].reshape(N, 2 * n * n)
+        blocks[:, n:].reshape(N, n, 2 * n - 1)[:, :, :n] = -self.A.swapaxes(1, 2)
         return band
 
     def forward(self, z0: Array, c: Array) -> Array:
@@ -48,51 +47,71 @@ class LinearRecursion:
 
         Args:
             z0: (n,) first state.
-            c: (N, n) inputs.
+            c: (N, n) inputs, or (m, N, n) for m recursions.
 
         Returns:
-            (N+1, n) states z.
+            (N+1, n) states z, or (m, N+1, n).
         """
-        rhs = np.concatenate([z0[None], c])
+        rhs = np.empty((*c.shape[:-2], c.shape[-2] + 1, c.shape[-1]))
+        rhs[..., 0, :] = z0
+        rhs[..., 1:, :] = c
         return self._solve(rhs, transposed=False)
 
     def adjoint(self, a: Array) -> Array:
         """Solve the adjoint recursion `l_k = A_k' l_{k+1} + a_k` with `l_N = a_N`.
 
         Args:
-            a: (N+1, n) inputs.
+            a: (N+1, n) inputs, or (m, N+1, n) for m recursions.
 
         Returns:
-            (N+1, n) costates l.
+            (N+1, n) costates l, or (m, N+1, n).
         """
-        return self._solve(a, transposed=True)
+        return self._solve(np.array(a, dtype=np.float64), transposed=True)
 
     def _solve(self, rhs: Array, transposed: bool) -> Array:
-        """(N+1, n) solution of the banded system, or of its transpose.
+        """Solution of the banded system, or of its transpose.
 
         Args:
-            rhs: (N+1, n) right-hand side.
+            rhs: (N+1, n) or (m, N+1, n) right-hand sides, which are overwritten.
             transposed: Whether to solve the transposed system.
         """
         N, n, _ = self.A.shape
-        if rhs.shape != (N + 1, n):
+        if rhs.shape[-2:] != (N + 1, n):
             raise ValueError(
-                f"the right-hand side has shape {rhs.shape}; "
+                f"the right-hand side has shape {rhs.shape[-2:]}; "
                 f"a recursion over {N} samples of {n} states needs {(N + 1, n)}"
             )
 
-        flat = np.array(rhs, dtype=np.float64).reshape(-1)
+        # Each right-hand side is a column for LAPACK.
+        columns = rhs.reshape(-1, (N + 1) * n).T
         with np.errstate(over="ignore", invalid="ignore"):
-            solution = scipy.linalg.blas.dtbsv(
-                2 * n - 1,
+            solution, _ = scipy.linalg.lapack.dtbtrs(
                 self._banded_matrix,
-                flat,
-                lower=1,
-                trans=int(transposed),
-                diag=1,
-                overwrite_x=1,
+                columns,
+                uplo="L",
+                trans="T" if transposed else "N",
+                diag="U",
+                overwrite_b=1,
             )
-        return np.asarray(solution).reshape(rhs.shape)
+        return np.asarray(solution.T.reshape(rhs.shape))
+
+
+def products_at_samples(matrices: Array, vectors: Array) -> Array:
+    """Products of a matrix and a vector at every sample.
+
+    Args:
+        matrices: (N, i, j) matrices.
+        vectors: (N, j) vectors, or m of them at every sample: (m, N, j).
+
+    Returns:
+        (N, i) or (m, N, i) products.
+    """
+    if vectors.ndim == 2:
+        return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
+
+    # One product of matrices per sample is quicker than m products with a vector.
+    columns = np.ascontiguousarray(vectors.transpose(1, 2, 0))
+    return np.asarray((matrices @ columns).transpose(2, 0, 1))
 
 
 def largest_amplification(A: Array, sizes: Array | None = None) -> float:
@@ -204,26 +223,17 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
     Raises:
         numpy.linalg.LinAlgError: `R + B'PB` is not positive definite.
     """
-    K = np.zeros((len(A), B.shape[2], A.shape[1]))
-    if not K.size:
-        return K
+    if not B.shape[2]:
+        return np.zeros((len(A), 0, A.shape[1]))
 
-    P = terminal
-
-    for k in range(len(A) - 1, -1, -1):
-        BP = B[k].T @ P
-        K[k] = _solve_positive_definite(R + BP @ B[k], BP @ A[k])
-        P = Q + A[k].T @ P @ (A[k] - B[k] @ K[k])
-
-        # Symmetrise: round-off grows backwards in time otherwise.
-        P = 0.5 * (P + P.T)
-
-    return K
+    return RiccatiSolution.solve(A, B, _constant_weights(len(A), Q, R, terminal)).K
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TangentCurve:
     """A tangent vector zeta = (z, v) of the trajectory manifold.
+
+    Functions that say so take m of them as well, which are stacked along a further first axis.
 
     Attributes:
         z: (N+1, nx) change of the state [x-unit].
@@ -290,23 +300,25 @@ class Weights:
         The inner product of zeta with any tangent curve (z, v) is `sum a'z + b'v`.
 
         Args:
-            zeta: The tangent curve.
+            zeta: The tangent curve, or m of them.
 
         Returns:
-            a: (N+1, nx) and b: (N, nu).
+            a: (N+1, nx) and b: (N, nu), or (m, N+1, nx) and (m, N, nu).
         """
         z = zeta.z
         v = zeta.v
 
-        a = np.einsum("kij,kj->ki", self.Q, z)
-        a[:-1] += np.einsum("kui,ku->ki", self.S, v)
-        b = np.einsum("kui,ki->ku", self.S, z[:-1])
-        b += np.einsum("kuw,kw->ku", self.R, v)
+        a = products_at_samples(self.Q, z)
+        a[..., :-1, :] += products_at_samples(self.S.swapaxes(1, 2), v)
+        b = products_at_samples(self.S, z[..., :-1, :])
+        b += products_at_samples(self.R, v)
+        if not self.W.any():
+            return a, b
 
         # A change of the control between two samples involves both of them.
-        changes = np.diff(v, axis=0, prepend=0.0, append=0.0)
+        changes = np.diff(v, axis=-2, prepend=0.0, append=0.0)
         weighted = self.W * changes
-        return a, b + weighted[:-1] - weighted[1:]
+        return a, b + weighted[..., :-1, :] - weighted[..., 1:, :]
 
 
 def descent(
@@ -329,14 +341,20 @@ def descent(
     Returns:
         The minimiser.
     """
-    N, nx, nu = B.shape
-    weights = Weights(
+    weights = _constant_weights(len(B), Q, R, terminal)
+    return RiccatiSolution.solve(A, B, weights).descent(a, b)
+
+
+def _constant_weights(N: int, Q: Array, R: Array, terminal: Array) -> Weights:
+    """The form that weighs each of N samples alike, but for the last state."""
+    nx = len(Q)
+    nu = len(R)
+    return Weights(
         Q=np.stack([*[Q] * N, terminal]),
         S=np.zeros((N, nu, nx)),
         R=np.stack([R] * N),
         W=np.zeros((N + 1, nu)),
     )
-    return RiccatiSolution.solve(A, B, weights).descent(a, b)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -380,26 +398,25 @@ class RiccatiSolution:
         if weights.W.any():
             A, B, weights = _with_previous_control(A, B, weights)
 
-        Q = weights.Q
-        S = weights.S
-        R = weights.R
-        K = np.empty_like(S)
-        inverse = np.empty_like(R)
-        P = Q[N]
-        unit = np.eye(nu)
+        # Each step of the recursion is one quadratic form of (v_k, z_k): its own weights, and those
+        # of the next state, which the matrix [B A] gives.
+        to_next = np.concatenate([B, A], axis=2)
+        forms = _forms_of_samples(weights)
+        factors = np.empty((N, nu, forms.shape[2]))
+        P = weights.Q[N]
 
-        for k in range(N - 1, -1, -1):
-            BP = B[k].T @ P
-            both = np.concatenate([BP @ A[k] + S[k], unit], axis=1)
-            both = _solve_positive_definite(R[k] + BP @ B[k], both)
-            K[k] = both[:, :-nu]
-            inverse[k] = both[:, -nu:]
+        steps = zip(to_next[::-1], forms[::-1], factors[::-1], strict=True)
+        for matrix, form, factor in steps:
+            form += matrix.T.dot(P).dot(matrix)
+            factor[:] = _solve_positive_definite(form[:nu, :nu], form[:nu])
 
-            P = Q[k] + A[k].T @ P @ (A[k] - B[k] @ K[k]) - S[k].T @ K[k]
-
-            # Symmetrise: round-off grows backwards in time otherwise.
+            # The minimum over v_k is a form of z_k. Symmetrise: round-off grows backwards in time
+            # otherwise.
+            P = (form - form[:, :nu].dot(factor))[nu:, nu:]
             P = 0.5 * (P + P.T)
 
+        K = factors[:, :, nu:]
+        inverse = np.asarray(np.linalg.inv(forms[:, :nu, :nu]), dtype=np.float64)
         return RiccatiSolution(
             K=K, inverse=inverse, closed_loop=LinearRecursion(A - B @ K), B=B, nx=nx
         )
@@ -408,26 +425,38 @@ class RiccatiSolution:
         """Minimiser of the linear cost `sum a'z + b'v` plus half of the quadratic form.
 
         Args:
-            a: (N+1, nx) derivative of the cost by the state.
-            b: (N, nu) derivative of the cost by the control.
+            a: (N+1, nx) derivative of the cost by the state, or (m, N+1, nx) for m costs.
+            b: (N, nu) derivative of the cost by the control, or (m, N, nu).
 
         Returns:
-            The tangent curve.
+            The tangent curve, or m of them.
         """
         # Backward: costate of the closed loop.
-        driving = np.zeros((len(a), self.B.shape[1]))
-        driving[:, : self.nx] = a
-        driving[:-1] -= np.einsum("kui,ku->ki", self.K, b)
+        n = self.B.shape[1]
+        driving = np.zeros((*a.shape[:-1], n))
+        driving[..., : self.nx] = a
+        driving[..., :-1, :] -= products_at_samples(self.K.swapaxes(1, 2), b)
         costate = self.closed_loop.adjoint(driving)
 
         # Forward: the open-loop part of the control moves the closed loop.
-        reduced = b + np.einsum("kiu,ki->ku", self.B, costate[1:])
-        feedforward = np.einsum("kuw,kw->ku", self.inverse, reduced)
-        inputs = -np.einsum("kiu,ku->ki", self.B, feedforward)
-        z = self.closed_loop.forward(np.zeros(driving.shape[1]), inputs)
+        reduced = b + products_at_samples(self.B.swapaxes(1, 2), costate[..., 1:, :])
+        feedforward = products_at_samples(self.inverse, reduced)
+        inputs = -products_at_samples(self.B, feedforward)
+        z = self.closed_loop.forward(np.zeros(n), inputs)
 
-        v = -np.einsum("kui,ki->ku", self.K, z[:-1]) - feedforward
-        return TangentCurve(z=z[:, : self.nx], v=v)
+        v = -products_at_samples(self.K, z[..., :-1, :]) - feedforward
+        return TangentCurve(z=z[..., : self.nx], v=v)
+
+
+def _forms_of_samples(weights: Weights) -> Array:
+    """(N, nu+nx, nu+nx) matrices of a form without W, one for (v_k, z_k) of each sample."""
+    N, nu, nx = weights.S.shape
+    forms = np.empty((N, nu + nx, nu + nx))
+    forms[:, :nu, :nu] = weights.R
+    forms[:, :nu, nu:] = weights.S
+    forms[:, nu:, :nu] = weights.S.swapaxes(1, 2)
+    forms[:, nu:, nu:] = weights.Q[:-1]
+    return forms
 
 
 def _with_previous_control(A: Array, B: Array, weights: Weights) -> tuple[Array, Array, Weights]:
@@ -485,46 +514,56 @@ class CurveCoordinates:
     K: Array
 
     @cached_property
+    def _has_feedback(self) -> bool:
+        """Whether K is not zero; without feedback, the products with K are left out."""
+        return bool(self.K.any())
+
+    @cached_property
     def _closed_loop(self) -> LinearRecursion:
         """Recursion of `A - B K`."""
-        return LinearRecursion(self.A - self.B @ self.K)
+        return LinearRecursion(self.A - self.B @ self.K if self._has_feedback else self.A)
 
     def gradient(self, a: Array, b: Array) -> Array:
         """Gradient by the curve coordinate of the cost `sum a'z + b'v`.
 
         Args:
-            a: (N+1, nx) derivative of the cost by the state.
-            b: (N, nu) derivative of the cost by the control.
+            a: (N+1, nx) derivative of the cost by the state, or (m, N+1, nx) for m costs.
+            b: (N, nu) derivative of the cost by the control, or (m, N, nu).
 
         Returns:
-            (N, nu) gradient.
+            (N, nu) gradient, or (m, N, nu).
         """
         driving = np.array(a)
-        driving[:-1] -= np.einsum("kui,ku->ki", self.K, b)
+        if self._has_feedback:
+            driving[..., :-1, :] -= products_at_samples(self.K.swapaxes(1, 2), b)
         costate = self._closed_loop.adjoint(driving)
-        return np.asarray(b + np.einsum("kiu,ki->ku", self.B, costate[1:]))
+        through_state = products_at_samples(self.B.swapaxes(1, 2), costate[..., 1:, :])
+        return np.asarray(b + through_state)
 
     def lift(self, c: Array) -> TangentCurve:
         """Tangent curve of a curve coordinate.
 
         Args:
-            c: (N, nu) curve coordinate.
+            c: (N, nu) curve coordinate, or (m, N, nu) for m of them.
 
         Returns:
-            The tangent curve (z, v) with z_0 = 0.
+            The tangent curve (z, v) with z_0 = 0, or m of them.
         """
-        inputs = np.einsum("kiu,ku->ki", self.B, c)
+        inputs = products_at_samples(self.B, c)
         z = self._closed_loop.forward(np.zeros(self.A.shape[1]), inputs)
-        feedback = np.einsum("kui,ki->ku", self.K, z[:-1])
-        return TangentCurve(z=z, v=c - feedback)
+        if not self._has_feedback:
+            return TangentCurve(z=z, v=c)
+        return TangentCurve(z=z, v=c - products_at_samples(self.K, z[..., :-1, :]))
 
     def coordinate(self, zeta: TangentCurve) -> Array:
         """Curve coordinate `c = v + K z` of a tangent curve.
 
         Args:
-            zeta: The tangent curve.
+            zeta: The tangent curve, or m of them.
 
         Returns:
-            (N, nu) curve coordinate.
+            (N, nu) curve coordinate, or (m, N, nu).
         """
-        return np.asarray(zeta.v + np.einsum("kui,ki->ku", self.K, zeta.z[:-1]))
+        if not self._has_feedback:
+            return zeta.v
+        return np.asarray(zeta.v + products_at_samples(self.K, zeta.z[..., :-1, :]))

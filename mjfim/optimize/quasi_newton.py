@@ -39,11 +39,30 @@ class CurvaturePair:
         Returns:
             The pair or None.
         """
-        curvature = float(np.vdot(s, y))
-        if curvature > tolerance * np.linalg.norm(s) * np.linalg.norm(y):
-            return CurvaturePair(s=s, y=y, curvature=curvature)
+        found = convex_pairs(s[None], y[None], tolerance)
+        return found[0] if found else None
 
-        return None
+
+def convex_pairs(s: Array, y: Array, tolerance: float) -> list[CurvaturePair]:
+    """The pairs of steps and changes of the gradient whose curvature is clearly positive.
+
+    Args:
+        s: (p, ...) steps.
+        y: (p, ...) changes of the gradient along these steps.
+        tolerance: Smallest curvature, relative to the norms of s and y.
+
+    Returns:
+        The pairs, in the same order.
+    """
+    steps = s.reshape(len(s), -1)
+    changes = y.reshape(len(y), -1)
+    curvatures = np.einsum("pi,pi->p", steps, changes)
+    norms = np.linalg.norm(steps, axis=1) * np.linalg.norm(changes, axis=1)
+    is_convex = curvatures > tolerance * norms
+    return [
+        CurvaturePair(s=s[i], y=y[i], curvature=float(curvatures[i]))
+        for i in np.flatnonzero(is_convex)
+    ]
 
 
 def inverse_hessian_product(
@@ -52,23 +71,30 @@ def inverse_hessian_product(
     """Product of the BFGS approximation of the inverse Hessian with a vector.
 
     Args:
-        g: (...) vector, usually a gradient.
+        g: (...) vector, usually a gradient, or m vectors: (m, ...).
         pairs: Curvature pairs, the oldest first.
-        initial: Product of the initial inverse Hessian with a vector of the shape of g.
+        initial: Product of the initial inverse Hessian with vectors of the shape of g.
 
     Returns:
-        (...) the product.
+        (...) or (m, ...) the product.
     """
+    if not pairs:
+        return initial(g)
+
+    # A product of the rows with a vector has the shape (m,), or is a number for a single row.
+    size = pairs[0].s.size
+    rows = g.reshape(*g.shape[: g.ndim - pairs[0].s.ndim], size)
+
     alphas = []
     for pair in reversed(pairs):
-        alpha = np.vdot(pair.s, g) / pair.curvature
-        g = g - alpha * pair.y
+        alpha = (rows @ pair.s.reshape(size) / pair.curvature)[..., None]
+        rows = rows - alpha * pair.y.reshape(size)
         alphas.append(alpha)
 
-    product = initial(g)
+    rows = initial(rows.reshape(g.shape)).reshape(rows.shape)
 
     for pair, alpha in zip(pairs, reversed(alphas), strict=True):
-        beta = np.vdot(pair.y, product) / pair.curvature
-        product = product + pair.s * (alpha - beta)
+        beta = (rows @ pair.y.reshape(size) / pair.curvature)[..., None]
+        rows = rows + (alpha - beta) * pair.s.reshape(size)
 
-    return product
+    return rows.reshape(g.shape)

@@ -15,9 +15,19 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.optimize.barrier import BarrierExpansion
-from mjfim.optimize.lq import CurveCoordinates, RiccatiSolution, TangentCurve, Weights
+from mjfim.optimize.lq import (
+    CurveCoordinates,
+    RiccatiSolution,
+    TangentCurve,
+    Weights,
+    products_at_samples,
+)
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.optimize.quasi_newton import CurvaturePair, inverse_hessian_product
+from mjfim.optimize.quasi_newton import (
+    CurvaturePair,
+    convex_pairs,
+    inverse_hessian_product,
+)
 
 # Smallest curvature of a pair that is used, relative to the norms of the step and of the change of
 # the gradient.
@@ -82,10 +92,10 @@ class CurveMetric:
         """Product of the metric's matrix with a curve coordinate.
 
         Args:
-            s: (N, nu) curve coordinate.
+            s: (N, nu) curve coordinate, or (m, N, nu) for m of them.
 
         Returns:
-            (N, nu) half of the gradient of the form.
+            (N, nu) half of the gradient of the form, or (m, N, nu).
         """
         a, b = self.weights.half_gradient(self.coordinates.lift(s))
         return self.coordinates.gradient(a, b)
@@ -94,14 +104,15 @@ class CurveMetric:
         """Product of the inverse of the metric's matrix with a vector, by the Riccati equations.
 
         Args:
-            g: (N, nu) vector.
+            g: (N, nu) vector, or (m, N, nu) for m of them.
 
         Returns:
-            (N, nu) curve coordinate s with `apply(s) = g`.
+            (N, nu) curve coordinate s with `apply(s) = g`, or (m, N, nu).
         """
         K = self.coordinates.K
-        a = np.zeros((len(g) + 1, K.shape[2]))
-        a[:-1] = -np.einsum("kui,ku->ki", K, g)
+        *m, N, _ = g.shape
+        a = np.zeros((*m, N + 1, K.shape[2]))
+        a[..., :-1, :] = -products_at_samples(K.swapaxes(1, 2), g)
         return self.coordinates.coordinate(self._riccati.descent(a, -g))
 
 
@@ -204,23 +215,24 @@ class BasisMetric:
         """Product of the matrix with coefficients.
 
         Args:
-            s: (M, nu) coefficients.
+            s: (M, nu) coefficients, or (m, M, nu) for m vectors of them.
 
         Returns:
-            (M, nu) product.
+            (M, nu) product, or (m, M, nu).
         """
-        return np.asarray((self.H @ s.reshape(-1)).reshape(s.shape))
+        return np.asarray((s.reshape(-1, len(self.H)) @ self.H).reshape(s.shape))
 
     def solve(self, g: Array) -> Array:
         """Product of the inverse of the matrix with a vector.
 
         Args:
-            g: (M, nu) vector.
+            g: (M, nu) vector, or (m, M, nu) for m of them.
 
         Returns:
-            (M, nu) coefficients s with `apply(s) = g`.
+            (M, nu) coefficients s with `apply(s) = g`, or (m, M, nu).
         """
-        return np.asarray(scipy.linalg.cho_solve(self._factor, g.reshape(-1)).reshape(g.shape))
+        columns = g.reshape(-1, len(self.H)).T
+        return np.asarray(scipy.linalg.cho_solve(self._factor, columns).T.reshape(g.shape))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -435,11 +447,12 @@ class StructuredBFGS:
         slopes = here.eigenvalue_slopes
         m = len(slopes)
         model_gradient = np.tensordot(model.gradient(np.zeros(m)), slopes, axes=1)
-        step = -inverse(here.gradient - model_gradient)
+        found = inverse(np.concatenate([(here.gradient - model_gradient)[None], slopes]))
+        step = -found[0]
 
         # The model depends on the step through m numbers d only. Solve for these numbers, then
         # correct the step.
-        responses = np.stack([inverse(slope) for slope in slopes])
+        responses = found[1:]
         flat = slopes.reshape(m, -1)
         d = flat @ step.reshape(-1)
         spread = flat @ responses.reshape(m, -1).T
@@ -448,12 +461,11 @@ class StructuredBFGS:
 
     def _inverse_hessian(self, metric: CurveMetric | BasisMetric) -> Callable[[Array], Array]:
         """Product of the inverse Hessian of metric and stored pairs with a vector."""
-        pairs = []
-        for remainder in self._pairs:
-            y = remainder.y + metric.apply(remainder.s)
-            pair = CurvaturePair.where_convex(remainder.s, y, MIN_RELATIVE_CURVATURE)
-            if pair is not None:
-                pairs.append(pair)
+        pairs: list[CurvaturePair] = []
+        if self._pairs:
+            s = np.stack([remainder.s for remainder in self._pairs])
+            y = np.stack([remainder.y for remainder in self._pairs])
+            pairs = convex_pairs(s, y + metric.apply(s), MIN_RELATIVE_CURVATURE)
 
         return partial(inverse_hessian_product, pairs=pairs, initial=metric.solve)
 
@@ -522,40 +534,38 @@ class StructuredBFGS:
         weights = self._with_ridge(barrier.weights)
         coordinates = CurveCoordinates(A=expansion.A, B=expansion.B, K=K)
 
-        gradient = self._gradient(coordinates, expansion.a, expansion.b)
-        cost_a = expansion.a - barrier.a
-        cost_b = expansion.b - barrier.b
-        cost_gradient = self._gradient(coordinates, cost_a, cost_b)
-
-        slopes: Array = np.zeros((0, *gradient.shape))
+        # Gradients of the sum, of the cost alone, and of the coordinates of the eigenvalue model.
+        a = [expansion.a[None], (expansion.a - barrier.a)[None]]
+        b = [expansion.b[None], (expansion.b - barrier.b)[None]]
         model = expansion.eigenvalue_model
         if model is not None:
-            derivatives = zip(model.a, model.b, strict=True)
-            slopes = np.stack([self._gradient(coordinates, a, b) for a, b in derivatives])
+            a.append(model.a)
+            b.append(model.b)
+        gradients = self._gradients(coordinates, np.concatenate(a), np.concatenate(b))
 
         self._last = _LocalModel(
             expansion=expansion,
             coordinates=coordinates,
             weights=weights,
-            gradient=gradient,
-            cost_gradient=cost_gradient,
-            eigenvalue_slopes=slopes,
+            gradient=gradients[0],
+            cost_gradient=gradients[1],
+            eigenvalue_slopes=gradients[2:],
             basis=self.basis,
         )
         return self._last
 
-    def _gradient(self, coordinates: CurveCoordinates, a: Array, b: Array) -> Array:
-        """(N, nu) gradient of a linear cost by the coordinates; (M, nu) with a basis.
+    def _gradients(self, coordinates: CurveCoordinates, a: Array, b: Array) -> Array:
+        """(m, N, nu) gradients of linear costs by the coordinates; (m, M, nu) with a basis.
 
         Args:
             coordinates: Curve coordinates of the trajectory.
-            a: (N+1, nx) derivative of the cost by the state.
-            b: (N, nu) derivative of the cost by the control.
+            a: (m, N+1, nx) derivatives of the costs by the state.
+            b: (m, N, nu) derivatives of the costs by the control.
         """
-        gradient = coordinates.gradient(a, b)
+        gradients = coordinates.gradient(a, b)
         if self.basis is None:
-            return gradient
-        return np.asarray(self.basis.T @ gradient)
+            return gradients
+        return np.asarray(self.basis.T @ gradients)
 
 
 def _barrier(expansion: Expansion) -> BarrierExpansion:

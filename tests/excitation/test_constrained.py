@@ -895,7 +895,7 @@ def test_a_shorter_design_played_twice_is_a_start(
 ) -> None:
     """Half of the horizon has about as much information per second; costs hold for all of it."""
     rest = {"start": "rest", "end": "rest"}
-    descent = {"repeats": (2,), "max_iterations": 60}
+    descent = {"repeats": (2,), "max_iterations": 80}
     hanging = {"qpos": (0.0, np.pi), "qvel": (0.0, 0.0)}
     control = {"kind": "sine", "amplitude": 2.0, "frequency": 0.9}
     limits = {**HARD, "control_rate": 200.0}

@@ -74,6 +74,18 @@ def test_the_gradient_agrees_with_differences_and_the_model_is_convex(values: st
         assert model.value(d + e) + model.value(d - e) >= 2 * model.value(d) - 1e-12
 
 
+@pytest.mark.parametrize("values", [*VALUES.values(), [0.5]])
+def test_the_hessian_agrees_with_differences_of_the_gradient(values: list[float]) -> None:
+    rng, h, model = np.random.default_rng(5), 1e-6, model_of(values)
+    m = len(model.a)
+    for size in (0.0, 0.05, 1.0):
+        d = size * rng.normal(size=m)
+        rows = [model.gradient(d + h * e) - model.gradient(d - h * e) for e in np.eye(m)]
+        H = model.hessian(d)
+        np.testing.assert_allclose(H, np.array(rows) / (2 * h), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("values", VALUES)
 def test_the_minimising_gradient_solves_the_proximal_problem(values: str) -> None:
     """With a singular spread, coordinates that no step can change keep their values."""

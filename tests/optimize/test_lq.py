@@ -12,6 +12,7 @@ import pytest
 from scipy.linalg import expm, solve_discrete_are
 
 from mjfim.optimize.lq import (
+    CurveCoordinates,
     LinearRecursion,
     RiccatiSolution,
     TangentCurve,
@@ -104,6 +105,45 @@ def test_recursions_leave_their_inputs_alone_and_can_be_reused() -> None:
     np.testing.assert_array_equal(recursion.forward(np.ones(2), c), first)
     for now, before in zip((A, c, a), kept, strict=True):
         np.testing.assert_array_equal(now, before)
+
+
+def test_many_recursions_at_once_are_those_one_by_one() -> None:
+    rng = np.random.default_rng(14)
+    recursion, z0 = LinearRecursion(rng.normal(size=(6, 3, 3))), rng.normal(size=3)
+    c, a = rng.normal(size=(5, 6, 3)), rng.normal(size=(5, 7, 3))
+    np.testing.assert_array_equal(
+        recursion.forward(z0, c), [recursion.forward(z0, each) for each in c]
+    )
+    np.testing.assert_array_equal(recursion.adjoint(a), [recursion.adjoint(each) for each in a])
+
+
+@pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
+@pytest.mark.parametrize("feedback", [False, True])
+def test_many_tangent_curves_at_once_are_those_one_by_one(steps: bool, feedback: bool) -> None:
+    N, nx, nu = 8, 3, 2
+    rng = np.random.default_rng(15)
+    A, B = random_system(rng, N, nx, nu)
+    weights = random_weights(rng, N, nx, nu, steps)
+    K = feedback * rng.normal(size=(N, nu, nx))
+    a, b = rng.normal(size=(4, N + 1, nx)), rng.normal(size=(4, N, nu))
+
+    coordinates = CurveCoordinates(A=A, B=B, K=K)
+    solution = RiccatiSolution.solve(A, B, weights)
+    curves, minima = coordinates.lift(b), solution.descent(a, b)
+    forces = weights.half_gradient(curves)
+    gradients, back = coordinates.gradient(a, b), coordinates.coordinate(curves)
+    np.testing.assert_allclose(back, b, rtol=0, atol=1e-9)
+
+    equal = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
+    for i in range(4):
+        curve, minimum = coordinates.lift(b[i]), solution.descent(a[i], b[i])
+        equal(curves.z[i], curve.z)
+        equal(curves.v[i], curve.v)
+        equal(minima.z[i], minimum.z)
+        equal(minima.v[i], minimum.v)
+        equal(gradients[i], coordinates.gradient(a[i], b[i]))
+        for many, one in zip(forces, weights.half_gradient(curve), strict=True):
+            equal(many[i], one)
 
 
 def test_recursion_overflows_to_infinity_without_a_warning() -> None:

@@ -1,0 +1,54 @@
+"""Products with the inverse Hessian of L-BFGS, compared with dense matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mjfim.optimize.quasi_newton import CurvaturePair, convex_pairs, inverse_hessian_product
+from tests.support.lq import positive
+
+SHAPE = (3, 2)
+
+
+def updated(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The dense inverse Hessian after a BFGS update."""
+    rho = 1.0 / (s @ y)
+    left = np.eye(len(s)) - rho * np.outer(s, y)
+    return np.asarray(left @ H @ left.T + rho * np.outer(s, s))
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_the_product_is_that_with_the_dense_bfgs_matrix(count: int) -> None:
+    """Products with many vectors at once are those with each of them."""
+    rng = np.random.default_rng(count)
+    curvature, start = positive(rng, 6), positive(rng, 6)
+    s = rng.normal(size=(count, *SHAPE))
+    y = (s.reshape(count, 6) @ curvature).reshape(s.shape)
+    pairs = convex_pairs(s, y, 1e-10) if count else []
+    assert len(pairs) == count
+
+    H = start
+    for pair in pairs:
+        H = updated(H, pair.s.reshape(-1), pair.y.reshape(-1))
+
+    def initial(g: np.ndarray) -> np.ndarray:
+        return np.asarray((g.reshape(-1, 6) @ start).reshape(g.shape))
+
+    many = rng.normal(size=(5, *SHAPE))
+    expected = (many.reshape(5, -1) @ H).reshape(many.shape)
+    np.testing.assert_allclose(inverse_hessian_product(many, pairs, initial), expected, rtol=1e-9)
+    for g, product in zip(many, expected, strict=True):
+        np.testing.assert_allclose(inverse_hessian_product(g, pairs, initial), product, rtol=1e-9)
+
+
+def test_only_pairs_of_clearly_positive_curvature_are_kept() -> None:
+    s = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 2.0]])
+    y = np.array([[3.0, 1.0], [-1.0, 5.0], [1.0, 1.0], [1.0, 1e-9]])
+    kept = convex_pairs(s, y, 1e-8)
+    assert [pair.curvature for pair in kept] == [3.0]
+    np.testing.assert_array_equal(kept[0].y, y[0])
+
+    for step, change in zip(s, y, strict=True):
+        alone = CurvaturePair.where_convex(step, change, 1e-8)
+        assert (alone is not None) == (float(step @ change) > 1.0)
