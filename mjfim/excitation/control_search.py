@@ -310,7 +310,25 @@ def choose(
     if cheaper:
         status = Status.BEST_SEEN if best.status is Status.INFEASIBLE else best.status
         best, point = replace(best, status=status), min(cheaper, key=lambda begin: begin.cost)
-    return Choice(best=best, point=point, results=tuple(known))
+    return Choice(best=best, point=point, results=tuple(_comparable(known, best)))
+
+
+def _comparable(results: Sequence[RunResult], best: RunResult) -> list[RunResult]:
+    """Results whose costs can be compared with that of the best run.
+
+    J of a control that violates a limit is infinite where the best run keeps all limits: it would
+    look like a better result that was not chosen.
+
+    Args:
+        results: Result of every run.
+        best: The best of them.
+    """
+    if not best.is_feasible:
+        return list(results)
+    return [
+        result if result.is_feasible or result.point is None else replace(result, cost=np.inf)
+        for result in results
+    ]
 
 
 def _best_of(results: Sequence[RunResult]) -> RunResult:

@@ -30,7 +30,7 @@ ROUND_OFF = 1e-12
 
 # Smallest factor by which the line search shortens a rejected step; the largest factor is a
 # setting.
-MIN_SHORTENING = 0.1
+MIN_SHORTENING = 0.3
 
 # Largest predicted decrease of the first trial step, relative to the scale of the cost.
 MAX_PREDICTED_DECREASE = 2.0
@@ -203,7 +203,7 @@ class Armijo:
     """Backtracking line search until `J(gamma) <= J(0) + sigma gamma DJ.zeta`.
 
     A rejected gamma is shortened to the minimum of the parabola through J(0), the slope and
-    J(gamma), within [0.1, beta] gamma.
+    J(gamma), within [0.3, beta] gamma.
 
     Attributes:
         sigma: Smallest accepted share of the predicted decrease.

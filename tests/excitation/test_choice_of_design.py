@@ -73,6 +73,27 @@ def test_the_best_of_many_starts_is_evaluated_whatever_its_place(
     assert [result.point is None for result in choice.results] == [False, False, True]
 
 
+def test_a_control_outside_the_limits_does_not_look_better_than_the_design(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A start that was discarded outside the limits is evaluated, but has no cost to compare."""
+
+    def point(stage: object, control: Array) -> Any:
+        """Evaluate a control."""
+        return SimpleNamespace(cost=control[0, 0])
+
+    monkeypatch.setattr(control_search, "point_at_stated_rate", point)
+    inside = replace(stopped(4.0), cost=4.0)
+    outside = replace(stopped(1.0), is_feasible=False, status=Status.LEFT)
+    choice = choose(SEARCH, [INITIAL], [inside, outside], False)
+    assert (choice.best.name, choice.point.cost) == ("4", 4.0)
+    assert [result.cost for result in choice.results] == [4.0, np.inf]
+
+    # Where nothing is inside, the costs tell which one was chosen.
+    alone = choose(SEARCH, [INITIAL], [outside], True)
+    assert [result.cost for result in alone.results] == [1.0]
+
+
 def test_a_design_all_of_whose_workers_are_lost_says_so() -> None:
     results = [RunResult(name=name, status=Status.LOST) for name in ("first", "second")]
     with pytest.raises(LostWorkError, match="the workers of all starts were lost"):

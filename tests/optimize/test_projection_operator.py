@@ -68,6 +68,8 @@ class Pendulum:
         sign: Sign of the gradient of `expand`.
         wall: Size of the torque above which a trial diverges.
         refinements: Number of times that `refine` returns a more accurate point.
+        values: Every value that was asked for.
+        gammas: Every step length that was tried.
     """
 
     shift: float = 0.0
@@ -75,6 +77,7 @@ class Pendulum:
     wall: float = np.inf
     refinements: int = 0
     values: list[float] = field(default_factory=list)
+    gammas: list[float] = field(default_factory=list)
 
     def rollout(self, u: Array) -> Curve:
         """Trajectory without feedback."""
@@ -112,6 +115,7 @@ class Pendulum:
 
     def project(self, point: Curve, zeta: TangentCurve, gamma: float, K: Array) -> Curve:
         """The projection operator, sample by sample."""
+        self.gammas.append(gamma)
         x, u = [START], []
         for k in range(N):
             u.append(
@@ -337,10 +341,13 @@ def test_armijo_accepts_a_step_of_sufficient_decrease_however_long_the_direction
     assert problem.value(trial) <= value + sigma * gamma * slope
     assert problem.value(trial) < value
     assert 0.0 < gamma <= 1.0
-    rejected = problem.values[
-        1:-3
-    ]  # between J at the start and the three asked for after the accepted one
-    assert all(v > value + sigma * gamma * slope for v in rejected[:-1])
+
+    # Between J at the start and the three that are asked for after the accepted one.
+    *rejected, accepted = problem.values[1:-3]
+    *longer, last = problem.gammas
+    assert (accepted, last) == (problem.value(trial), gamma)
+    tried = zip(rejected, longer, strict=True)
+    assert all(v > value + sigma * step_length * slope for v, step_length in tried)
 
 
 def test_armijo_rejects_small_decrease_that_is_not_sufficient() -> None:
