@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -178,6 +179,25 @@ def test_every_part_has_measurements_with_names_of_their_own(tmp_path: Path) -> 
         assert len(set(names)) == len(names)
         assert {"short_fit", "help"} <= set(names)
         assert all(Path(name).name == name for name in names)
+
+
+@pytest.mark.parametrize("is_quick", [False, True])
+def test_every_measurement_gets_the_arguments_of_its_function(
+    is_quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called: list[str] = []
+
+    def bound(function: str, package: Path, **arguments: object) -> None:
+        """Raise TypeError where the function does not take the arguments."""
+        inspect.signature(getattr(measurements, function)).bind(**arguments)
+        called.append(function)
+
+    monkeypatch.setattr(script, "measure_in_subprocess", bound)
+    sizes = script.Sizes(is_quick=is_quick, hours=1.0, folder=tmp_path)
+    for name in ("starts", "ratios", "limits", "compare"):
+        for measurement in script.PARTS[name].measurements(sizes):
+            measurement.run(tmp_path)
+    assert {"starts_side_by_side", "ratio_to_engine", "limited_cart_pendulum"} < set(called)
 
 
 def test_the_table_has_a_row_for_each_line() -> None:

@@ -329,13 +329,13 @@ def _over_earlier_steps(earlier: Figures, own: Figures) -> Figure:
 
 def ratios(sizes: Sizes) -> Iterator[Measurement]:
     """Time of cart-pendulum designs over that of the engine."""
-    repeats = 1 if sizes.is_quick else 3
+    runs = 1 if sizes.is_quick else 3
     yield _of(
         "ratio_to_engine",
-        f"ratios_{repeats}",
+        f"ratios_{runs}",
         Line(name="cart-pendulum: wall over engine", figure="levels", goal=SHORT_RATIO),
         Line(name="the same with one level", figure="one level", goal=SHORT_RATIO),
-        repeats=repeats,
+        runs=runs,
     )
 
 

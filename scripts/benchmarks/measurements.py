@@ -225,7 +225,7 @@ def arm_iterations(
     }
 
 
-def ratio_to_engine(repeats: int) -> Figures:
+def ratio_to_engine(runs: int) -> Figures:
     """Divide the time of cart-pendulum designs by that of the engine; the worst of all cases."""
     from mjfim.excitation.task import DesignTask
     from scripts.benchmarks import benchmark
@@ -235,7 +235,7 @@ def ratio_to_engine(repeats: int) -> Figures:
     for name, descent in (("levels", {}), ("one level", {"coarse": 1})):
         ratios = []
         for case in benchmark.CASES:
-            run, design = benchmark.fastest(repeats, case, name, **descent)
+            run, design = benchmark.fastest(runs, case, name, **descent)
             task = DesignTask.resolve(benchmark.experiment(case))
             step = benchmark.step_seconds(task, design.trajectory)
             ratios.append(run.seconds * cores() / (design.steps * step))
