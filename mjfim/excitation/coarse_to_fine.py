@@ -49,9 +49,6 @@ STATED_LAST_WEIGHT = 1e-5
 STATED_RELAXATION = 0.1
 STATED_TOLERANCE = 1e-6
 
-# Number of iterations for which there has to be time before a round on a finer level begins.
-FEWEST_ITERATIONS = 2.0
-
 # Number of iterations in the time of a search on the stated level below which its five stages would
 # end before a step. It then begins with the barrier weight of the level before, and ends with the
 # usual smallest one.
@@ -92,7 +89,7 @@ class CoarseToFine(LimitedRounds):
         # The descents end so close to an optimum that a sharp barrier takes most iterations.
         schedule = BarrierSchedule(first=entry.mu, last=stage.last_mu, follows_curvature=True)
         if is_stated:
-            is_short = seconds < FEW_ITERATIONS * self._seconds_of_iteration(entry)
+            is_short = seconds < FEW_ITERATIONS * self.seconds_of_iteration(entry)
             sharp = replace(self.sharpest, first=entry.mu)
             schedule = self._short_schedule(entry) if is_short else sharp
         return SearchTerms(
@@ -151,7 +148,7 @@ class CoarseToFine(LimitedRounds):
         if not has_feasible:
             return True
 
-        return self._seconds_left >= FEWEST_ITERATIONS * self._seconds_of_iteration(entry)
+        return self.has_time_for(entry)
 
     def next_round(self, number: int, done: int) -> int:
         """Number of the round that follows another one, see `RoundPlan`.
@@ -182,7 +179,7 @@ class CoarseToFine(LimitedRounds):
     def affordable(self) -> Sequence[InitialControl]:
         """The first starts, as many as can be optimised roughly in the time of the first round."""
         starts = self.starts
-        seconds = ROUND_SHARE * self._seconds_left
+        seconds = ROUND_SHARE * self.seconds_left
         if len(starts) == 1 or np.isinf(seconds):
             return starts
 
@@ -202,13 +199,3 @@ class CoarseToFine(LimitedRounds):
         # A control that is far from an optimum still needs a blunt barrier.
         first = self.rounds[-2].last_mu if entry.mu <= STATED_FIRST_WEIGHT else entry.mu
         return BarrierSchedule(first=first, follows_curvature=True)
-
-    def _seconds_of_iteration(self, entry: Entry) -> float:
-        """Expected time of an iteration on the level of a start [s]; 0 in the first round."""
-        task = self.rounds[entry.round].level.task
-        return entry.seconds_per_step * task.samples * task.system.grid.substeps
-
-    @property
-    def _seconds_left(self) -> float:
-        """Time that is left for rounds [s]."""
-        return max(self.searches.budget.seconds_left - self.reserved_seconds, 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule
 from mjfim.excitation.rescue import Rescue
-from mjfim.excitation.rounds import RoundPlan
+from mjfim.excitation.rounds import Entry, RoundPlan
 from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.run_rounds import run_rounds
 from mjfim.excitation.tightened_runs import run_within_tighter_limits
@@ -19,6 +19,9 @@ from mjfim.excitation.winner_repair import WinnerRepair
 
 # Share of the time that is reserved for runs within tighter limits.
 RESERVED_SHARE = 0.05
+
+# Number of iterations for which there has to be time, so that the search of a start is useful.
+FEWEST_ITERATIONS = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,6 +94,19 @@ class LimitedRounds(RoundPlan):
     def reserved_seconds(self) -> float:
         """Time that is reserved for runs within tighter limits [s]; 0 without a limit of time."""
         return RESERVED_SHARE * (self.searches.stated.task.experiment.descent.seconds or 0.0)
+
+    @property
+    def seconds_left(self) -> float:
+        """Time that is left for rounds [s]."""
+        return max(self.searches.budget.seconds_left - self.reserved_seconds, 0.0)
+
+    def seconds_of_iteration(self, entry: Entry) -> float:
+        """Expected time of an iteration on the level of a start [s]; 0 in the first round."""
+        return entry.seconds_per_step * self.rounds[entry.round].level.engine_steps
+
+    def has_time_for(self, entry: Entry) -> bool:
+        """Check whether there is time for a useful search on the level of a start."""
+        return self.seconds_left >= FEWEST_ITERATIONS * self.seconds_of_iteration(entry)
 
     @property
     def max_iterations(self) -> int:

@@ -40,9 +40,6 @@ FIRST_ROUND_SHARE = 0.5
 BRIEF_MU = 0.03
 BRIEF_SHARE = 0.75
 
-# Number of iterations for which there has to be time before the second round of such a design.
-FEWEST_ITERATIONS = 2.0
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Multistart(LimitedRounds):
@@ -106,11 +103,7 @@ class Multistart(LimitedRounds):
         """Check whether there is time for a useful search, see `RoundPlan`."""
         if not (self._is_coarse_only and has_feasible):
             return True
-
-        # An iteration on the stated level takes longer, in proportion to its engine steps.
-        iteration = entry.seconds_per_step * self.searches.stated.engine_steps
-        left = self.searches.budget.seconds_left - self.reserved_seconds
-        return left >= FEWEST_ITERATIONS * iteration
+        return self.has_time_for(entry)
 
     def late(self, entry: Entry, result: RunResult, *, is_tried: bool) -> RunResult:
         """Result of a start that was not judged, see `RoundPlan`.

@@ -31,8 +31,9 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.tightened_runs import run_within_tighter_limits
 from mjfim.excitation.winner_repair import ViolatingWinner, WinnerRepair
 from mjfim.experiment.schema import Experiment
-from mjfim.records.design import HistoryRow, Status
+from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
+from tests.support.made_records import make_row
 from tests.support.paths import MODELS
 
 LIMITS = Experiment.from_file(MODELS / "cart_pendulum_limits.toml")
@@ -252,17 +253,7 @@ def test_runs_within_tighter_limits_are_as_sharp_as_the_result_before(
     reached: float, last: float, search: CoarseToFine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     control = search.searches.stated.task.control
-    row = HistoryRow(
-        iteration=7,
-        cost=1.0,
-        criterion=1.0,
-        min_eigenvalue=1.0,
-        slope=0.1,
-        gamma=1.0,
-        seconds=1.0,
-        steps=100,
-        mu=reached,
-    )
+    row = make_row(iteration=7, slope=0.1, seconds=1.0, steps=100, mu=reached)
     result = RunResult(name="a", control=control, cost=1.0, history=(row,))
 
     def first_one(*args: object) -> ViolatingWinner:

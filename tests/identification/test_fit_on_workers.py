@@ -119,16 +119,24 @@ class HangingThreads(ThreadPoolExecutor):
         return Future()
 
 
-def test_workers_that_hang_after_a_request_to_stop_are_waited_for_once(
+@pytest.fixture
+def in_small_batches(
     experiment: mjfim.Experiment,
     recordings: list[mjfim.Recording],
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
+) -> FitProblem:
+    """A problem with many batches, each of which is a task."""
     monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
+    return problem_of(experiment, recordings, SEGMENTS)
+
+
+def test_workers_that_hang_after_a_request_to_stop_are_waited_for_once(
+    in_small_batches: FitProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = in_small_batches
     monkeypatch.setattr(fit_workers, "GRACE", 0.01)
     monkeypatch.setattr(dispatch, "GRACE", 0.01)
     monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.01)
-    problem = problem_of(experiment, recordings, SEGMENTS)
     begin = problem.begin(problem.system.parameters.guess)
     stop = StopToken()
     stop.request()
@@ -142,12 +150,9 @@ def test_workers_that_hang_after_a_request_to_stop_are_waited_for_once(
 
 
 def test_workers_that_lose_one_task_after_a_request_to_stop_do_the_next_ones(
-    experiment: mjfim.Experiment,
-    recordings: list[mjfim.Recording],
-    monkeypatch: pytest.MonkeyPatch,
+    in_small_batches: FitProblem,
 ) -> None:
-    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
-    problem = problem_of(experiment, recordings, SEGMENTS)
+    problem = in_small_batches
     begin = problem.begin(problem.system.parameters.guess)
     stop = StopToken()
     stop.request()
@@ -180,12 +185,9 @@ def stopped_fit(
 
 
 def test_a_request_to_stop_ends_the_pass_that_runs_and_keeps_the_values_of_before(
-    experiment: mjfim.Experiment,
-    recordings: list[mjfim.Recording],
-    monkeypatch: pytest.MonkeyPatch,
+    in_small_batches: FitProblem,
 ) -> None:
-    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
-    problem = problem_of(experiment, recordings, SEGMENTS)
+    problem = in_small_batches
     begin = problem.begin(1.05 * problem.system.parameters.guess)
     stop = StopToken()
 

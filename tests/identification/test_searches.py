@@ -38,7 +38,33 @@ WAVE_LENGTH = 1.2345e-9
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rough:
+class OneParameter:
+    """What residuals of one unbounded parameter have in common."""
+
+    lower = np.array([-np.inf])
+    upper = np.array([np.inf])
+
+    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
+        """The unknowns after a fraction of a step."""
+        return replace(at, theta=at.theta + fraction * step.common)
+
+    def common_values(self, at: UnknownValues) -> Array:
+        """The parameter."""
+        return at.theta
+
+
+def condensed(slopes: Array, residuals: Array) -> Condensed:
+    """The triangle of residuals of one parameter, and of their derivatives."""
+    return Condensed(
+        blocks=np.linalg.qr(np.column_stack([slopes, residuals]), mode="r")[None],
+        segment_of_block=np.zeros(1, dtype=int),
+        private_rows=np.zeros((1, 0, 2)),
+        common_rows=np.zeros((0, 2)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rough(OneParameter):
     """Residuals of one parameter, a line with short waves, whose minimum is near 1.
 
     Attributes:
@@ -46,8 +72,6 @@ class Rough:
     """
 
     step: float = 1e-7
-    lower = np.array([-np.inf])
-    upper = np.array([np.inf])
     sample_count = COUNT
 
     def residuals(self, theta: float) -> Array:
@@ -64,21 +88,7 @@ class Rough:
         """Linearise by two-sided differences."""
         theta = at.theta[0]
         rise = self.residuals(theta + self.step) - self.residuals(theta - self.step)
-        rows = np.column_stack([rise / (2.0 * self.step), self.residuals(theta)])
-        return Condensed(
-            blocks=np.linalg.qr(rows, mode="r")[None],
-            segment_of_block=np.zeros(1, dtype=int),
-            private_rows=np.zeros((1, 0, 2)),
-            common_rows=np.zeros((0, 2)),
-        )
-
-    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
-        """The unknowns after a fraction of a step."""
-        return replace(at, theta=at.theta + fraction * step.common)
-
-    def common_values(self, at: UnknownValues) -> Array:
-        """The parameter."""
-        return at.theta
+        return condensed(rise / (2.0 * self.step), self.residuals(theta))
 
     def with_longer_differences(self, factor: float) -> Rough:
         """The same residuals with longer steps."""
@@ -177,7 +187,7 @@ def test_a_part_of_recordings_that_repeat_in_turn_holds_different_ones() -> None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parts:
+class Parts(OneParameter):
     """Segments of one parameter, some of which have another minimum and diverge beyond a limit.
 
     Attributes:
@@ -190,8 +200,6 @@ class Parts:
     sample_count = 24_800
     workers = None
     layout = SimpleNamespace(free_starts=False)
-    lower = np.array([-np.inf])
-    upper = np.array([np.inf])
 
     def residuals(self, theta: float) -> Array:
         """One residual of each segment."""
@@ -207,21 +215,7 @@ class Parts:
     def condense(self, at: UnknownValues) -> Condensed:
         """Linearise."""
         r = self.residuals(at.theta[0])
-        rows = np.column_stack([np.full(len(r), SLOPE), r])
-        return Condensed(
-            blocks=np.linalg.qr(rows, mode="r")[None],
-            segment_of_block=np.zeros(1, dtype=int),
-            private_rows=np.zeros((1, 0, 2)),
-            common_rows=np.zeros((0, 2)),
-        )
-
-    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
-        """The unknowns after a fraction of a step."""
-        return replace(at, theta=at.theta + fraction * step.common)
-
-    def common_values(self, at: UnknownValues) -> Array:
-        """The parameter."""
-        return at.theta
+        return condensed(np.full(len(r), SLOPE), r)
 
     def of_segments(self, indices: np.ndarray) -> Parts:
         """Some segments."""
