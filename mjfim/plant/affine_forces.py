@@ -11,6 +11,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.parameter_change import ParameterChange
 
 # MjData fields whose sum are these forces.
 FORCE_FIELDS = ("qfrc_passive", "qfrc_actuator")
@@ -116,6 +117,39 @@ class AffineForces:
         slopes = self._slopes(acts, self._applied(ctrl)[1])
         return ForceSlopes(slopes=slopes, implicit_damping=self._damping(slopes), agree=agree)
 
+    def change(self, states: Array, ctrl: Array, acceleration: Array, by: ParameterChange) -> Array:
+        """Derivatives of the right-hand side of an engine step, `forces - timestep D a`.
+
+        Args:
+            states: (n, 2 nv) states before the step.
+            ctrl: (n, nu) controls.
+            acceleration: (n, nv) mean accelerations a.
+            by: Change of the model by m parameters.
+
+        Returns:
+            (n, nv, m) derivatives at fixed accelerations.
+        """
+        points = self._points(states, ctrl)
+        acts = self._clamped(points)[1]
+
+        # Where the integrator takes all forces at the end of the step, the step moves the speeds.
+        model, nv = self.model, acceleration.shape[1]
+        if self._is_implicit:
+            speeds = slice(1 + nv, 1 + 2 * nv)
+            points = np.array(points)
+            points[:, speeds] += float(model.opt.timestep) * acceleration
+
+        total = np.zeros((len(points), nv, by.count))
+        for joint, k in np.argwhere(by.springs.any(axis=1)).tolist():
+            total[:, joint, k] += points @ by.springs[joint, :, k]
+        for actuator, k in np.argwhere(by.actuators.any(axis=1)).tolist():
+            force = acts[:, actuator] * (points @ by.actuators[actuator, :, k])
+            total[:, :, k] += force[:, None] * self.moments[actuator]
+
+        if self._damps_implicitly:
+            total -= float(model.opt.timestep) * acceleration[..., None] * by.damping
+        return total
+
     def actuator_slopes(self, states: Array, ctrl: Array) -> Array:
         """(n, actuators, 2 nv + nu) derivatives of the actuators' forces at n states.
 
@@ -170,12 +204,23 @@ class AffineForces:
 
     def _damping(self, slopes: Array) -> Array:
         """(n, nv, nv) damping that the integrator takes at the end of an engine step."""
-        model, nv = self.model, slopes.shape[1]
-        if model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        nv = slopes.shape[1]
+        if self._is_implicit:
             return -slopes[..., nv : 2 * nv]
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP):
+        if not self._damps_implicitly:
             return np.zeros((len(slopes), nv, nv))
-        return np.broadcast_to(np.diag(model.dof_damping), (len(slopes), nv, nv))
+        return np.broadcast_to(np.diag(self.model.dof_damping), (len(slopes), nv, nv))
+
+    @property
+    def _is_implicit(self) -> bool:
+        """Whether the integrator takes all forces at the end of an engine step."""
+        return bool(self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+
+    @property
+    def _damps_implicitly(self) -> bool:
+        """Whether it takes those of the joints' dampers, and no others, at the end of the step."""
+        is_explicit = self.model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        return not (self._is_implicit or is_explicit)
 
     def _applied(self, ctrl: Array) -> tuple[Array, np.ndarray]:
         """(n, nu) controls within their limits, and (n, nu) True where they are not clamped."""

@@ -5,13 +5,15 @@ An engine step of such a plant solves
     M(q) a + c(q, v) = tau - timestep D a,      tau = offset + slopes (q, v, u)
 
 for the mean acceleration a, and sets `v+ = v + timestep a` and `q+ = q + timestep v+`. Derivatives
-of the left-hand side at fixed a have a closed form (`RigidBodyMotion`), and it is linear in the
-inertial parameters. So one engine step at each state takes the place of a step for every coordinate
+of the left-hand side at fixed a have a closed form (`RigidBodyMotion`), which is linear in the
+inertial parameters, and the right-hand side is affine in damping, stiffness and gains
+(`AffineForces`). So one engine step at each state takes the place of a step for every coordinate
 and every parameter. Whether the equation holds is checked at every engine step.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +21,10 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.parameters import Parameter
-from mjfim.model.targets import InertiaField, ModelField
 from mjfim.plant.affine_forces import FORCE_FIELDS, AffineForces, ForceSlopes
 from mjfim.plant.batch import BatchSimulator
 from mjfim.plant.joint_tree import JointTree
+from mjfim.plant.parameter_change import ParameterChange
 from mjfim.plant.rigid_body_motion import MOTION_FIELDS, RigidBodyMotion, barycentric_inertias
 
 # Smallest number of joints for which derivatives have a closed form. With four hinges, a gradient
@@ -39,11 +40,8 @@ RECORDED_FIELDS = (*MOTION_FIELDS, *FORCE_FIELDS, "xpos", "xmat")
 # Engine steps whose derivatives are computed at once, so that they stay in the processor's cache.
 STEPS_AT_ONCE = 500
 
-# Arrays of MjModel that hold the inertia of bodies.
-INERTIA_ARRAYS = ("body_mass", "body_ipos", "body_inertia")
-
-# Difference step of the inertias by the parameters, relative to the size of a parameter.
-INERTIA_STEP = 1e-5
+# Difference step of the model by the parameters, relative to the size of a parameter.
+MODEL_STEP = 1e-5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,16 +145,6 @@ def _has_polynomial_forces(model: Any) -> bool:
     )
 
 
-def is_inertial(parameter: Parameter) -> bool:
-    """Whether a parameter changes nothing but the inertia of bodies."""
-    fields = [target.field for target in parameter.targets]
-    return bool(fields) and all(
-        isinstance(field, InertiaField)
-        or (isinstance(field, ModelField) and field.array in INERTIA_ARRAYS)
-        for field in fields
-    )
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClosedForm:
     """Derivatives of samples in closed form.
@@ -172,7 +160,7 @@ class ClosedForm:
     sizes: Array
 
     def jacobians(
-        self, model: Any, states: Array, ctrl: Array, inertia_change: Array | None = None
+        self, model: Any, states: Array, ctrl: Array, change: ParameterChange | None = None
     ) -> SampleJacobians | None:
         """First derivatives of samples.
 
@@ -180,21 +168,18 @@ class ClosedForm:
             model: The model at the parameter values.
             states: (N, 2 nv) states before the samples.
             ctrl: (N, nu) controls, held over the samples.
-            inertia_change: (b, 10, m) derivative of the moved bodies' barycentric inertias by m
-                parameters; None for none.
+            change: Change of the model by m parameters; None for none.
 
         Returns:
             The derivatives; None where the samples have another equation of motion.
         """
-        if inertia_change is None:
-            inertia_change = np.zeros((len(self.tree.bodies), 10, 0))
         forces = AffineForces.measured(self.simulator, model, states[0], ctrl[0], self.sizes)
         system = _System(
             simulator=self.simulator,
             tree=self.tree,
             model=model,
             forces=forces,
-            inertia_change=inertia_change,
+            change=change,
         )
 
         parts = []
@@ -218,9 +203,36 @@ class ClosedForm:
             forces=forces,
         )
 
-    def inertias(self, model: Any) -> Array:
-        """(b, 10) barycentric inertias of the moved bodies in a model."""
-        return barycentric_inertias(model, self.tree.bodies)
+    def change_between(
+        self, pair: Sequence[Any], state: Array, ctrl: Array, distance: float
+    ) -> ParameterChange:
+        """Change of the model by one parameter, by two-sided differences.
+
+        Coordinates in which the model is not linear need no other treatment.
+
+        Args:
+            pair: The model at a larger and at a smaller value of the parameter.
+            state: (2 nv,) state about which forces are measured.
+            ctrl: (nu,) control about which they are measured.
+            distance: Distance of the two values.
+        """
+        more, less = pair
+        forces = [
+            AffineForces.measured(self.simulator, model, state, ctrl, self.sizes) for model in pair
+        ]
+        inertias = [barycentric_inertias(model, self.tree.bodies) for model in pair]
+
+        def quotient(larger: Array, smaller: Array) -> Array:
+            """Quotient by one parameter."""
+            return np.asarray((larger - smaller)[..., None] / distance)
+
+        return ParameterChange(
+            inertia=quotient(*inertias),
+            springs=quotient(forces[0].springs, forces[1].springs),
+            actuators=quotient(forces[0].actuators, forces[1].actuators),
+            damping=quotient(more.dof_damping, less.dof_damping),
+            armature=quotient(more.dof_armature, less.dof_armature),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -232,14 +244,14 @@ class _System:
         tree: Joints of the model.
         model: The model.
         forces: Forces of springs and actuators.
-        inertia_change: (b, 10, m) derivative of the moved bodies' inertias by m parameters.
+        change: Change of the model by m parameters; None for none.
     """
 
     simulator: BatchSimulator
     tree: JointTree
     model: Any
     forces: AffineForces
-    inertia_change: Array
+    change: ParameterChange | None
 
     def jacobians(self, states: Array, ctrl: Array) -> SampleJacobians | None:
         """First derivatives of N samples, see `ClosedForm.jacobians`."""
@@ -272,10 +284,12 @@ class _System:
         inverse = np.linalg.inv(motion.mass_matrix + self._timestep * slopes.implicit_damping)
         by_point = inverse @ by_point
 
-        count = self.inertia_change.shape[2]
+        count = 0 if self.change is None else self.change.count
         by_theta: Array = np.zeros((N * substeps, nv, count))
-        if count:
-            by_theta = inverse @ -self._regressor(motion, fields)
+        if self.change is not None and count:
+            points = _flat(steps.states[:, :-1]), np.repeat(ctrl, substeps, axis=0)
+            forces = self.forces.change(*points, motion.acceleration, self.change)
+            by_theta = inverse @ (forces - self._inertial(motion, fields, self.change))
         accelerations = by_point.reshape(N, substeps, nv, -1)
         A, B, E = self._over_samples(accelerations, by_theta.reshape(N, substeps, nv, count))
         return SampleJacobians(
@@ -296,11 +310,14 @@ class _System:
         error = np.abs(motion.force + self._timestep * damping[..., 0] - force)
         return bool((error <= LARGEST_ERROR * motion.largest_force).all())
 
-    def _regressor(self, motion: RigidBodyMotion, fields: dict[str, Array]) -> Array:
-        """(n, nv, m) derivatives of the joint forces by the parameters."""
+    def _inertial(
+        self, motion: RigidBodyMotion, fields: dict[str, Array], change: ParameterChange
+    ) -> Array:
+        """(n, nv, m) derivatives of the forces that the motion needs by the parameters."""
         bodies = self.tree.bodies
         axes = fields["xmat"].reshape(len(motion.speed), -1, 3, 3)
-        return motion.regressor(fields["xpos"][:, bodies], axes[:, bodies], self.inertia_change)
+        total = motion.regressor(fields["xpos"][:, bodies], axes[:, bodies], change.inertia)
+        return np.asarray(total + motion.acceleration[..., None] * change.armature)
 
     def _over_samples(self, by_point: Array, by_theta: Array) -> tuple[Array, Array, Array]:
         """A, B and E of samples from derivatives of the accelerations of their engine steps.

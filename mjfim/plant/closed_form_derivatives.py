@@ -10,14 +10,14 @@ from mjfim.arrays import Array
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.plant.closed_form import (
-    INERTIA_STEP,
+    MODEL_STEP,
     ClosedForm,
     SampleJacobians,
     closed_form_tree,
-    is_inertial,
 )
 from mjfim.plant.closed_form_observations import observation_jacobian
 from mjfim.plant.difference_steps import DifferenceSteps
+from mjfim.plant.parameter_change import ParameterChange, acts_on_joints, is_inertial
 from mjfim.records.trajectory import Trajectory
 
 # Largest number of parameter values for which the derivatives of the inertias are kept.
@@ -89,19 +89,21 @@ class ClosedFormMemory:
 
     Attributes:
         tree: Joints of the model; None where there is no closed form.
-        inertial: (p,) True for parameters that change nothing but the inertia of bodies.
+        covered: (p,) True for parameters by which derivatives have a closed form: those that change
+            nothing but inertias, or nothing but springs, dampers, gains and armatures.
         latest: Derivatives that were computed last. The gradient of a design needs those of the
             trajectory whose sensitivities were computed before.
-        inertia_change: (b, 10, p) derivative of the moved bodies' inertias by the parameters, by
-            the bytes of theta.
+        changes: Change of the model by the covered parameters, by the bytes of theta.
     """
 
     def __init__(self, simulator: BatchSimulator, parameters: ParameterSet) -> None:
         """Begin with nothing computed."""
         self.tree = None if simulator.sensors else closed_form_tree(simulator.model)
-        self.inertial = np.array([is_inertial(p) for p in parameters.parameters], dtype=bool)
+        self.covered = np.array(
+            [is_inertial(p) or acts_on_joints(p) for p in parameters.parameters], dtype=bool
+        )
         self.latest: _KnownJacobians | None = None
-        self.inertia_change: dict[bytes, Array] = {}
+        self.changes: dict[bytes, ParameterChange] = {}
 
 
 class ClosedFormDerivatives(DifferenceSteps):
@@ -110,7 +112,7 @@ class ClosedFormDerivatives(DifferenceSteps):
     def closed_form_sensitivity(
         self, theta: Array, trajectory: Trajectory, directions: Array
     ) -> KnownSensitivities | None:
-        """Sensitivities of the states along directions of the inertial parameters.
+        """Sensitivities of the states along directions of the covered parameters.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -118,16 +120,16 @@ class ClosedFormDerivatives(DifferenceSteps):
             directions: (n, p) directions of theta [theta-unit].
 
         Returns:
-            The sensitivities along directions that change nothing but inertias; None where there is
-            no closed form or no such direction.
+            The sensitivities along directions of the covered parameters; None where there is no
+            closed form or no such direction.
         """
         memory = self.plant.closed_form_memory
-        among_inertial = np.asarray(~directions[:, ~memory.inertial].any(axis=1))
+        among = np.asarray(~directions[:, ~memory.covered].any(axis=1))
         closed = self._closed_form(trajectory)
-        if closed is None or not among_inertial.any():
+        if closed is None or not among.any():
             return None
 
-        change = self._inertia_change(closed, theta)
+        change = self._change(closed, theta, trajectory)
         if change is None:
             return None
 
@@ -135,7 +137,7 @@ class ClosedFormDerivatives(DifferenceSteps):
             self.plant.model(theta),
             trajectory.state[:-1],
             trajectory.ctrl,
-            change @ directions[among_inertial].T,
+            change.along(directions[np.ix_(among, memory.covered)]),
         )
         if found is None:
             return None
@@ -144,7 +146,7 @@ class ClosedFormDerivatives(DifferenceSteps):
         psi = np.zeros((len(found.A) + 1, *found.E.shape[1:]))
         for k, (A, E) in enumerate(zip(found.A, found.E, strict=True)):
             psi[k + 1] = A @ psi[k] + E
-        return KnownSensitivities(among=among_inertial, psi=np.moveaxis(psi, 2, 0))
+        return KnownSensitivities(among=among, psi=np.moveaxis(psi, 2, 0))
 
     def closed_form_mixed(
         self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array
@@ -243,33 +245,31 @@ class ClosedFormDerivatives(DifferenceSteps):
             jacobians=replace(found, E=np.zeros((*found.E.shape[:2], 0))),
         )
 
-    def _inertia_change(self, closed: ClosedForm, theta: Array) -> Array | None:
-        """(b, 10, p) derivative of the moved bodies' inertias, by two-sided differences.
-
-        Coordinates in which inertias are not linear need no other treatment. None where MuJoCo
-        cannot compile a moved model.
-        """
+    def _change(
+        self, closed: ClosedForm, theta: Array, trajectory: Trajectory
+    ) -> ParameterChange | None:
+        """Change of the model by the covered parameters; None where MuJoCo cannot compile it."""
         memory = self.plant.closed_form_memory
         key = np.asarray(theta, dtype=np.float64).tobytes()
-        known = memory.inertia_change.get(key)
+        known = memory.changes.get(key)
         if known is not None:
             return known
 
-        steps = INERTIA_STEP * self.plant.parameters.magnitude
-        change = np.zeros((len(closed.tree.bodies), 10, len(theta)))
-        for i in np.flatnonzero(memory.inertial):
+        steps = MODEL_STEP * self.plant.parameters.magnitude
+        changes = []
+        for i in np.flatnonzero(memory.covered):
             move = np.zeros(len(theta))
             move[i] = steps[i]
             pair, compiled = self.plant.try_models(np.stack([theta + move, theta - move]))
             if not compiled.all():
                 return None
-            forward, backward = (closed.inertias(model) for model in pair)
-            change[:, :, i] = (forward - backward) / (2.0 * steps[i])
+            begin = trajectory.state[0], trajectory.ctrl[0]
+            changes.append(closed.change_between(pair, *begin, 2.0 * steps[i]))
 
-        if len(memory.inertia_change) >= MAX_KEPT_CHANGES:
-            memory.inertia_change.clear()
-        memory.inertia_change[key] = change
-        return change
+        if len(memory.changes) >= MAX_KEPT_CHANGES:
+            memory.changes.clear()
+        memory.changes[key] = ParameterChange.joined(changes)
+        return memory.changes[key]
 
 
 def _has_same_clamps(origin: SampleJacobians, moved: SampleJacobians, ctrl: Array) -> np.ndarray:

@@ -111,7 +111,7 @@ class RolloutDerivatives(ClosedFormDerivatives):
             lumped: Parameters whose columns follow from those of the others, without rollouts of
                 their own; None for none. Where this motion shows that they do not follow, all
                 parameters are moved.
-            closed_form: True to take derivatives by inertial parameters in closed form where the
+            closed_form: True to take derivatives in closed form, by the parameters for which the
                 plant has one.
 
         Returns:
@@ -200,8 +200,8 @@ class RolloutDerivatives(ClosedFormDerivatives):
             states: (N+1, ns) states at theta, or None where they are not known.
             central: True for two-sided differences.
             lumped: Parameters whose columns follow from those of the others, or None.
-            closed_form: The trajectory at theta, whose derivatives by inertial parameters are
-                taken in closed form where the plant has one; None for rollouts only.
+            closed_form: The trajectory at theta, whose derivatives are taken in closed form by the
+                parameters for which the plant has one; None for rollouts only.
 
         Returns:
             y: (N+1, ny) outputs [y-unit] and the sensitivities, or None if a rollout diverges. The

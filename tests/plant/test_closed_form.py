@@ -54,12 +54,19 @@ TREE = """
 </mujoco>
 """
 
-# Inertial parameters in three forms, and one that is none.
+# Inertial parameters in three forms, those of springs, dampers, servos and armatures, and one that
+# is none of these.
 PARAMETERS: dict[str, Any] = {
     "mass": {"target": "body/upper:mass"},
     "centre": {"target": "body/fore:ipos[2]"},
     "load": {"inertial": "load", "coordinates": "barycentric"},
     "damping": {"target": "joint/elbow:damping"},
+    "armature": {"target": "joint/shoulder:armature"},
+    "stiffness": {"target": "joint/lift:stiffness"},
+    "springref": {"target": "joint/slider:springref", "guess": 0.1},
+    "kp": {"target": "actuator/shoulder:kp"},
+    "kv": {"target": "actuator/elbow:kv"},
+    "gear": {"target": "actuator/push:gear[0]"},
 }
 
 CHIRP = {"control": {"kind": "chirp", "amplitude": 0.8, "frequency": 1.0}}
@@ -98,10 +105,12 @@ def assert_close(found: Any, expected: Any, accuracy: float) -> None:
 
 
 # The damping of Euler's method is implicit or explicit.
+EXPLICIT = 'integrator="Euler"><flag eulerdamp="disable"/></option><option '
 OPTIONS = (
     'integrator="implicitfast"',
     'integrator="Euler"',
     'integrator="Euler" gravity="3 -2 -9"',
+    EXPLICIT,
 )
 
 
@@ -120,8 +129,9 @@ def test_first_derivatives_agree_with_differences(tmp_path, option: str) -> None
     assert_close(found.first.B, expected.B, 1e-8)
 
 
-def test_sensitivities_agree_with_differences_of_rollouts(tmp_path) -> None:
-    task = tree_task(tmp_path)
+@pytest.mark.parametrize("option", OPTIONS)
+def test_sensitivities_agree_with_differences_of_rollouts(tmp_path, option: str) -> None:
+    task = tree_task(tmp_path, option)
     trajectory, derivatives = curve(task), task.plant.derivatives
     expected = derivatives.sensitivity(task.theta, trajectory)
     before = task.plant.engine_steps
@@ -130,8 +140,9 @@ def test_sensitivities_agree_with_differences_of_rollouts(tmp_path) -> None:
     assert found is not None and expected is not None
 
     # Every engine step once, besides those from which forces are measured, and two rollouts for the
-    # parameter that is no inertia.
+    # gear.
     engine_steps = task.samples * task.plant.simulator.substeps
+    assert task.plant.closed_form_memory.covered.sum() == len(task.theta) - 1
     assert steps < 4 * engine_steps
 
     for column in range(len(task.theta)):
