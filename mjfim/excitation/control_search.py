@@ -32,7 +32,7 @@ from mjfim.excitation.unconstrained import UnconstrainedSearch
 from mjfim.excitation.verification import verify
 from mjfim.information.smoothness import roughness
 from mjfim.interruption import hurried
-from mjfim.parallel import ExecutorLike, LostWorkError
+from mjfim.parallel import ExecutorLike, LostWorkError, Workers
 from mjfim.plant.active_constraints import nothing_acts_along
 from mjfim.records.design import Status
 
@@ -59,6 +59,7 @@ class ControlSearch:
         limited: Cost of controls that keep the hard limits; None without limits.
         outside: The initial control where it violates a limit; None where it keeps them.
         is_brief: Whether the time allows few evaluations only.
+        evaluation_seconds: Time of the first evaluation [s].
     """
 
     stage: DescentLevel
@@ -68,6 +69,7 @@ class ControlSearch:
     limited: LimitedCost | None = None
     outside: OutsideStart | None = None
     is_brief: bool = False
+    evaluation_seconds: float = 0.0
 
     def run(self, starts: Iterable[InitialControl]) -> Runs:
         """Yield every iterate of all runs; return their results on the stated plant."""
@@ -147,9 +149,10 @@ class ControlSearch:
             budget=self.budget,
             first=self.first,
             is_brief=self.is_brief and not is_bounded,
+            evaluation_seconds=self.evaluation_seconds,
         )
-        constrained = yield from search.run(starts, inside)
-        results += self._not_worse(self._evaluated(constrained), inside)
+        found = yield from search.run(starts, inside)
+        results += self._not_worse(self._evaluated(found.results), found.inside)
         if results:
             steps = results[0].steps + steps_without_barrier
             results[0] = replace(results[0], steps=steps)
@@ -192,10 +195,11 @@ class ControlSearch:
 
     def _not_worse(self, found: list[RunResult], inside: InsideControl | None) -> list[RunResult]:
         """Results whose first one is not worse than a control that keeps all limits."""
-        if not found or inside is None:
+        if inside is None:
             return found
 
-        first = found[0]
+        # A search that was stopped early may have no results.
+        first = found[0] if found else RunResult(name="initial control", status=Status.INTERRUPTED)
         if first.is_feasible and first.cost <= inside.cost:
             return found
 
@@ -295,9 +299,9 @@ def choose(
     best = _best_of(known)
     if best.point is None and not interrupted:
         if all(result.status is Status.LOST for result in known):
+            fault = "" if search.executor is None else Workers.of(search.executor).probable_fault
             raise LostWorkError(
-                "the workers of all starts were lost several times (their processes were ended "
-                "from outside, perhaps because the memory was full), so there is no design"
+                f"the worker of every start was lost several times, so there is no design: {fault}"
             )
         raise SimulationDivergedError("the simulation diverges from every start")
 

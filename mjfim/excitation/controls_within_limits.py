@@ -20,7 +20,7 @@ from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.constraint_kinds import ConstraintValues
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.interior_point import MAX_START_VIOLATION, nearly_inside
-from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.levels import DescentLevel, moved_alike
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import FADE_SHARE
 from mjfim.excitation.verification import verify
@@ -56,9 +56,12 @@ class LimitedCost:
 
     Attributes:
         level: The stated level, on the plant without clamps.
+        first: The experiment's initial control, evaluated on the unmodified plant; None where it is
+            not known.
     """
 
     level: DescentLevel
+    first: DesignPoint | None = None
 
     @cached_property
     def constraints(self) -> ConstraintSet:
@@ -89,7 +92,12 @@ class LimitedCost:
     def point(self, control: Array) -> DesignPoint | None:
         """Evaluate a control: (N, nu); None where it violates a limit."""
         trajectory = self.trajectory(control)
-        return None if trajectory is None else self.level.problem.point(trajectory)
+        if trajectory is None:
+            return None
+
+        # The initial control has been evaluated already.
+        known = None if self.first is None else moved_alike(self.first, trajectory)
+        return self.level.problem.point(trajectory) if known is None else known
 
     def __call__(self, control: Array) -> float:
         """J of a control: (N, nu); infinite where it violates a limit."""
@@ -124,11 +132,16 @@ class LimitedCost:
         return OutsideStart(control=control, scaled=scaled, is_far=is_far)
 
 
-def limited_cost_of(stage: DescentLevel) -> LimitedCost | None:
-    """Cost of controls that keep all limits, at the stated level; None without hard limits."""
+def limited_cost_of(stage: DescentLevel, first: DesignPoint | None = None) -> LimitedCost | None:
+    """Cost of controls that keep all limits, at the stated level; None without hard limits.
+
+    Args:
+        stage: The stated level.
+        first: The experiment's initial control, evaluated there; None where it is not known.
+    """
     if not stage.task.is_limited:
         return None
-    return LimitedCost(level=DescentLevel(stage.task.relaxed(), stage.basis))
+    return LimitedCost(level=DescentLevel(stage.task.relaxed(), stage.basis), first=first)
 
 
 def keeps_limits(limited: LimitedCost | None, point: DesignPoint) -> bool:
@@ -377,6 +390,8 @@ class ControlsWithinLimits:
 
         for keeps in (self._nearly_keeps, self._keeps):
             factors = self._largest_factors(inside, keeps)
+            if (factors == 1.0).all():
+                return inside
             found = self.inside(inside.about, factors * inside.deviation, inside.share)
             if found is not None:
                 return found if found.cost < inside.cost else inside

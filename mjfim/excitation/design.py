@@ -138,9 +138,9 @@ def design_task(
     steps_before = task.plant.engine_steps
 
     # Evaluate the initial control and find the combinations that can be identified.
-    evaluated = budget.seconds_used
+    begun = budget.seconds_used
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    is_brief = allows_few_evaluations(budget, budget.seconds_used - evaluated)
+    evaluation_seconds = budget.seconds_used - begun
     if initial_control is not None:
         initial_control = _checked_control(task, initial_control)
     starts = list(initial_controls_of(task, initial_control))
@@ -153,7 +153,7 @@ def design_task(
     first, begin = stage.problem.reevaluated(first), stage.problem.reevaluated(begin)
 
     # Under hard limits, the design has to beat the initial control, scaled until it keeps them.
-    limited = limited_cost_of(stage)
+    limited = limited_cost_of(stage, first)
     outside = None if limited is None else limited.outside_start(task.control, budget)
 
     search = ControlSearch(
@@ -163,7 +163,8 @@ def design_task(
         budget=budget,
         limited=limited,
         outside=outside,
-        is_brief=is_brief,
+        is_brief=allows_few_evaluations(budget, evaluation_seconds),
+        evaluation_seconds=evaluation_seconds,
     )
     results = consume(search.run(starts), callback)
     interrupted = budget.stop.requested

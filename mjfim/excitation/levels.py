@@ -13,6 +13,7 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.lumped_parameters import LumpedParameters
+from mjfim.records.trajectory import Trajectory
 
 # Default factor by which the samples of a coarse level are longer.
 AUTO_COARSE_FACTOR = 4
@@ -231,17 +232,31 @@ def first_point(level: DescentLevel, evaluated: DesignPoint | None = None) -> De
         evaluated: The initial control on another plant, with the same criterion. It counts where
             both plants move in the same way. None where it is not known.
     """
-    # At the further samples of a robust design, the plants may move differently.
-    is_robust = evaluated is not None and bool(evaluated.others)
-    curve = None if evaluated is None or is_robust else evaluated.trajectory
-
     reference = level.task.reference
-    if curve is not None and reference is not None and curve.moves_as(reference):
-        return evaluated
+    if evaluated is not None and reference is not None:
+        known = moved_alike(evaluated, reference)
+        if known is not None:
+            return known
     try:
         return level.problem.point(level.task.initial)
     except SimulationDivergedError:
         return None
+
+
+def moved_alike(evaluated: DesignPoint, trajectory: Trajectory) -> DesignPoint | None:
+    """A point of another plant with the same criterion, where both plants move in the same way.
+
+    Args:
+        evaluated: The point.
+        trajectory: The motion of this plant.
+
+    Returns:
+        The point; None where the motions differ, and for a robust design, in which the plants may
+        move differently at the further samples.
+    """
+    curve = evaluated.trajectory
+    is_known = not evaluated.others and curve is not None and curve.moves_as(trajectory)
+    return evaluated if is_known else None
 
 
 def similar_level(

@@ -28,16 +28,35 @@ from mjfim.excitation.run_result import RunResult, Runs
 from mjfim.excitation.short_budget import still_allows_few_evaluations
 from mjfim.excitation.task import DesignTask
 from mjfim.parallel import ExecutorLike
-from mjfim.records.design import Status
+from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 
 # Share of the time for random controls before a descent whose derivatives may mislead.
 PROBE_SHARE = 0.1
 
+# Number of evaluations in the time that is left below which all of it is for random controls. A
+# descent with dry friction takes about half of them before its first step, to make a smooth level
+# and to bring its result inside the limits.
+FEWEST_EVALUATIONS = 10.0
+
 # Share of the time that is left for random changes of a control, between two descents, and for the
 # report of the design after the last changes.
 RANDOM_SHARE = 0.5
 CLOSING_SHARE = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundWithinLimits:
+    """What a search within hard limits has found.
+
+    Attributes:
+        results: Result of every start that was begun.
+        inside: The best control that keeps all limits and was not found by a descent; None where
+            there is none. A search that was stopped has not compared it with the results.
+    """
+
+    results: list[RunResult]
+    inside: InsideControl | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,6 +75,7 @@ class LimitedSearch:
         first: The experiment's initial control, evaluated on the unmodified plant; None where it is
             not known.
         is_brief: Whether the time allows few evaluations only, by the first one.
+        evaluation_seconds: Time of the first evaluation [s].
     """
 
     limited: LimitedCost
@@ -64,13 +84,22 @@ class LimitedSearch:
     budget: Budget
     first: DesignPoint | None = None
     is_brief: bool = False
+    evaluation_seconds: float = 0.0
 
-    def run(self, starts: list[InitialControl], inside: InsideControl | None) -> Runs:
+    def run(
+        self, starts: list[InitialControl], inside: InsideControl | None
+    ) -> Generator[DesignEvent, None, FoundWithinLimits]:
         """Descend from several starts, and change controls at random where that gains more.
 
         Args:
             starts: The initial controls.
             inside: A control that keeps all limits, or None.
+
+        Yields:
+            Every iterate, and every random control that is better than all before.
+
+        Returns:
+            What was found.
         """
         search = RandomSearch(
             cost=self.limited,
@@ -84,18 +113,48 @@ class LimitedSearch:
         if self.is_rough:
             best = self._best_inside(starts[0].control, inside)
         if best is not None and best is not inside:
-            best, rows = yield from search.run(best, self.budget.share(PROBE_SHARE), patience=0)
+            best, rows = yield from search.run(best, self._probe_budget(), patience=0)
             cost_to_beat = best.cost if rows else np.inf
+
+            # Where no time is left, the search ends with the best control.
+            if self.budget.exhausted is not None:
+                rows = rows or (search.row(best, 0),)
+                result = self._without_descent(starts[0].name, best, rows)
+                return FoundWithinLimits(results=[result], inside=best)
 
         results = yield from self._descend(starts, cost_to_beat=cost_to_beat)
         winner = min(range(len(results)), key=lambda i: results[i].cost, default=None)
         if winner is None or self.budget.stop.requested:
-            return results
+            return FoundWithinLimits(results=results, inside=best)
         if results[winner].is_held_up or results[winner].cost > cost_to_beat:
             results = list(results)
             result = results[winner]
             results[winner] = yield from self._helped_by_chance(search, result, best)
-        return results
+        return FoundWithinLimits(results=results, inside=best)
+
+    def _probe_budget(self) -> Budget:
+        """Time for random controls before a descent; all of it where it allows few evaluations."""
+        has_few = self.budget.seconds_left < FEWEST_EVALUATIONS * self.evaluation_seconds
+        return self.budget.share(1.0 - CLOSING_SHARE if has_few else PROBE_SHARE)
+
+    def _without_descent(
+        self, name: str, best: InsideControl, rows: tuple[HistoryRow, ...]
+    ) -> RunResult:
+        """Result of a search that had no time for a descent.
+
+        Args:
+            name: Name of the initial control.
+            best: The best control within limits.
+            rows: The random controls that led to it.
+        """
+        is_stopped = self.budget.stop.requested
+        return RunResult(
+            name=name,
+            control=best.control,
+            cost=best.cost,
+            status=Status.INTERRUPTED if is_stopped else Status.MAX_ITERATIONS,
+            history=rows,
+        )
 
     def _descend(
         self,

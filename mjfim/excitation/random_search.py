@@ -105,7 +105,7 @@ class RandomSearch:
 
         for found in self._improvements(best, trials, patience):
             best = found
-            rows.append(self._row(found, len(rows)))
+            rows.append(self.row(found, len(rows)))
             yield DesignEvent(start=self.name, row=rows[-1])
         return best, tuple(rows)
 
@@ -213,7 +213,10 @@ class RandomSearch:
         for _ in range(SMALLER_TRIALS):
             if found is None or found.cost >= best.cost:
                 return None
-            if self._growth(found.control) <= self.largest_growth:
+
+            # The growth along the initial control is needed only where this one is strong.
+            growth = self._growth(found.control)
+            if growth <= UNSTABLE_GROWTH or growth <= self.largest_growth:
                 return found
             if trials.is_over:
                 return None
@@ -228,8 +231,13 @@ class RandomSearch:
         except SimulationDivergedError:
             return np.inf
 
-    def _row(self, found: InsideControl, number: int) -> HistoryRow:
-        """An improvement as a row of the history."""
+    def row(self, found: InsideControl, number: int) -> HistoryRow:
+        """A control as a row of the history.
+
+        Args:
+            found: The control.
+            number: Number of the row.
+        """
         values = self.cost.values(found.control)
         margins = {} if values is None else self.cost.constraints.relative_margins(values)
         return HistoryRow(

@@ -183,7 +183,7 @@ class Dispatch(Generic[Order, T]):
 
                 outcome = self._next_outcome()
                 if outcome is not None:
-                    self._workers.has_answered = True
+                    self._workers.has_answered |= bool(outcome.found)
                     yield outcome
                 elif self._is_overdue():
                     self._abandon()
@@ -269,8 +269,8 @@ class Dispatch(Generic[Order, T]):
             return None
 
         sentence = (
-            f"the worker was lost {work.losses} times while it did this work (its process was "
-            "ended from outside, perhaps because the memory was full), so this work is left out"
+            f"the worker was lost {work.losses} times while it did this work "
+            f"({self._workers.probable_fault}), so this work is left out"
         )
         return Outcome(index=work.index, loss=sentence)
 

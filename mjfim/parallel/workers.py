@@ -62,7 +62,7 @@ class Workers(Executor):
             positive.
 
     Attributes:
-        has_answered: Whether any task has ended so far.
+        has_answered: Whether any task has ended with a result so far.
     """
 
     def __init__(
@@ -183,6 +183,16 @@ class Workers(Executor):
         is_known = cancel_futures and not self.is_cluster
         options = {name: True} if is_known else {}
         self._executor.shutdown(wait, **options)
+
+    @property
+    def probable_fault(self) -> str:
+        """Why processes of the workers have ended, in words: what is probable."""
+        if self.pool is not None and not self.has_answered:
+            return (
+                "its process ended before it could begin, perhaps because the program calls mjfim "
+                'outside `if __name__ == "__main__":`'
+            )
+        return "its process was ended from outside, perhaps because the memory was full"
 
     @property
     def shares_memory(self) -> bool:

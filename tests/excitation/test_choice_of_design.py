@@ -22,7 +22,7 @@ from mjfim.excitation.run_result import RunResult
 from mjfim.parallel import LostWorkError
 from mjfim.records.design import Status
 
-SEARCH: Any = SimpleNamespace(stage=None, limited=None)
+SEARCH: Any = SimpleNamespace(stage=None, limited=None, executor=None)
 INITIAL: Any = SimpleNamespace(cost=10.0)
 
 
@@ -96,7 +96,7 @@ def test_a_control_outside_the_limits_does_not_look_better_than_the_design(
 
 def test_a_design_all_of_whose_workers_are_lost_says_so() -> None:
     results = [RunResult(name=name, status=Status.LOST) for name in ("first", "second")]
-    with pytest.raises(LostWorkError, match="the workers of all starts were lost"):
+    with pytest.raises(LostWorkError, match="the worker of every start was lost"):
         choose(SEARCH, [INITIAL], results, False)
 
 

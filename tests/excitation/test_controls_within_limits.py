@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from mjfim.budget import Budget, StopToken
-from mjfim.excitation.controls_within_limits import ControlsWithinLimits, LimitedCost
+from mjfim.excitation.controls_within_limits import (
+    ControlsWithinLimits,
+    LimitedCost,
+    limited_cost_of,
+)
 from mjfim.excitation.design import design_task
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.violations import all_violations_of
@@ -42,6 +46,21 @@ def test_the_scaled_initial_control_is_the_largest_share_that_keeps_all_limits(
     assert cost(inside.control) == inside.cost
     assert np.isinf(cost(inside.about + 1.06 * inside.deviation))
     assert np.allclose(inside.deviation, inside.share * (task.control - inside.about))
+
+
+def test_a_known_initial_control_is_not_evaluated_again(tmp_path: Path) -> None:
+    task = stiff_arm_task(tmp_path, 0.0005, horizon=0.4)
+    stage = DescentLevel(task, None)
+    first = stage.problem.point(task.initial)
+    cost = limited_cost_of(stage, first)
+    assert cost is not None
+    assert cost.point(task.control) is first
+    assert first.cost == pytest.approx(LimitedCost(level=cost.level)(task.control), rel=1e-6)
+
+    # Another control is evaluated, and one outside limits has no point.
+    other = task.centre + 0.9 * (task.control - task.centre)
+    assert cost.point(other) is not first
+    assert cost.point(task.centre + 1e3 * (task.control - task.centre)) is None
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from mjfim.budget import Budget, measured_by
+from mjfim.budget import Budget, StopToken, measured_by
 from mjfim.excitation.controls_within_limits import LimitedCost
 from mjfim.excitation.design import design_task
 from mjfim.excitation.levels import DescentLevel
@@ -22,9 +22,10 @@ from mjfim.excitation.short_budget import allows_few_evaluations, enlarged
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import StepCount
 from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
 from tests.support.limits import cart_inside
 from tests.support.resting_arm import resting_arm
-from tests.support.stiff_servos import stiff_arm_task
+from tests.support.stiff_servos import dry_arm_experiment, stiff_arm_task
 
 # Speed of the simulation on this clock [engine steps / s].
 STEPS_PER_SECOND = 1e5
@@ -130,6 +131,47 @@ def test_the_time_of_few_evaluations_is_enough_for_a_good_control(
     design = design_task(make(tmp_path, {**ENDLESS, "seconds": evaluations * evaluation}))
     assert design.sound
     assert design.final.cost < bound
+
+
+def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_friction(
+    clock: StepClock, tmp_path: Path
+) -> None:
+    """A descent takes as long as some evaluations before its first step."""
+    task = DesignTask.resolve(dry_arm_experiment(tmp_path), threads=1)
+    begun = clock()
+    initial = task.problem.point(task.initial).cost
+    seconds = 6.0 * (clock() - begun)
+
+    begun = clock()
+    descent = {**ENDLESS, "seconds": seconds}
+    design = design_task(DesignTask.resolve(dry_arm_experiment(tmp_path, descent=descent)))
+    assert design.within_limits
+    assert design.final.cost < 0.3 * initial
+    assert design.history
+    assert design.status in (Status.MAX_ITERATIONS, Status.ROUGH)
+
+    # The first evaluation, its report and those of the last control are not random controls.
+    assert clock() - begun < 4.0 * seconds
+
+
+def test_a_stop_during_the_descent_leaves_the_best_random_control(tmp_path: Path) -> None:
+    """A descent begins from the initial control; what was found before must not be lost."""
+    stop = StopToken()
+    costs: list[float] = []
+
+    def stop_at_the_descent(event: DesignEvent) -> None:
+        """Stop at the first iterate with a barrier."""
+        if event.row.mu > 0.0:
+            stop.request()
+        else:
+            costs.append(event.row.cost)
+
+    task = DesignTask.resolve(dry_arm_experiment(tmp_path), threads=1)
+    design = design_task(task, callback=stop_at_the_descent, budget=Budget(stop=stop))
+    assert design.status is Status.INTERRUPTED
+    assert min(costs) < 0.3 * design.initial.cost
+    assert design.final.cost == pytest.approx(min(costs), rel=1e-6)
+    assert design.within_limits
 
 
 def test_iterations_alone_never_make_a_design_brief() -> None:

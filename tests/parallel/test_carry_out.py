@@ -135,6 +135,19 @@ def test_where_all_are_lost_together_the_suspect_runs_alone_in_the_end() -> None
     assert 1 in alone
 
 
+def test_a_program_whose_processes_cannot_begin_reads_how_to_call_them() -> None:
+    """Each new process imports the main program, which starts processes in turn without a guard."""
+    with Pool(1) as pool:
+        workers = Workers(pool)
+        assert '`if __name__ == "__main__":`' in workers.probable_fault
+
+        (outcome,) = carry_out(workers, square, [3], Budget())
+        assert outcome.found == (9,)
+        assert "the memory was full" in workers.probable_fault
+    other = Workers(FakeExecutor(lambda order, times: None))
+    assert "the memory was full" in other.probable_fault
+
+
 def test_outcomes_come_in_the_order_of_the_orders_and_the_callback_has_them_at_once() -> None:
     is_last = threading.Event()
 
