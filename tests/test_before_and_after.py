@@ -55,6 +55,16 @@ def test_a_verdict_says_how_far_the_goal_is(value: float, stated: Line, expected
 
 def test_a_failed_measurement_misses_its_goal() -> None:
     assert script.verdict(None, line()) == "missed"
+
+
+def test_a_goal_of_another_machine_is_a_ratio_to_the_earlier_commit() -> None:
+    """On a machine that is half as fast, both versions take twice as long."""
+    stated = script.Line(name="a", figure="b", unit="s", goal=2.5, before_there=5.0)
+    text = "missed by a factor 1.6; as a ratio (≤ 0.5) met"
+    assert script.verdict(Figure(4.0), stated, Figure(10.0)) == text
+    assert script.verdict(Figure(4.0), stated, Figure(7.0)).endswith("missed by a factor 1.1")
+    assert script.verdict(Figure(4.0), stated) == "missed by a factor 1.6"
+    assert script.verdict(Figure(2.0), stated, Figure(1.0)) == "met"
     assert script.text_of(None, line()) == "failed"
 
 

@@ -83,6 +83,11 @@ QUICK_EXAMPLES = ("cart_pendulum_limits",)
 # Wall time of a fit of an hour at 1 kHz [s], its memory [GiB], and wall time of a fit of 4 s [s].
 HOUR, HOUR_MEMORY, SHORT = 70.0, 1.0, 0.5
 
+# What the earlier commit took where these goals were set [s]: an iteration of the Panda by the
+# number of parameters, the fit of an hour, and the first command of the README.
+ITERATION_THERE = {30: 0.52, 70: 0.95}
+HOUR_THERE, FIRST_COMMAND_THERE = 166.0, 4.4
+
 # Ratio of the time of a design to that of the engine, with short iterations, and with those of at
 # least 40 ms in the engine.
 SHORT_RATIO, LONG_RATIO = 1.3, 1.15
@@ -119,6 +124,8 @@ class Line:
         unit: Unit of the figure, or empty.
         goal: What is wanted, or None.
         is_larger_better: Whether the goal is a lower bound.
+        before_there: What the earlier commit took on the machine on which the goal was set; None
+            where it is not known. On another machine, the goal is a ratio to the earlier commit.
         derived: Computes the figure from those of the earlier commit and those of the version; None
             for a measured one.
     """
@@ -128,6 +135,7 @@ class Line:
     unit: str = ""
     goal: float | None = None
     is_larger_better: bool = False
+    before_there: float | None = None
     derived: Callable[[Figures, Figures], Figure] | None = None
 
 
@@ -205,7 +213,15 @@ def start_ups(sizes: Sizes) -> Iterator[Measurement]:
             yield Measurement(
                 name=command.name.replace(" ", "_").strip("-"),
                 run=partial(_start_up, command),
-                lines=(Line(name=command.name, figure="time", unit="s", goal=command.goal),),
+                lines=(
+                    Line(
+                        name=command.name,
+                        figure="time",
+                        unit="s",
+                        goal=command.goal,
+                        before_there=FIRST_COMMAND_THERE if is_first else None,
+                    ),
+                ),
                 repeats=3 if sizes.is_quick else 5,
             )
 
@@ -267,6 +283,7 @@ def iterations(sizes: Sizes) -> Iterator[Measurement]:
                 figure="iteration",
                 unit="s",
                 goal=benchmark_arm.AIMS.get(p),
+                before_there=ITERATION_THERE.get(p),
             ),
             Line(name=f"{name}: engine steps of an iteration", figure="steps"),
             Line(name=f"{name}: all beside iterations", figure="rest", unit="s"),
@@ -498,6 +515,7 @@ def fits(sizes: Sizes) -> Iterator[Measurement]:
                 figure="time",
                 unit="s",
                 goal=HOUR if is_whole else None,
+                before_there=HOUR_THERE,
             ),
             Line(
                 name="its memory",
@@ -749,14 +767,31 @@ def ratio_of(before: Figure | None, now: Figure | None) -> str:
     return f"{text} ({now.processors / before.processors:.3g})"
 
 
-def verdict(figure: Figure | None, line: Line) -> str:
-    """Whether a figure meets the goal of its line, or how far it is from it; empty without goal."""
+def verdict(figure: Figure | None, line: Line, before: Figure | None = None) -> str:
+    """Whether a figure meets the goal of its line, or how far it is from it; empty without goal.
+
+    Args:
+        figure: The figure; None where it was not measured.
+        line: The line.
+        before: That of the earlier commit on this machine, for a goal that is also a ratio.
+    """
     if line.goal is None:
         return ""
     if figure is None or not is_found(figure.value, line):
         return "missed"
 
     factor = line.goal / figure.value if line.is_larger_better else figure.value / line.goal
+    if factor <= 1.0 or line.before_there is None or before is None:
+        return _distance(factor)
+
+    # A slower machine takes longer for both versions.
+    wanted = line.goal / line.before_there
+    relative = _distance(figure.value / before.value / wanted)
+    return f"{_distance(factor)}; as a ratio (≤ {wanted:.3g}) {relative}"
+
+
+def _distance(factor: float) -> str:
+    """How far a figure is from its goal, by its ratio to it: at most 1 where it is met."""
     if factor <= 1.0:
         return "met"
     if factor < FACTOR:
@@ -797,7 +832,7 @@ def add_lines(table: Table, measurement: Measurement, result: Result) -> None:
             text_of(now, line),
             ratio_of(before, now),
             goal_of(line),
-            verdict(now, line),
+            verdict(now, line, before),
         )
 
 

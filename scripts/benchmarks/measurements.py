@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
+import numpy as np
+
 import mjfim
 from mjfim.parallel import cores
 from scripts.benchmarks.checkouts import ROOT
@@ -179,11 +181,12 @@ def arm_iterations(
             that has them in closed form.
 
     Returns:
-        `iteration` is the mean of one iteration, `rest` all that is not iterations: what is
-        identifiable, the first iterate, and the verification. `steps` are the engine steps of an
-        iteration, `bare step` is the time of one step of the bare engine, and `engine` that of all
-        steps of an iteration. `wall ratio` is the wall time of an iteration on all cores over it,
-        and `ratio` the time of the processors over it.
+        `iteration` is the median time of an iteration and `steps` that of its engine steps. `rest`
+        is all that is not iterations: what is identifiable, the first iterate, derivatives without
+        closed form at the last one, and the verification. `bare step` is the time of one step of
+        the bare engine, and `engine` that of all steps of an iteration, on average. `wall ratio` is
+        the average wall time of an iteration on all cores over it, and `ratio` the average time of
+        the processors over it.
     """
     from mjfim.excitation.design import design_task
     from mjfim.excitation.task import DesignTask
@@ -210,14 +213,21 @@ def arm_iterations(
     end = clock.read()
 
     count = max(len(readings) - 1, 1)
+    iteration = Figure(
+        float(np.median(np.diff([reading.wall for reading in readings]))),
+        float(np.median(np.diff([reading.processors for reading in readings]))),
+    )
     wall = readings[-1].wall - readings[0].wall
     processors = readings[-1].processors - readings[0].processors
     bare_step = bare_step_time(task.plant.source.model, task)
     engine = (steps[-1] - steps[0]) * bare_step
     return {
-        "iteration": Figure(wall / count, processors / count),
-        "rest": Figure(end.wall - wall, end.processors - processors),
-        "steps": Figure((steps[-1] - steps[0]) / count),
+        "iteration": iteration,
+        "rest": Figure(
+            end.wall - count * iteration.value,
+            end.processors - count * (iteration.processors or 0.0),
+        ),
+        "steps": Figure(float(np.median(np.diff(steps)))),
         "bare step": Figure(bare_step),
         "engine": Figure(engine / count),
         "wall ratio": Figure(wall * cores() / engine if engine > 0.0 else inf),
@@ -271,7 +281,10 @@ def limited_arm(arm: str, horizon: float, dry: bool, seconds: float) -> Figures:
         used = clock.read()
 
     is_kept = min(design.limits.values()) >= 0.0
-    sigma = float(design.final.eigenvalues[0] ** -0.5) if is_kept else float("inf")
+
+    # The eigenvalue is that of the information per second of measurements.
+    smallest = float(design.final.eigenvalues[0]) * arms.MEASURED
+    sigma = smallest**-0.5 if is_kept else float("inf")
     return {"sigma": Figure(sigma), "time": Figure(*used)}
 
 

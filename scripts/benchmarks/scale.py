@@ -26,7 +26,9 @@ by `--only`, for some of the verbs by `--verb`:
                cart-pendulum and of an arm, whose orders take much longer
 
 In `equal`, the work of one process is what the cluster does without any overhead: what is above 1
-is the price of sending, waiting and resolving the experiment more than once. `--full` has 64
+is the price of sending, waiting and resolving the experiment more than once. The other cores do the
+same work meanwhile, as they do on the cluster, because cores share caches, memory and power, and
+each of them is slower where the others are busy. `--full` has 64
 starts, 1e5 trials and 500 recordings; the work under accidents (kill, interrupt, folder) is always
 small. A table at the end says which figures are as wanted.
 
@@ -44,6 +46,7 @@ import logging
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
@@ -347,6 +350,30 @@ def serial(verb: Verb) -> Reference:
     return Reference(fingerprint=verb.fingerprint(result), cpu=time.process_time() - begun)
 
 
+@contextmanager
+def busy_cores(verb: Verb, options: argparse.Namespace) -> Iterator[None]:
+    """Let other processes repeat the work of a verb, so that as many cores are busy as workers."""
+    words = [sys.executable, "-m", "scripts.benchmarks", "scale", "--repeat", verb.name]
+    for name in vars(QUICK):
+        size = getattr(options, name)
+        words += [] if size is None else [f"--{name}", str(size)]
+    words += ["--full"] if options.full else []
+
+    others = [
+        subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        for _ in range(options.workers - 1)
+    ]
+    try:
+        yield
+    finally:
+        ended = [other.poll() for other in others]
+        for other in others:
+            other.kill()
+            other.wait()
+    if any(code is not None for code in ended):
+        raise RuntimeError(f"{verb.name}: a process that repeats the work has ended by itself")
+
+
 def on_cluster(verb: Verb, reference: Reference, workers: int) -> bool:
     """Compare a verb on the cluster with one process: numbers, CPU time and memory."""
     with cluster(workers) as client:
@@ -598,6 +625,10 @@ def run(options: argparse.Namespace) -> bool:
     small = replace(QUICK, **given)
     large = replace(FULL if options.full else QUICK, **given)
     parts = set(options.only or PARTS)
+    if options.repeat:
+        (verb,) = (each for each in verbs(large) if each.name == options.repeat)
+        while True:
+            verb.run(None)
 
     good = True
     if parts & LARGE_PARTS:
@@ -630,7 +661,9 @@ def _large_work(sizes: Sizes, parts: set[str], options: argparse.Namespace) -> b
     half = _chosen(fewer, options) if "scaling" in parts else []
     for verb in _chosen(sizes, options):
         if "equal" in parts:
-            good &= on_cluster(verb, serial(verb), options.workers)
+            with busy_cores(verb, options):
+                reference = serial(verb)
+            good &= on_cluster(verb, reference, options.workers)
         if "scaling" in parts:
             good &= scaling(next(each for each in half if each.name == verb.name))
     return good
@@ -662,6 +695,9 @@ def main() -> int:
     parser.add_argument("--full", action="store_true", help="the work of a large study")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="parts; default: all")
     parser.add_argument("--verb", nargs="+", help="verbs; default: all that take an executor")
+    parser.add_argument(
+        "--repeat", metavar="VERB", help="do nothing else than to repeat the work of a verb"
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--kills", type=int, default=2, help="random moments per verb")
     parser.add_argument("--seed", type=int, default=0, help="of the random moments")
