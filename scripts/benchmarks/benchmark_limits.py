@@ -17,7 +17,6 @@ import dataclasses
 import json
 import time
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 
 from rich.console import Console
@@ -135,13 +134,9 @@ def run_mjfim(seconds: float, seed: int) -> SolverResult:
 
 def import_libraries(executor: mjfim.Pool) -> None:
     """Start all processes of a pool, and import there and here what a design needs."""
-    tasks = [
-        executor.submit(import_module, name)
-        for _ in range(executor.max_workers)
-        for name in LIBRARIES
-    ]
-    for name in LIBRARIES:
-        import_module(name)
+    statement = f"import {', '.join(LIBRARIES)}"
+    tasks = [executor.submit(exec, statement) for _ in range(executor.max_workers)]
+    exec(statement)
     for task in tasks:
         task.result()
 
