@@ -194,14 +194,19 @@ class ControlSearch:
         return limited.is_far_outside(limited.values(control))
 
     def _not_worse(self, found: list[RunResult], inside: InsideControl | None) -> list[RunResult]:
-        """Results whose first one is not worse than a control that keeps all limits."""
+        """Results of which one is not worse than a control that keeps all limits.
+
+        Args:
+            found: Result of every start.
+            inside: The control that keeps all limits; None where there is none.
+        """
         if inside is None:
+            return found
+        if any(result.is_feasible and result.cost <= inside.cost for result in found):
             return found
 
         # A search that was stopped early may have no results.
         first = found[0] if found else RunResult(name="initial control", status=Status.INTERRUPTED)
-        if first.is_feasible and first.cost <= inside.cost:
-            return found
 
         # Nothing better was found from the first start.
         status = first.status

@@ -34,10 +34,10 @@ from mjfim.records.events import DesignEvent
 # Share of the time for random controls before a descent whose derivatives may mislead.
 PROBE_SHARE = 0.1
 
-# Number of evaluations in the time that is left below which all of it is for random controls. A
-# descent with dry friction takes about half of them before its first step, to make a smooth level
-# and to bring its result inside the limits.
-FEWEST_EVALUATIONS = 10.0
+# Number of evaluations in the time that is left below which all of it is for random controls. With
+# dry friction, a descent takes about ten of them to make a smooth level, to take a step, and to
+# bring its result inside the limits.
+FEWEST_EVALUATIONS = 20.0
 
 # Share of the time that is left for random changes of a control, between two descents, and for the
 # report of the design after the last changes.
@@ -101,6 +101,8 @@ class LimitedSearch:
         Returns:
             What was found.
         """
+        plant = self._task.plant
+        steps = plant.engine_steps
         search = RandomSearch(
             cost=self.limited,
             name=starts[0].name,
@@ -108,19 +110,25 @@ class LimitedSearch:
             seed=self._task.experiment.descent.seed,
         )
 
-        # Where derivatives may mislead, a descent has to be better than some random controls.
+        # Where derivatives may mislead, a descent has to be better than some random controls. With
+        # little time, there is nothing else.
         best, cost_to_beat = inside, np.inf
+        rows: tuple[HistoryRow, ...] = ()
+        is_over = False
         if self.is_rough:
             best = self._best_inside(starts[0].control, inside)
         if best is not None and best is not inside:
-            best, rows = yield from search.run(best, self._probe_budget(), patience=0)
+            is_over = self._has_few_evaluations
+            budget = self.budget.share(1.0 - CLOSING_SHARE if is_over else PROBE_SHARE)
+            best, rows = yield from search.run(best, budget, patience=np.inf if is_over else 0)
             cost_to_beat = best.cost if rows else np.inf
 
-            # Where no time is left, the search ends with the best control.
-            if self.budget.exhausted is not None:
-                rows = rows or (search.row(best, 0),)
-                result = self._without_descent(starts[0].name, best, rows)
-                return FoundWithinLimits(results=[result], inside=best)
+        # A descent does not begin after the time is over.
+        if best is not None and (is_over or self.budget.exhausted is not None):
+            rows = rows or (search.row(best, 0),)
+            result = self._without_descent(starts[0].name, best, rows)
+            result = replace(result, steps=plant.engine_steps - steps)
+            return FoundWithinLimits(results=[result], inside=best)
 
         results = yield from self._descend(starts, cost_to_beat=cost_to_beat)
         winner = min(range(len(results)), key=lambda i: results[i].cost, default=None)
@@ -132,10 +140,10 @@ class LimitedSearch:
             results[winner] = yield from self._helped_by_chance(search, result, best)
         return FoundWithinLimits(results=results, inside=best)
 
-    def _probe_budget(self) -> Budget:
-        """Time for random controls before a descent; all of it where it allows few evaluations."""
-        has_few = self.budget.seconds_left < FEWEST_EVALUATIONS * self.evaluation_seconds
-        return self.budget.share(1.0 - CLOSING_SHARE if has_few else PROBE_SHARE)
+    @property
+    def _has_few_evaluations(self) -> bool:
+        """Whether the time that is left allows too few evaluations for a descent."""
+        return self.budget.seconds_left < FEWEST_EVALUATIONS * self.evaluation_seconds
 
     def _without_descent(
         self, name: str, best: InsideControl, rows: tuple[HistoryRow, ...]
@@ -236,7 +244,7 @@ class LimitedSearch:
             if is_over or not is_descent_useful or done >= self._max_iterations:
                 return result
 
-            is_descent_useful = _is_progress(before, best)
+            is_descent_useful = _is_progress(before, best) and not self._has_few_evaluations
             if not is_descent_useful:
                 continue
 

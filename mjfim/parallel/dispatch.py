@@ -183,7 +183,7 @@ class Dispatch(Generic[Order, T]):
 
                 outcome = self._next_outcome()
                 if outcome is not None:
-                    self._workers.has_answered |= bool(outcome.found)
+                    self._workers.has_answered = True
                     yield outcome
                 elif self._is_overdue():
                     self._abandon()
@@ -254,6 +254,7 @@ class Dispatch(Generic[Order, T]):
 
         # An order that needs values is submitted again with them.
         result = _result_of(future)
+        self._workers.has_begun = True
         if isinstance(result, AbsentValue):
             work.values.update({digest: owned_value(digest) for digest in result.digests})
             self._waiting.appendleft(work)

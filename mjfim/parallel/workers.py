@@ -62,7 +62,8 @@ class Workers(Executor):
             positive.
 
     Attributes:
-        has_answered: Whether any task has ended with a result so far.
+        has_answered: Whether any task has ended so far.
+        has_begun: Whether any worker has sent an answer of its own so far.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class Workers(Executor):
         self._known_count = 0
         self._count_until = 0.0
         self.has_answered = False
+        self.has_begun = False
 
     @classmethod
     def of(cls, executor: ExecutorLike) -> Workers:
@@ -187,12 +189,10 @@ class Workers(Executor):
     @property
     def probable_fault(self) -> str:
         """Why processes of the workers have ended, in words: what is probable."""
-        if self.pool is not None and not self.has_answered:
-            return (
-                "its process ended before it could begin, perhaps because the program calls mjfim "
-                'outside `if __name__ == "__main__":`'
-            )
-        return "its process was ended from outside, perhaps because the memory was full"
+        words = "its process was ended from outside, perhaps because the memory was full"
+        if self.pool is None or self.has_begun:
+            return words
+        return f'{words}, or because a script calls mjfim outside `if __name__ == "__main__":`'
 
     @property
     def shares_memory(self) -> bool:

@@ -204,7 +204,13 @@ class ClosedForm:
         )
 
     def change_between(
-        self, pair: Sequence[Any], state: Array, ctrl: Array, distance: float
+        self,
+        pair: Sequence[Any],
+        state: Array,
+        ctrl: Array,
+        distance: float,
+        *,
+        is_inertial: bool,
     ) -> ParameterChange:
         """Change of the model by one parameter, by two-sided differences.
 
@@ -215,11 +221,16 @@ class ClosedForm:
             state: (2 nv,) state about which forces are measured.
             ctrl: (nu,) control about which they are measured.
             distance: Distance of the two values.
+            is_inertial: Whether the parameter changes nothing but inertias.
         """
         more, less = pair
-        forces = [
-            AffineForces.measured(self.simulator, model, state, ctrl, self.sizes) for model in pair
+
+        # Inertias change no forces of springs and actuators.
+        measured = [
+            AffineForces.measured(self.simulator, model, state, ctrl, self.sizes)
+            for model in (pair[:1] if is_inertial else pair)
         ]
+        forces = 2 * measured if is_inertial else measured
         inertias = [barycentric_inertias(model, self.tree.bodies) for model in pair]
 
         def quotient(larger: Array, smaller: Array) -> Array:

@@ -20,7 +20,7 @@ from mjfim.plant.difference_steps import DifferenceSteps
 from mjfim.plant.parameter_change import ParameterChange, acts_on_joints, is_inertial
 from mjfim.records.trajectory import Trajectory
 
-# Largest number of parameter values for which the derivatives of the inertias are kept.
+# Largest number of parameter values for which the change of the model is kept.
 MAX_KEPT_CHANGES = 64
 
 # Step along (psi w, w) between two derivatives in closed form. It can be short, because they have
@@ -264,7 +264,11 @@ class ClosedFormDerivatives(DifferenceSteps):
             if not compiled.all():
                 return None
             begin = trajectory.state[0], trajectory.ctrl[0]
-            changes.append(closed.change_between(pair, *begin, 2.0 * steps[i]))
+            parameter = self.plant.parameters.parameters[i]
+            change = closed.change_between(
+                pair, *begin, 2.0 * steps[i], is_inertial=is_inertial(parameter)
+            )
+            changes.append(change)
 
         if len(memory.changes) >= MAX_KEPT_CHANGES:
             memory.changes.clear()
