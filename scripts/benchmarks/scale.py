@@ -283,8 +283,8 @@ def cluster(workers: int) -> Iterator[Any]:
     # The workers import the benchmarks as this process does.
     root = str(Path(__file__).resolve().parents[2])
 
-    # Dask looks at the stack of each worker a hundred times per second. In one comparison, this took
-    # 6 % of the CPU time of a design.
+    # Dask looks at the stack of each worker a hundred times per second. In one comparison, this
+    # took 6 % of the CPU time of a design.
     os.environ["DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED"] = "False"
     os.environ["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
     with (
