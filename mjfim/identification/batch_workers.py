@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from mjfim.budget import Budget
 from mjfim.identification.segment_simulation import SegmentBatch
-from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution, UnknownValues
+from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 if TYPE_CHECKING:
     from mjfim.identification.fit_problem import FitProblem
@@ -16,6 +16,9 @@ T = TypeVar("T")
 
 # Work on one batch of a problem, at values of the unknowns.
 BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T | None]
+
+# Work on a whole problem, which ends early when the budget is exhausted.
+ProblemWork = Callable[["FitProblem", Budget], T]
 
 
 class BatchWorkers(Protocol):
@@ -40,22 +43,18 @@ class BatchWorkers(Protocol):
             What is found for every batch, in their order.
         """
 
-    def solutions(
-        self,
-        problem: FitProblem,
-        begins: Sequence[UnknownValues],
-        settings: SearchSettings,
-        budget: Budget,
-    ) -> Iterator[Solution | None]:
-        """Search from several starts.
+    def of_whole(
+        self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
+    ) -> Iterator[T]:
+        """Do works that do not depend on each other, each of them in one worker.
+
+        Every worker receives all data of the problem, so that these should not be large.
 
         Args:
             problem: The problem.
-            begins: Unknowns at which the searches begin.
-            settings: Tolerance and number of iterations.
-            budget: Ends the searches early.
+            works: The works; they and the results can be pickled.
+            budget: Ends the works early.
 
         Yields:
-            The solution of every search that was not stopped before its begin, in their order; None
-            where the simulation diverges at the begin.
+            The result of every work that was not stopped before its begin, in their order.
         """

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.batch_workers import ProblemWork
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.optimize.levenberg_marquardt import (
     InterruptedPassError,
@@ -36,6 +38,9 @@ PREDICTED_SHARE = 0.25
 
 # Largest number of samples in a cross-validation; of more data, a subset of the segments is used.
 MAX_SAMPLES = 200_000
+
+# Size of all recordings up to which each worker receives them [bytes].
+LARGEST_SENT_BYTES = 64 * 2**20
 
 # Settings of the searches for theta without a part of the data, and for initial states. Few
 # iterations are enough, because these searches begin close to their result, and errors of
@@ -146,27 +151,63 @@ def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> I
         problem = problem.of_segments(subset)
         at = replace(at, private=at.private[subset])
 
-    guess = problem.system.parameters.guess
     parts = [
         replace(part, note=_note_of_subset(part.recordings, problem, whole))
         for part in _parts(problem)
     ]
-    for k, part in enumerate(parts):
-        begin_stage("predicting each part from the others", k, len(parts))
-        others = problem.masked([~mask for mask in part.masks])
-        segments = others.segments_with_values
-        if not len(segments):
-            continue
-
-        # The data that are left out may have led the estimate to a minimum that the others lack.
-        # The fit to the others then begins at the guess.
-        others = others.of_segments(segments)
-        begins = [replace(at, private=at.private[segments]), others.begin(guess)]
-        found = minimise(others, min(begins, key=others.cost), SEARCH, budget)
+    folds = [partial(_prediction_by_others, at=at, part=part) for part in parts]
+    for k, prediction in enumerate(_of_folds(problem, folds, budget)):
+        begin_stage("predicting each part from the others", k + 1, len(parts))
         if budget.exhausted is not None:
             return
-        if found is not None:
-            yield _prediction(problem, found.unknowns.theta, part, False, budget)
+        if prediction is not None:
+            yield prediction
+
+
+def _of_folds(
+    problem: FitProblem, folds: Sequence[ProblemWork[Prediction | None]], budget: Budget
+) -> Iterator[Prediction | None]:
+    """Predictions of all parts, in one process or side by side on workers."""
+    begin_stage("predicting each part from the others", 0, len(folds))
+
+    # A worker that does a whole fold waits for nobody, but needs all recordings. Where they are
+    # large, workers share each pass over the data instead.
+    size = sum(each.t.nbytes + each.y.nbytes + each.ctrl.nbytes for each in problem.recordings)
+    if problem.workers is None or len(folds) == 1 or size > LARGEST_SENT_BYTES:
+        yield from (fold(problem, budget) for fold in folds)
+    else:
+        yield from problem.workers.of_whole(problem, folds, budget)
+
+
+def _prediction_by_others(
+    problem: FitProblem, budget: Budget, *, at: UnknownValues, part: _Part
+) -> Prediction | None:
+    """Prediction of one part of the data by a fit to the others.
+
+    Args:
+        problem: Problem of all parts.
+        budget: Ends the fit early.
+        at: Unknowns at the fit to all parts.
+        part: The part.
+
+    Returns:
+        The prediction; None where there are no other data, where the simulation diverges, and after
+        a request to stop.
+    """
+    others = problem.masked([~mask for mask in part.masks])
+    segments = others.segments_with_values
+    if not len(segments):
+        return None
+
+    # The data that are left out may have led the estimate to a minimum that the others lack. The
+    # fit to the others then begins at the guess.
+    others = others.of_segments(segments)
+    guess = problem.system.parameters.guess
+    begins = [replace(at, private=at.private[segments]), others.begin(guess)]
+    found = minimise(others, min(begins, key=others.cost), SEARCH, budget)
+    if found is None or budget.exhausted is not None:
+        return None
+    return _prediction(problem, found.unknowns.theta, part, False, budget)
 
 
 def _parts(problem: FitProblem) -> Iterator[_Part]:

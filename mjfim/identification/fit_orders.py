@@ -18,14 +18,14 @@ from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording, align
-from mjfim.identification.batch_workers import BatchWork
+from mjfim.identification.batch_workers import BatchWork, ProblemWork
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.pins import Pins
 from mjfim.identification.recording_files import RecordingFiles
 from mjfim.identification.segment_simulation import SegmentBatch, SegmentSimulation
 from mjfim.identification.segments import Segment
 from mjfim.identification.unknowns import UnknownLayout
-from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues
+from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.parallel.kept import KeptPerThread
 from mjfim.parallel.shared_value import AbsentValueError, SharedValue, keep_value, require_values
@@ -312,15 +312,13 @@ class BatchOrder(Generic[T]):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SearchOrder:
-    """Search from one start.
+class WholeOrder(Generic[T]):
+    """Work on a whole problem.
 
     Attributes:
         part: The problem, with all its segments.
-        begin: Unknowns at which the search begins.
-        settings: Tolerance and number of iterations.
+        work: Does the work.
     """
 
     part: SharedValue[PartOrder]
-    begin: UnknownValues
-    settings: SearchSettings
+    work: ProblemWork[T]

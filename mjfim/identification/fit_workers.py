@@ -20,25 +20,19 @@ from mjfim.budget import Budget, StopToken
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.batch_workers import BatchWork
+from mjfim.identification.batch_workers import BatchWork, ProblemWork
 from mjfim.identification.fit_orders import (
     KEPT_PROBLEMS,
     BatchOrder,
     PartOrder,
     ProblemOrder,
     RecordingOrder,
-    SearchOrder,
+    WholeOrder,
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.recording_files import RecordingFolder
 from mjfim.identification.segment_simulation import SegmentBatch
-from mjfim.optimize.levenberg_marquardt import (
-    InterruptedPassError,
-    SearchSettings,
-    Solution,
-    UnknownValues,
-    minimise,
-)
+from mjfim.optimize.levenberg_marquardt import InterruptedPassError, UnknownValues
 from mjfim.parallel import (
     ExecutorLike,
     Workers,
@@ -93,15 +87,10 @@ def _work_on_batch(order: BatchOrder[T]) -> _Found[T | None]:
 
 
 @one_blas_thread()
-def _search_in_worker(order: SearchOrder) -> _Found[Solution | None]:
-    """Search from one start in a worker process."""
+def _work_on_whole(order: WholeOrder[T]) -> _Found[T]:
+    """Do a work on a whole problem in a worker process."""
     problem = _problem_of(order.part)
-    return _counted(problem, lambda: _search(problem, order, pool_stop_token()))
-
-
-def _search(problem: FitProblem, order: SearchOrder, stop: StopToken) -> Solution | None:
-    """Search from one start; None where the simulation diverges there."""
-    return minimise(problem, order.begin, order.settings, Budget(stop=stop))
+    return _counted(problem, lambda: order.work(problem, Budget(stop=pool_stop_token())))
 
 
 def _counted(problem: FitProblem, work: Callable[[], T]) -> _Found[T]:
@@ -204,24 +193,21 @@ class FitWorkers:
                 found[index] = work(problem, at, batch)
         return [found[index] for index in range(len(batches))]
 
-    def solutions(
-        self,
-        problem: FitProblem,
-        begins: Sequence[UnknownValues],
-        settings: SearchSettings,
-        budget: Budget,
-    ) -> Iterator[Solution | None]:
-        """Search from several starts. See `batch_workers.BatchWorkers`."""
-        threads = self._executor.threads_for(len(begins))
+    def of_whole(
+        self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
+    ) -> Iterator[T]:
+        """Do independent works, each in one worker. See `batch_workers.BatchWorkers`."""
+        threads = self._executor.threads_for(len(works))
         part = self.part_of(problem, range(len(problem.segments)), threads)
-        orders = [SearchOrder(part=part, begin=begin, settings=settings) for begin in begins]
+        orders = [WholeOrder(part=part, work=work) for work in works]
         alone = replace(problem, workers=None)
 
-        def here(order: SearchOrder) -> _Found[Solution | None]:
-            """Search from the start of a lost worker; its steps are counted by the simulator."""
-            return _Found(result=_search(alone, order, budget.stop), steps=0)
+        def here(order: WholeOrder[T]) -> _Found[T]:
+            """Do the work of a lost worker; its steps are counted by the simulator."""
+            return _Found(result=order.work(alone, budget), steps=0)
 
-        for found in results_or_here(self._executor, _search_in_worker, orders, budget, here):
+        work_on_whole: Callable[[WholeOrder[T]], _Found[T]] = _work_on_whole
+        for found in results_or_here(self._executor, work_on_whole, orders, budget, here):
             yield _counted_here(problem, found)
 
     def part_of(

@@ -151,6 +151,13 @@ def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
     return replace(at, private=at.private[subset])
 
 
+def _short_search(
+    problem: FitProblem, budget: Budget, *, begin: UnknownValues, settings: SearchSettings
+) -> Solution | None:
+    """Search from one start; None where the simulation diverges there."""
+    return minimise(problem, begin, settings, budget)
+
+
 def _without_neighbourhood(solution: Solution) -> Solution:
     """A solution beside which the simulation diverges, so that no search goes on from there."""
     status = "stopped: the simulation diverges next to the estimate"
@@ -441,8 +448,11 @@ class FitSearch:
 
         # The first sample is the stated start, which was searched before.
         if problem.workers is not None:
-            begins = [problem.begin(theta) for theta in samples[1:]]
-            searched = problem.workers.solutions(problem, begins, settings, self.budget)
+            works = [
+                partial(_short_search, begin=problem.begin(theta), settings=settings)
+                for theta in samples[1:]
+            ]
+            searched = problem.workers.of_whole(problem, works, self.budget)
             return [solution for solution in searched if solution is not None]
 
         found = []

@@ -28,9 +28,12 @@ by `--only`, for some of the verbs by `--verb`:
 In `equal`, the work of one process is what the cluster does without any overhead: what is above 1
 is the price of sending, waiting and resolving the experiment more than once. The other cores do the
 same work meanwhile, as they do on the cluster, because cores share caches, memory and power, and
-each of them is slower where the others are busy. `--full` has 64
-starts, 1e5 trials and 500 recordings; the work under accidents (kill, interrupt, folder) is always
-small. A table at the end says which figures are as wanted.
+each of them is slower where the others are busy. `equal` and `scaling` compare seconds that are
+measured one after the other. A small process simulates meanwhile and measures the speed of a core
+(`core_speed.py`); the seconds of the earlier measurement are those that it would have taken at the
+speed of the later one. The measured seconds stand beside them. `--full` has 64 starts, 1e5 trials
+and 500 recordings; the work under accidents (kill, interrupt, folder) is always small. A table at
+the end says which figures are as wanted.
 
 In `simulate`, a start that goes on takes part in up to four searches one after the other, and the
 last one of them has to be waited for. So the efficiency depends on the number of starts for each
@@ -68,6 +71,7 @@ from mjfim.output.playback import design_columns, simulate_playback
 from scripts.benchmarks import arms
 from scripts.benchmarks.benchmark_hour import EXPERIMENT as TWO_JOINTS
 from scripts.benchmarks.benchmark_hour import played
+from scripts.benchmarks.core_speed import core_speed
 from scripts.benchmarks.pressed_key import commands, moments, pressed, undisturbed_seconds
 from scripts.benchmarks.simulated_design import Efficiency, efficiencies, save_curves
 
@@ -85,6 +89,9 @@ LARGE_WORK = 60.0
 
 # Efficiency that is wanted at the largest of these numbers of simulated workers.
 LEAST_EFFICIENCY, SIMULATED_WORKERS = 0.8, (1, 4, 16, 64, 256)
+
+# Difference of the numbers of iterations on clusters of different sizes, as a share.
+SAME_WORK = 0.03
 
 # The arm whose starts are simulated as well, the duration of its motion [s], and the starts and
 # iterations that are carried out to measure the lengths of the orders.
@@ -120,6 +127,15 @@ class Sizes:
 
 QUICK = Sizes(starts=8, iterations=12, trials=4000, recordings=24, seconds=2.0, robots=8)
 FULL = Sizes(starts=64, iterations=60, trials=100_000, recordings=500, seconds=1.0, robots=60)
+
+# Settings of Dask, as in docs/how-to/cluster.md. Without them, a scheduler and two workers that do
+# nothing take 17 % of a core: Dask looks at the stack of each worker a hundred times per second, at
+# its memory ten times, and checks its own event loops fifty times.
+QUIET_DASK = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.admin.tick.interval": "1s",
+}
 
 # Duration of the motion that is repeated in Monte-Carlo trials [s], and noise of the states with
 # which the trials of such a short motion converge soon.
@@ -278,16 +294,14 @@ def cluster(workers: int) -> Iterator[Any]:
     Yields:
         A client of the cluster.
     """
+    import dask
     from distributed import Client, LocalCluster
 
     # The workers import the benchmarks as this process does.
     root = str(Path(__file__).resolve().parents[2])
-
-    # Dask looks at the stack of each worker a hundred times per second. In one comparison, this
-    # took 6 % of the CPU time of a design.
-    os.environ["DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED"] = "False"
     os.environ["PYTHONPATH"] = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
     with (
+        dask.config.set(QUIET_DASK),
         tempfile.TemporaryDirectory() as folder,
         LocalCluster(
             n_workers=workers,
@@ -310,11 +324,17 @@ def _import() -> None:
     import mjfim.excitation.design  # noqa: F401
 
 
-def cpu_seconds() -> float:
-    """CPU time of this process and of all that it has started and that are alive [s]."""
+def cpu_seconds(without: int) -> float:
+    """CPU time of this process and of all that it has started and that are alive [s].
+
+    Args:
+        without: Number of a process that does not count.
+    """
     own = psutil.Process()
     total = 0.0
     for process in [own, *own.children(recursive=True)]:
+        if process.pid == without:
+            continue
         try:
             times = process.cpu_times()
         except psutil.NoSuchProcess:
@@ -341,17 +361,22 @@ class Reference:
     Attributes:
         fingerprint: Numbers of its result.
         cpu: CPU time [s].
+        speed: Speed of a core meanwhile [steps/s].
     """
 
     fingerprint: bytes
     cpu: float
+    speed: float
 
 
 def serial(verb: Verb) -> Reference:
     """Do the work of a verb in this process."""
-    begun = time.process_time()
-    result = verb.run(None)
-    return Reference(fingerprint=verb.fingerprint(result), cpu=time.process_time() - begun)
+    with core_speed() as core:
+        begun = time.process_time()
+        result = verb.run(None)
+        used = time.process_time() - begun
+    fingerprint = verb.fingerprint(result)
+    return Reference(fingerprint=fingerprint, cpu=used, speed=core.steps_per_second)
 
 
 @contextmanager
@@ -381,19 +406,21 @@ def busy_cores(verb: Verb, options: argparse.Namespace) -> Iterator[None]:
 def on_cluster(verb: Verb, reference: Reference, workers: int) -> bool:
     """Compare a verb on the cluster with one process: numbers, CPU time and memory."""
     with cluster(workers) as client:
-        begun, clock = cpu_seconds(), time.perf_counter()
-        result = verb.run(client)
-        used, seconds = cpu_seconds() - begun, time.perf_counter() - clock
+        with core_speed() as core:
+            begun, clock = cpu_seconds(core.probe), time.perf_counter()
+            result = verb.run(client)
+            used, seconds = cpu_seconds(core.probe) - begun, time.perf_counter() - clock
         memory = max(client.run(peak_memory).values())
 
     is_equal = verb.fingerprint(result) == reference.fingerprint
-    ratio = used / reference.cpu
+    alone = reference.cpu * reference.speed / core.steps_per_second
+    ratio = used / alone
     is_large = reference.cpu >= LARGE_WORK
     good = judge(verb.name, "equal to the last digit", str(is_equal), "True", good=is_equal)
     good &= judge(
         verb.name,
         f"CPU s on {workers} workers over those alone",
-        f"{used:.1f} / {reference.cpu:.1f} = {ratio:.3f}",
+        f"{used:.1f} / {alone:.1f} ({reference.cpu:.1f}) = {ratio:.3f}",
         f"<= {MOST_CPU}" + ("" if is_large else " in large work"),
         good=ratio <= MOST_CPU or not is_large,
     )
@@ -526,17 +553,19 @@ def in_empty_folder(sizes: Sizes, references: dict[str, Reference], workers: int
 
 def scaling(verb: Verb) -> bool:
     """Compare the time on one worker with that on two."""
-    seconds = {}
+    seconds, speeds = {}, {}
     for workers in (1, 2):
-        with cluster(workers) as client:
+        with cluster(workers) as client, core_speed() as core:
             clock = time.perf_counter()
             verb.run(client)
             seconds[workers] = time.perf_counter() - clock
-    speed = seconds[1] / seconds[2]
+        speeds[workers] = core.steps_per_second
+    alone = seconds[1] * speeds[1] / speeds[2]
+    speed = alone / seconds[2]
     return judge(
         verb.name,
         "speed of two workers over that of one",
-        f"{seconds[1]:.1f} / {seconds[2]:.1f} = {speed:.2f}",
+        f"{alone:.1f} ({seconds[1]:.1f}) / {seconds[2]:.1f} = {speed:.2f}",
         f">= {LEAST_SPEED}",
         good=speed >= LEAST_SPEED,
     )
@@ -567,6 +596,16 @@ def simulations(sizes: Sizes, options: argparse.Namespace) -> bool:
             f"{last.efficiency:.3f}",
             f">= {LEAST_EFFICIENCY}",
             good=last.efficiency >= LEAST_EFFICIENCY,
+        )
+
+        # An efficiency of less work would mean nothing.
+        counts = [row.iterations for row in rows]
+        good &= judge(
+            "design",
+            f"{name}: iterations on all these clusters",
+            f"{min(counts)} to {max(counts)}",
+            f"within {SAME_WORK:.0%}",
+            good=max(counts) <= (1.0 + SAME_WORK) * min(counts),
         )
     return good
 

@@ -11,10 +11,14 @@ from unittest.mock import patch
 import numpy as np
 
 import mjfim
+from mjfim.arrays import Array
+from mjfim.excitation import control_search
 from mjfim.excitation import design as design_module
 from mjfim.excitation.constrained import ConstrainedSlice
+from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.judging import JudgeOrder
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.rounds import Judgement
 from mjfim.excitation.task import DesignTask
 from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
@@ -33,9 +37,11 @@ class Efficiency:
     Attributes:
         workers: Number of workers.
         seconds: Simulated time of the whole design [s].
-        efficiency: Seconds of the same design on one worker, over workers times `seconds`.
+        efficiency: Length of all tasks together, over workers times `seconds`.
         of_searches: The same from the first task to the last one, without what the caller does
             before and after them.
+        iterations: Number of iterations of all searches, which does not depend on the number of
+            workers if they make the same decisions.
         caller: CPU time of the caller, whom all workers wait for if it is busy [s].
         pickling: The part of it in which orders are pickled and results unpickled [s].
         tasks: Number of tasks.
@@ -46,6 +52,7 @@ class Efficiency:
     seconds: float
     efficiency: float
     of_searches: float
+    iterations: int
     caller: float
     pickling: float
     tasks: int
@@ -72,15 +79,16 @@ def efficiencies(
     task = DesignTask.resolve(experiment, threads=1)
     tasks = _MeasuredSearches()
 
-    # One worker carries out all tasks, the others schedule them again.
-    alone = _simulated_seconds(task, tasks, starts, 1)
+    # Slices are longer on more workers. Each length is carried out and measured once, at the speed
+    # that the computer has then. So tasks of one run are compared with each other only.
     for number in counts:
-        found = alone if number == 1 else _simulated_seconds(task, tasks, starts, number)
+        found = _simulated_seconds(task, tasks, starts, number)
         yield Efficiency(
             workers=number,
             seconds=found.whole,
-            efficiency=alone.whole / (number * found.whole),
+            efficiency=found.busy / (number * found.whole),
             of_searches=found.busy / (number * found.searches),
+            iterations=found.iterations,
             caller=found.caller,
             pickling=found.pickling,
             tasks=found.tasks,
@@ -99,6 +107,7 @@ class _Times:
         caller: The caller's own work.
         pickling: The part of it in which it pickles and unpickles.
         tasks: Number of tasks.
+        iterations: Number of iterations of all searches.
     """
 
     whole: float
@@ -107,6 +116,7 @@ class _Times:
     caller: float
     pickling: float
     tasks: int
+    iterations: int
 
 
 def _simulated_seconds(
@@ -120,11 +130,21 @@ def _simulated_seconds(
         names = (_copy_name(found, i) for i in range(starts))
         return (replace(found[i % len(found)], name=name) for i, name in enumerate(names))
 
+    evaluated: dict[bytes, Any] = {}
+
+    def evaluated_once(stage: DescentLevel, control: Array) -> Any:
+        """The point of a control. Copies of a start find the same one, different starts do not."""
+        key = control.tobytes()
+        if key not in evaluated:
+            evaluated[key] = point_at_stated_rate(stage, control)
+        return evaluated[key]
+
     with (
         patch.object(design_module, "initial_controls_of", many),
+        patch.object(control_search, "point_at_stated_rate", evaluated_once),
         simulated(workers, tasks, LATENCY) as cluster,
     ):
-        design_module.design_task(task, executor=cluster.workers)
+        found = design_module.design_task(task, executor=cluster.workers)
     return _Times(
         whole=cluster.now,
         searches=cluster.searching,
@@ -132,6 +152,7 @@ def _simulated_seconds(
         caller=cluster.caller,
         pickling=cluster.pickling,
         tasks=cluster.count,
+        iterations=sum(start.iterations for start in found.starts),
     )
 
 
