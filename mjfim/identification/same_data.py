@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -29,7 +29,14 @@ def refuse_same_data(fitted: Sequence[Recording], held_out: Sequence[Recording])
     """
     recordings = [*fitted, *held_out]
 
-    for (i, one), (j, other) in combinations(enumerate(recordings), 2):
+    # Different recordings usually differ in their first row, so that few pairs are compared.
+    groups: dict[Hashable, list[int]] = {}
+    for i, recording in enumerate(recordings):
+        groups.setdefault(_beginning(recording), []).append(i)
+
+    pairs = [pair for group in groups.values() for pair in combinations(group, 2)]
+    for i, j in sorted(pairs):
+        one, other = recordings[i], recordings[j]
         if not _same_data(one, other):
             continue
 
@@ -44,17 +51,17 @@ def refuse_same_data(fitted: Sequence[Recording], held_out: Sequence[Recording])
         raise RecordingError(f"{fault}: {consequence}")
 
 
+def _beginning(recording: Recording) -> Hashable:
+    """What recordings with the same data have in common: sizes, outputs and the first row."""
+    # Missing values are equal to each other here, and zero has no sign.
+    first = np.nan_to_num(recording.y[:1].ravel()) + 0.0
+    return recording.t.shape, recording.y.shape, recording.outputs, tuple(first.tolist())
+
+
 def _same_data(one: Recording, other: Recording) -> bool:
-    """Whether two recordings have equal outputs, controls and measurements at the same times."""
+    """Whether two recordings of the same sizes have equal values at the same times."""
     if one is other:
         return True
-    shapes = (one.t.shape, one.y.shape)
-    if one.outputs != other.outputs or shapes != (other.t.shape, other.y.shape):
-        return False
-
-    # Different recordings usually differ in their first row, so that most pairs end here.
-    if not np.array_equal(one.y[:1], other.y[:1], equal_nan=True):
-        return False
 
     same_values = np.array_equal(one.ctrl, other.ctrl, equal_nan=True)
     same_values = same_values and np.array_equal(one.y, other.y, equal_nan=True)

@@ -14,7 +14,7 @@ import mjfim
 from mjfim.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import fit_workers, searches, segment_simulation
+from mjfim.identification import cross_validation, fit_workers, searches, segment_simulation
 from mjfim.identification.fit_orders import BatchOrder
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
@@ -241,6 +241,48 @@ def test_an_order_holds_the_segments_of_its_batch_alone(
     assert len(part.value.made().segments) == len(problem.segments)
 
 
+@pytest.mark.parametrize("largest", [2**20, 0], ids=["folds", "batches"])
+def test_each_part_is_predicted_from_the_others_as_in_one_process(
+    experiment: mjfim.Experiment,
+    recordings: list[mjfim.Recording],
+    monkeypatch: pytest.MonkeyPatch,
+    largest: int,
+) -> None:
+    """A worker does a whole fold, or parts of each pass where the recordings are large."""
+    monkeypatch.setattr(cross_validation, "LARGEST_SENT_BYTES", largest)
+    problem = problem_of(experiment, recordings, WHOLE)
+    plant = problem.system.plant
+    at = problem.begin(problem.system.parameters.guess)
+    begin = plant.engine_steps
+    alone = cross_validation.predict_unfitted(problem, at, None, Budget())
+    steps = plant.engine_steps
+
+    orders: list[str] = []
+    for name in ("_work_on_whole", "_work_on_batch"):
+        monkeypatch.setattr(fit_workers, name, noted(getattr(fit_workers, name), name, orders))
+    with LosingThreads() as threads:
+        divided = problem.on_workers(FitWorkers(threads))
+        found = cross_validation.predict_unfitted(divided, at, None, Budget())
+
+    assert set(orders) == {"_work_on_whole" if largest else "_work_on_batch"}
+    assert [part.name for part in found] == [part.name for part in alone]
+    assert len(found) == len(recordings)
+    for here, there in zip(alone, found, strict=True):
+        assert np.array_equal(here.identified.rms, there.identified.rms)
+        assert np.array_equal(here.nominal.mae, there.nominal.mae)
+    assert plant.engine_steps - steps == steps - begin
+
+
+def noted(work: Callable[[Any], Any], name: str, names: list[str]) -> Callable[[Any], Any]:
+    """A work whose name is noted each time that it is done."""
+
+    def done(order: Any) -> Any:
+        names.append(name)
+        return work(order)
+
+    return done
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pool", "dask"])
 def test_processes_in_another_folder_find_the_same_estimate(
@@ -262,3 +304,6 @@ def test_processes_in_another_folder_find_the_same_estimate(
     assert np.array_equal(found.covariance, alone.covariance)
     assert found.chi2 == alone.chi2
     assert found.steps == alone.steps
+    assert len(found.predictions) == len(alone.predictions) > 1
+    for here, there in zip(alone.predictions, found.predictions, strict=True):
+        assert np.array_equal(here.identified.rms, there.identified.rms)

@@ -36,6 +36,20 @@ def test_copies_are_refused() -> None:
         refuse_same_data([copy, recording(1)], [dataclasses.replace(copy)])
 
 
+def test_a_copy_may_write_zeros_and_missing_values_in_another_way() -> None:
+    """Zero has two signs, and a missing value many bit patterns."""
+    first = np.array(recording().y)
+    second = np.array(recording().y)
+    first[0] = [0.0, np.nan]
+    second[0] = [-0.0, -np.nan]
+    one, other = (
+        dataclasses.replace(recording(name=n), y=y)
+        for n, y in zip("ab", (first, second), strict=True)
+    )
+    with pytest.raises(RecordingError, match="b holds the same data as a"):
+        refuse_same_data([one, recording(1), other], [])
+
+
 @pytest.mark.parametrize("changed", ["t", "ctrl", "y"])
 def test_other_recordings_are_accepted(changed: str) -> None:
     """One other value is enough, and so is a clock of another rate."""
