@@ -65,6 +65,11 @@ class AlignedRecording:
     def __post_init__(self) -> None:
         freeze(self, "t", "y", "ctrl")
 
+    @property
+    def size(self) -> int:
+        """Memory that the recording takes [bytes]."""
+        return self.t.nbytes + self.y.nbytes + self.ctrl.nbytes
+
     @cached_property
     def measured(self) -> np.ndarray:
         """(M, ny) True where there is a measured value."""

@@ -17,6 +17,9 @@ T = TypeVar("T")
 # Work on one batch of a problem, at values of the unknowns.
 BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T | None]
 
+# Size of all recordings of a problem up to which each worker receives them [bytes].
+LARGEST_SENT_BYTES = 64 * 2**20
+
 # Work on a whole problem, which ends early when the budget is exhausted.
 ProblemWork = Callable[["FitProblem", Budget], T]
 

@@ -17,7 +17,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.batch_workers import ProblemWork
+from mjfim.identification.batch_workers import LARGEST_SENT_BYTES, ProblemWork
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.optimize.levenberg_marquardt import (
     InterruptedPassError,
@@ -38,9 +38,6 @@ PREDICTED_SHARE = 0.25
 
 # Largest number of samples in a cross-validation; of more data, a subset of the segments is used.
 MAX_SAMPLES = 200_000
-
-# Size of all recordings up to which each worker receives them [bytes].
-LARGEST_SENT_BYTES = 64 * 2**20
 
 # Settings of the searches for theta without a part of the data, and for initial states. Few
 # iterations are enough, because these searches begin close to their result, and errors of
@@ -172,8 +169,8 @@ def _of_folds(
 
     # A worker that does a whole fold waits for nobody, but needs all recordings. Where they are
     # large, workers share each pass over the data instead.
-    size = sum(each.t.nbytes + each.y.nbytes + each.ctrl.nbytes for each in problem.recordings)
-    if problem.workers is None or len(folds) == 1 or size > LARGEST_SENT_BYTES:
+    is_large = problem.recording_bytes > LARGEST_SENT_BYTES
+    if problem.workers is None or len(folds) == 1 or is_large:
         yield from (fold(problem, budget) for fold in folds)
     else:
         yield from problem.workers.of_whole(problem, folds, budget)

@@ -272,6 +272,11 @@ class FitProblem:
         return sum(len(recording.t) for recording in self.recordings)
 
     @property
+    def recording_bytes(self) -> int:
+        """Size of all recordings [bytes]."""
+        return sum(each.size for each in self.recordings)
+
+    @property
     def value_count(self) -> int:
         """Number of measured values that count."""
         return int(sum(mask.sum() for mask in self.masks))

@@ -20,7 +20,7 @@ from mjfim.budget import Budget, StopToken
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.batch_workers import BatchWork, ProblemWork
+from mjfim.identification.batch_workers import LARGEST_SENT_BYTES, BatchWork, ProblemWork
 from mjfim.identification.fit_orders import (
     KEPT_PROBLEMS,
     BatchOrder,
@@ -136,7 +136,7 @@ class FitWorkers:
         self._executor = Workers.of(executor)
         self._stop = StopToken() if stop is None else stop
 
-        # True after workers did nothing for a pass that began after a request to stop.
+        # True where workers do not begin a pass soon that a result needs after a request to stop.
         self._are_given_up = False
 
         # Orders of each problem, by the threads of a worker, and the segments of a part.
@@ -207,8 +207,17 @@ class FitWorkers:
             return _Found(result=order.work(alone, budget), steps=0)
 
         work_on_whole: Callable[[WholeOrder[T]], _Found[T]] = _work_on_whole
-        for found in results_or_here(self._executor, work_on_whole, orders, budget, here):
-            yield _counted_here(problem, found)
+        left = len(orders)
+        try:
+            for found in results_or_here(self._executor, work_on_whole, orders, budget, here):
+                left -= 1
+                yield _counted_here(problem, found)
+        finally:
+            # Workers other than those of a pool go on with the works that a request to stop has
+            # left. This process does what is still needed of small data sooner than they.
+            is_small = problem.recording_bytes <= LARGEST_SENT_BYTES
+            if left and is_small and self._stop.requested and self._executor.pool is None:
+                self._are_given_up = True
 
     def part_of(
         self, problem: FitProblem, segments: Sequence[int], threads: int
@@ -276,8 +285,7 @@ class FitWorkers:
         if self._executor.shares_memory:
             return RecordingOrder.of(recording, None)
 
-        size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
-        files = self._folder.written(recording) if size > MIN_FILE_BYTES else None
+        files = self._folder.written(recording) if recording.size > MIN_FILE_BYTES else None
 
         # Workers of this computer find these files, so that nobody reads the log again.
         is_found = files is not None and self._executor.is_local

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -271,6 +273,45 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
         assert np.array_equal(here.identified.rms, there.identified.rms)
         assert np.array_equal(here.nominal.mae, there.nominal.mae)
     assert plant.engine_steps - steps == steps - begin
+
+
+@pytest.mark.parametrize("largest", [2**20, 0], ids=["small", "large"])
+def test_works_that_a_request_to_stop_has_left_do_not_hold_up_what_is_needed(
+    experiment: mjfim.Experiment,
+    recordings: list[mjfim.Recording],
+    monkeypatch: pytest.MonkeyPatch,
+    largest: int,
+) -> None:
+    """This process does passes over small data, while workers still do what nobody waits for."""
+    monkeypatch.setattr(dispatch, "GRACE", 0.1)
+    monkeypatch.setattr(fit_workers, "GRACE", 0.1)
+    monkeypatch.setattr(fit_workers, "LARGEST_SENT_BYTES", largest)
+    problem = problem_of(experiment, recordings, WHOLE)
+    at = problem.begin(problem.system.parameters.guess)
+    alone = problem.condense(at)
+    assert alone is not None
+
+    stop, is_over = StopToken(), Event()
+
+    def long_work(problem: FitProblem, budget: Budget) -> bool:
+        """A work during which the user presses Ctrl-C, and which goes on for long."""
+        stop.request()
+        return is_over.wait(20.0)
+
+    with ThreadPoolExecutor(1) as threads:
+        submit = mock.Mock(side_effect=threads.submit)
+        monkeypatch.setattr(threads, "submit", submit)
+        workers = FitWorkers(threads, stop)
+        divided = problem.on_workers(workers)
+        assert not list(workers.of_whole(divided, [long_work, long_work], Budget(stop=stop)))
+
+        before = submit.call_count
+        found = divided.condense(at)
+        is_submitted = submit.call_count > before
+        is_over.set()
+    assert found is not None
+    assert np.array_equal(found.blocks, alone.blocks)
+    assert is_submitted == (largest == 0)
 
 
 def noted(work: Callable[[Any], Any], name: str, names: list[str]) -> Callable[[Any], Any]:
