@@ -20,12 +20,16 @@ BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T | None]
 # Size of all recordings of a problem up to which each worker receives them [bytes].
 LARGEST_SENT_BYTES = 64 * 2**20
 
-# Work on a whole problem, which ends early when the budget is exhausted.
+# A task on a whole problem, which ends early when the budget is exhausted.
 ProblemWork = Callable[["FitProblem", Budget], T]
 
 
 class BatchWorkers(Protocol):
-    """Does work on batches of segments in other processes."""
+    """Workers for batches of segments, and for tasks on a whole problem."""
+
+    @property
+    def count(self) -> int:
+        """Number of workers."""
 
     def of_batches(
         self,
@@ -49,15 +53,15 @@ class BatchWorkers(Protocol):
     def of_whole(
         self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
     ) -> Iterator[T]:
-        """Do works that do not depend on each other, each of them in one worker.
+        """Do tasks that do not depend on each other, each of them in one worker.
 
         Every worker receives all data of the problem, so that these should not be large.
 
         Args:
             problem: The problem.
-            works: The works; they and the results can be pickled.
-            budget: Ends the works early.
+            works: The tasks; they and the results can be pickled.
+            budget: Ends the tasks early.
 
         Yields:
-            The result of every work that was not stopped before its begin, in their order.
+            The result of every task that was not stopped before its begin, in their order.
         """

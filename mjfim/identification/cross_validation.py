@@ -6,7 +6,7 @@ the other parts. The initial state of a predicted part is estimated from that pa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -118,7 +118,7 @@ def _predict_held_out(
         if budget.exhausted is not None:
             return
         begin_stage("predicting held-out recordings", i, len(held_out.recordings))
-        part = _Part(recordings=(i,), masks=_masks_of(held_out.masks, [i]))
+        part = _Part(name=held_out.recordings[i].name, recordings=(i,))
         yield _prediction(held_out, at.theta, part, True, budget)
 
 
@@ -127,14 +127,30 @@ class _Part:
     """A part of the data that is predicted.
 
     Attributes:
+        name: Name of the part for the user. A worker does not know it: the problem there has only
+            the recordings that it needs, which may have other names.
         recordings: Indices of the recordings that contain the part.
-        masks: (M, ny) for every recording, True for the values of the part.
-        note: What the name of the part adds where only some of its segments are predicted.
+        is_end: True for the end of these recordings alone.
     """
 
+    name: str
     recordings: tuple[int, ...]
-    masks: list[np.ndarray]
-    note: str = ""
+    is_end: bool = False
+
+    def masks(self, problem: FitProblem) -> list[np.ndarray]:
+        """(M, ny) for every recording, True for the values of the part.
+
+        Args:
+            problem: Problem of all parts.
+        """
+        masks = _masks_of(problem.masks, self.recordings)
+        if not self.is_end:
+            return masks
+
+        for i in self.recordings:
+            t = problem.recordings[i].t
+            masks[i] = masks[i] & (t >= (1.0 - PREDICTED_SHARE) * t[-1])[:, None]
+        return masks
 
 
 def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> Iterator[Prediction]:
@@ -149,12 +165,12 @@ def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> I
         at = replace(at, private=at.private[subset])
 
     parts = [
-        replace(part, note=_note_of_subset(part.recordings, problem, whole))
+        replace(part, name=part.name + _note_of_subset(part.recordings, problem, whole))
         for part in _parts(problem)
+        if any(segment.recording in part.recordings for segment in problem.segments)
     ]
     folds = [partial(_prediction_by_others, at=at, part=part) for part in parts]
-    for k, prediction in enumerate(_of_folds(problem, folds, budget)):
-        begin_stage("predicting each part from the others", k + 1, len(parts))
+    for prediction in _of_folds(problem, folds, budget):
         if budget.exhausted is not None:
             return
         if prediction is not None:
@@ -165,15 +181,22 @@ def _of_folds(
     problem: FitProblem, folds: Sequence[ProblemWork[Prediction | None]], budget: Budget
 ) -> Iterator[Prediction | None]:
     """Predictions of all parts, in one process or side by side on workers."""
-    begin_stage("predicting each part from the others", 0, len(folds))
-
     # A worker that does a whole fold waits for nobody, but needs all recordings. Where they are
-    # large, workers share each pass over the data instead.
+    # large, or where there would be nothing to do for many workers, the workers share each pass
+    # over the data instead.
+    workers = problem.workers
     is_large = problem.recording_bytes > LARGEST_SENT_BYTES
-    if problem.workers is None or len(folds) == 1 or is_large:
-        yield from (fold(problem, budget) for fold in folds)
+    found: Iterable[Prediction | None]
+    if workers is None or is_large or len(folds) < workers.count:
+        found = (fold(problem, budget) for fold in folds)
     else:
-        yield from problem.workers.of_whole(problem, folds, budget)
+        found = workers.of_whole(problem, folds, budget)
+
+    begin_stage("predicting each part from the others", 0, len(folds))
+    for number, prediction in enumerate(found, start=1):
+        if number < len(folds):
+            begin_stage("predicting each part from the others", number, len(folds))
+        yield prediction
 
 
 def _prediction_by_others(
@@ -191,7 +214,7 @@ def _prediction_by_others(
         The prediction; None where there are no other data, where the simulation diverges, and after
         a request to stop.
     """
-    others = problem.masked([~mask for mask in part.masks])
+    others = problem.masked([~mask for mask in part.masks(problem)])
     segments = others.segments_with_values
     if not len(segments):
         return None
@@ -214,15 +237,14 @@ def _parts(problem: FitProblem) -> Iterator[_Part]:
     """
     count = len(problem.recordings)
     if count == 1:
-        recording = problem.recordings[0]
-        late = recording.t >= (1.0 - PREDICTED_SHARE) * recording.t[-1]
-        mask = np.broadcast_to(late[:, None], recording.y.shape)
-        yield _Part(recordings=(0,), masks=[mask])
+        name = f"last {100 * PREDICTED_SHARE:.0f} % of {problem.recordings[0].name}"
+        yield _Part(name=name, recordings=(0,), is_end=True)
         return
 
     for group in np.array_split(np.arange(count), min(count, MAX_FOLDS)):
         indices = tuple(group.tolist())
-        yield _Part(recordings=indices, masks=_masks_of(problem.masks, indices))
+        name = ", ".join(problem.recordings[i].name for i in indices)
+        yield _Part(name=name, recordings=indices)
 
 
 def _note_of_subset(recordings: Sequence[int], subset: FitProblem, whole: FitProblem) -> str:
@@ -243,24 +265,20 @@ def _prediction(
     problem: FitProblem, theta: Array, part: _Part, held_out: bool, budget: Budget
 ) -> Prediction:
     """Errors of the model at theta: (p,), and of the nominal model, on a part of the data."""
-    name = ", ".join(problem.recordings[i].name for i in part.recordings)
-    if len(problem.recordings) == 1 and not held_out:
-        name = f"last {100 * PREDICTED_SHARE:.0f} % of {name}"
-    name += part.note
-
+    name, masks = part.name, part.masks(problem)
     guess = problem.system.parameters.guess
 
     # The fitted recordings are in the estimate anyway.
     if not held_out:
         return Prediction(
             name=name,
-            identified=_errors(problem, theta, part.masks, name, budget),
-            nominal=_errors(problem, guess, part.masks, name, budget),
+            identified=_errors(problem, theta, masks, name, budget),
+            nominal=_errors(problem, guess, masks, name, budget),
             held_out=False,
         )
 
-    errors, outputs = _predicted(problem, theta, part.masks, name, budget)
-    nominal_errors, nominal_outputs = _predicted(problem, guess, part.masks, name, budget)
+    errors, outputs = _predicted(problem, theta, masks, name, budget)
+    nominal_errors, nominal_outputs = _predicted(problem, guess, masks, name, budget)
     i = part.recordings[0]
     return Prediction(
         name=name,

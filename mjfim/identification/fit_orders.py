@@ -116,13 +116,14 @@ class RecordingOrder:
         Raises:
             RecordingError: Its file has changed since it was read.
         """
-        size = recording.t.nbytes + recording.y.nbytes + recording.ctrl.nbytes
         file = recording.file
         content = None
         if file is not None and channels is not None and file.is_read_by(channels):
             content = file.content
         return cls(
-            value=SharedRecording(uuid.uuid4().hex, recording, size), file=content, arrays=arrays
+            value=SharedRecording(uuid.uuid4().hex, recording, recording.size),
+            file=content,
+            arrays=arrays,
         )
 
     @property

@@ -273,8 +273,9 @@ class FitProblem:
 
     @property
     def recording_bytes(self) -> int:
-        """Size of all recordings [bytes]."""
-        return sum(each.size for each in self.recordings)
+        """Size of the recordings that have segments [bytes]."""
+        needed = {segment.recording for segment in self.segments}
+        return sum(self.recordings[i].size for i in needed)
 
     @property
     def value_count(self) -> int:

@@ -1,4 +1,4 @@
-"""A fit on the workers of an executor: they simulate batches of segments, and search from starts.
+"""A fit on the workers of an executor: they simulate batches of segments, or do whole searches.
 
 A worker receives the recordings of its batches once, and the values of the unknowns with every
 order. The batches, and the order in which their results are added, are those of a single process:
@@ -88,7 +88,7 @@ def _work_on_batch(order: BatchOrder[T]) -> _Found[T | None]:
 
 @one_blas_thread()
 def _work_on_whole(order: WholeOrder[T]) -> _Found[T]:
-    """Do a work on a whole problem in a worker process."""
+    """Do a task on a whole problem in a worker process."""
     problem = _problem_of(order.part)
     return _counted(problem, lambda: order.work(problem, Budget(stop=pool_stop_token())))
 
@@ -125,7 +125,7 @@ class _Watch:
 
 
 class FitWorkers:
-    """Workers that simulate the batches of a fit, and search from its starts.
+    """Workers that simulate the batches of a fit, or do whole tasks such as searches.
 
     Args:
         executor: Executor of the workers.
@@ -136,7 +136,8 @@ class FitWorkers:
         self._executor = Workers.of(executor)
         self._stop = StopToken() if stop is None else stop
 
-        # True where workers do not begin a pass soon that a result needs after a request to stop.
+        # True if, after a request to stop, this process does the passes itself that a result still
+        # needs, because the workers do not answer or are busy with what nobody waits for.
         self._are_given_up = False
 
         # Orders of each problem, by the threads of a worker, and the segments of a part.
@@ -151,6 +152,11 @@ class FitWorkers:
         self._systems: dict[tuple[int, int], tuple[System, SharedValue[SystemOrder]]] = {}
         self._recordings: dict[AlignedRecording, RecordingOrder] = {}
         self._folder = RecordingFolder()
+
+    @property
+    def count(self) -> int:
+        """Number of workers."""
+        return self._executor.count
 
     def of_batches(
         self,
@@ -196,7 +202,7 @@ class FitWorkers:
     def of_whole(
         self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
     ) -> Iterator[T]:
-        """Do independent works, each in one worker. See `batch_workers.BatchWorkers`."""
+        """Do independent tasks, each in one worker. See `batch_workers.BatchWorkers`."""
         threads = self._executor.threads_for(len(works))
         part = self.part_of(problem, range(len(problem.segments)), threads)
         orders = [WholeOrder(part=part, work=work) for work in works]
@@ -213,10 +219,11 @@ class FitWorkers:
                 left -= 1
                 yield _counted_here(problem, found)
         finally:
-            # Workers other than those of a pool go on with the works that a request to stop has
-            # left. This process does what is still needed of small data sooner than they.
+            # Workers other than those of a pool go on with tasks that a request to stop has left.
+            # If all of them do, this process is sooner ready with passes over small data.
             is_small = problem.recording_bytes <= LARGEST_SENT_BYTES
-            if left and is_small and self._stop.requested and self._executor.pool is None:
+            are_busy = self._executor.pool is None and left >= self.count
+            if self._stop.requested and are_busy and is_small:
                 self._are_given_up = True
 
     def part_of(

@@ -94,7 +94,8 @@ def identify(
         stop: Token that ends the search with the best result so far.
         progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
         executor: Where the work is done (`mjfim.ExecutorLike`); None for this process. It
-            simulates parts of much data and searches from several starts side by side.
+            simulates parts of much data, searches from several starts, and predicts parts of the
+            data from the others side by side.
 
     Returns:
         The estimate with its accuracy and warnings.

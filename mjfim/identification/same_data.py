@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
@@ -29,13 +29,12 @@ def refuse_same_data(fitted: Sequence[Recording], held_out: Sequence[Recording])
     """
     recordings = [*fitted, *held_out]
 
-    # Different recordings usually differ in their first row, so that few pairs are compared.
+    # Only recordings whose first rows are equal are compared pair by pair.
     groups: dict[Hashable, list[int]] = {}
     for i, recording in enumerate(recordings):
         groups.setdefault(_beginning(recording), []).append(i)
 
-    pairs = [pair for group in groups.values() for pair in combinations(group, 2)]
-    for i, j in sorted(pairs):
+    for i, j in chain.from_iterable(combinations(group, 2) for group in groups.values()):
         one, other = recordings[i], recordings[j]
         if not _same_data(one, other):
             continue
@@ -53,13 +52,14 @@ def refuse_same_data(fitted: Sequence[Recording], held_out: Sequence[Recording])
 
 def _beginning(recording: Recording) -> Hashable:
     """What recordings with the same data have in common: sizes, outputs and the first row."""
-    # Missing values are equal to each other here, and zero has no sign.
+    # Missing values are equal to each other and to zero here, and zero has no sign. Recordings that
+    # begin alike are compared as a whole later.
     first = np.nan_to_num(recording.y[:1].ravel()) + 0.0
     return recording.t.shape, recording.y.shape, recording.outputs, tuple(first.tolist())
 
 
 def _same_data(one: Recording, other: Recording) -> bool:
-    """Whether two recordings of the same sizes have equal values at the same times."""
+    """Whether two recordings that begin alike have equal values at the same times."""
     if one is other:
         return True
 

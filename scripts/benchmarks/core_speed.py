@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from mjfim.atomic_io import replacing
 
@@ -59,12 +60,29 @@ def core_speed() -> Iterator[CoreSpeed]:
         found = CoreSpeed(probe.pid)
         try:
             yield found
+            if probe.poll() is not None:
+                raise RuntimeError("the process that measures the speed of a core has ended")
         finally:
             probe.kill()
             probe.wait()
         if path.exists():
             total = json.loads(path.read_text())
-            found.steps_per_second = total["steps"] / total["seconds"]
+            found.steps_per_second = total["steps"] / max(total["seconds"], 1e-3)
+
+
+def at_speed(seconds: float, speed: float, wanted: float) -> float:
+    """Time that work takes at another speed of the core [s].
+
+    Args:
+        seconds: Time that it took [s].
+        speed: Speed at which it was done [steps/s]; NaN if it is not known.
+        wanted: The other speed [steps/s]; NaN if it is not known.
+
+    Returns:
+        The time; that which it took if a speed is not known.
+    """
+    ratio = speed / wanted
+    return seconds * ratio if np.isfinite(ratio) else seconds
 
 
 def main() -> None:

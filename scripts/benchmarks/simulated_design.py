@@ -64,8 +64,8 @@ def efficiencies(
 ) -> Iterator[Efficiency]:
     """Schedule a design from many starts on one worker and on more.
 
-    The searches from the initial controls that the experiment states are carried out once. Every
-    further start takes as long as one of them, and finds the same.
+    The searches from the initial controls that the experiment states are carried out once for each
+    length of slices. Every further start takes as long as one of them, and finds the same.
 
     Args:
         experiment: Experiment under hard limits; its number of starts is that of the searches that
@@ -130,11 +130,11 @@ def _simulated_seconds(
         names = (_copy_name(found, i) for i in range(starts))
         return (replace(found[i % len(found)], name=name) for i, name in enumerate(names))
 
-    evaluated: dict[bytes, Any] = {}
+    evaluated: dict[tuple[int, bytes], Any] = {}
 
     def evaluated_once(stage: DescentLevel, control: Array) -> Any:
-        """The point of a control. Copies of a start find the same one, different starts do not."""
-        key = control.tobytes()
+        """The point of a control, evaluated once: all copies of a start find the same control."""
+        key = id(stage), control.tobytes()
         if key not in evaluated:
             evaluated[key] = point_at_stated_rate(stage, control)
         return evaluated[key]

@@ -7,12 +7,14 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import mjfim
 from mjfim.budget import Budget, StopToken
 from mjfim.parallel import carry_out
 from scripts.benchmarks import arms, scale
+from scripts.benchmarks.core_speed import at_speed
 from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
 from scripts.benchmarks.simulated_design import Efficiency
 
@@ -78,10 +80,20 @@ def test_the_time_in_which_the_caller_pickles_counts_for_each_order() -> None:
     assert cluster.now >= 1000.0 + cluster.pickling / 20
 
 
-@pytest.mark.parametrize(("value", "is_good"), [(0.81, True), (0.79, False)])
+def test_a_time_is_stated_at_another_speed_if_both_speeds_are_known() -> None:
+    assert at_speed(6.0, speed=2.0, wanted=3.0) == 4.0
+    assert at_speed(6.0, speed=np.nan, wanted=3.0) == 6.0
+    assert at_speed(6.0, speed=2.0, wanted=np.nan) == 6.0
+
+
+@pytest.mark.parametrize(
+    ("value", "iterations", "verdict"),
+    [(0.81, 102, (True, True)), (0.79, 100, (False, True)), (0.81, 104, (True, False))],
+)
 def test_both_curves_are_judged_at_the_largest_number_of_workers(
     value: float,
-    is_good: bool,
+    iterations: int,
+    verdict: tuple[bool, bool],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -89,7 +101,7 @@ def test_both_curves_are_judged_at_the_largest_number_of_workers(
     def curve(
         experiment: mjfim.Experiment, starts: int, counts: Sequence[int]
     ) -> Iterator[Efficiency]:
-        """An efficiency of 1 but for the arm on the largest number of workers."""
+        """An efficiency of 1 and equal work but for the arm on the largest number of workers."""
         for count in counts:
             is_last = experiment.source == "arm" and count == counts[-1]
             yield Efficiency(
@@ -97,7 +109,7 @@ def test_both_curves_are_judged_at_the_largest_number_of_workers(
                 seconds=starts / count,
                 efficiency=value if is_last else 1.0,
                 of_searches=1.0,
-                iterations=5,
+                iterations=iterations if is_last else 100,
                 caller=0.1,
                 pickling=0.05,
                 tasks=10,
@@ -114,8 +126,8 @@ def test_both_curves_are_judged_at_the_largest_number_of_workers(
         simulated_starts=8192, arm_starts=1000, picture=tmp_path / "curves.png"
     )
 
-    assert scale.simulations(scale.QUICK, options) is is_good
-    assert [verdict.good for verdict in scale.verdicts] == [True, True, is_good, True]
+    assert scale.simulations(scale.QUICK, options) is all(verdict)
+    assert [each.good for each in scale.verdicts] == [True, True, *verdict]
     assert options.picture.is_file()
     assert "a design from 1000 starts" in capsys.readouterr().out
 
