@@ -750,7 +750,12 @@ def main() -> int:
     parser.add_argument("--simulated-starts", type=int, default=8192, help="of the cart-pendulum")
     parser.add_argument("--arm-starts", type=int, default=4096, help="simulated starts of the arm")
     parser.add_argument("--picture", type=Path, default=Path("out/scale.png"))
-    return 0 if run(parser.parse_args()) else 1
+    options = parser.parse_args()
+
+    # A shell starts its background jobs with SIGINT ignored, and the commands that they start would
+    # ignore it as well.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    return 0 if run(options) else 1
 
 
 if __name__ == "__main__":
