@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from mjfim.studies.compare import compare
     from mjfim.studies.monte_carlo import monte_carlo
     from mjfim.studies.robustness import assess_robustness
+    from mjfim.studies.selection import select_terms
 
 __all__ = [
     "Budget",
@@ -72,6 +73,7 @@ __all__ = [
     "predict",
     "run_campaign",
     "save_video",
+    "select_terms",
     "shortest_experiment",
     "simulate",
 ]
@@ -110,6 +112,7 @@ MODULES = {
     "compare": "mjfim.studies.compare",
     "monte_carlo": "mjfim.studies.monte_carlo",
     "assess_robustness": "mjfim.studies.robustness",
+    "select_terms": "mjfim.studies.selection",
 }
 
 # Names of earlier versions, each with its new name.

@@ -64,6 +64,14 @@ def identify(
         str,
         typer.Option(help="least_squares, which keeps bounds, or newton, the paper's method."),
     ] = "least_squares",
+    select: Annotated[
+        bool,
+        typer.Option(
+            "--select",
+            help="Add terms that the model lacks, such as friction, as long as they improve the "
+            "prediction of left-out data.",
+        ),
+    ] = False,
     video: VideoFile = None,
     live: LiveView = None,
     as_json: AsJson = False,
@@ -83,10 +91,13 @@ def identify(
     from mjfim.output.presentation import describe
     from mjfim.output.summaries.logs import describe_logs
     from mjfim.recordings.read import read_log, recording_paths
+    from mjfim.studies.selection import select_terms_system
 
     place = stated_executor(executor)
     if method not in ("least_squares", "newton"):
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
+    if select and method == "newton":
+        raise ExperimentError("--select: fits with the method least_squares only, not newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     inputs = input_files(system.experiment, [*recordings, *(held_out or [])])
     logs = recording_paths(recordings, system.channels)
@@ -107,14 +118,22 @@ def identify(
         progress("fitting") as display,
         watched(live, system, display) as show,
     ):
-        result = identify_system(
-            system,
-            [log.recording for log in fitted],
-            method="newton" if method == "newton" else "least_squares",
-            held_out=[log.recording for log in predicted],
-            callback=show,
-            executor=workers,
-        )
+        recorded = [log.recording for log in fitted]
+        kept = [log.recording for log in predicted]
+        if select:
+            selected = select_terms_system(
+                system, recorded, held_out=kept, callback=show, executor=workers
+            )
+            result, system = selected.estimate, selected.system
+        else:
+            result = identify_system(
+                system,
+                recorded,
+                method="newton" if method == "newton" else "least_squares",
+                held_out=kept,
+                callback=show,
+                executor=workers,
+            )
 
     summary = describe(result)
     if verbose:

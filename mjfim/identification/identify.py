@@ -22,6 +22,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.continuation import continued_fit
 from mjfim.identification.extreme_values import describe_extreme_value
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.report import FitResult, estimate_from
@@ -173,51 +174,107 @@ def identify_task(
     steps_before = task.system.plant.engine_steps
 
     with one_blas_thread(), stop_on_interrupt(stop) as token:
-        problem = task.problem()
-        held_out = task.held_out_problem()
-        if executor is not None:
-            workers = FitWorkers(executor, token)
-            problem = problem.on_workers(workers)
-            held_out = None if held_out is None else held_out.on_workers(workers)
+        workers = None if executor is None else FitWorkers(executor, token)
         search = FitSearch(task=task, budget=Budget(stop=token), callback=callback)
-
-        # With much data, the search begins on a subset of the segments.
-        begin_stage("simulating the segments from the initial guess")
-        subset = quick_subset(problem)
-        begin = problem.begin(task.start)
-        completed(partial(_require_finite_cost, task, problem, subset, begin))
-
-        begin_stage("testing what the recordings determine")
-
-        # Combinations of parameters that no recording determines are held at their start values.
-        part = problem.of_segments(subset)
-        null_space = completed(partial(_unseen_directions, task, part))
-        problem = problem.pinned(task.start, null_space)
-
-        # Short searches from several starts avoid local minima. The best result continues over
-        # all data.
-        problem, subset, first = _first_fit(search, problem, subset, begin)
-
-        # A result that does not explain the data may be a local minimum. Fits over short segments
-        # then give another start, and the better one of the two results is kept.
-        fit = continued_fit(search, problem, first, null_space)
-        result = FitResult(
-            task=task,
-            problem=fit.problem,
-            solution=fit.solution,
-            quality=fit.quality,
-            null_space=null_space,
-            held_out=held_out,
-            subset=subset,
-            restart=fit.restart,
-        )
-        estimate = estimate_from(result, search.budget)
+        estimate = estimate_from(fit_task(search, workers), search.budget)
 
     return replace(
         estimate,
         seconds=time.perf_counter() - begun,
         steps=task.system.plant.engine_steps - steps_before,
     )
+
+
+def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
+    """Search for the parameters of a task from its start.
+
+    Args:
+        search: The task, and the budget of its searches.
+        workers: Workers that simulate parts of the data; None for this process.
+
+    Returns:
+        The fit, whose accuracy is not yet assessed.
+
+    Raises:
+        RecordingError: A recording cannot be used.
+        SimulationDivergedError: The model diverges at the start.
+    """
+    task = search.task
+    problem, held_out = _problems(task, workers)
+
+    # With much data, the search begins on a subset of the segments.
+    begin_stage("simulating the segments from the initial guess")
+    subset = quick_subset(problem)
+    begin = problem.begin(task.start)
+    completed(partial(_require_finite_cost, task, problem, subset, begin))
+
+    # Combinations of parameters that no recording determines are held at their start values.
+    begin_stage("testing what the recordings determine")
+    null_space = completed(partial(_unseen_directions, task, problem.of_segments(subset)))
+    problem = problem.pinned(task.start, null_space)
+
+    # Short searches from several starts avoid local minima. The best result continues over all
+    # data.
+    problem, subset, first = _first_fit(search, problem, subset, begin)
+
+    # A result that does not explain the data may be a local minimum. Fits over short segments then
+    # give another start, and the better one of the two results is kept.
+    fit = continued_fit(search, problem, first, null_space)
+    return FitResult(
+        task=task,
+        problem=fit.problem,
+        solution=fit.solution,
+        quality=fit.quality,
+        null_space=null_space,
+        held_out=held_out,
+        subset=subset,
+        restart=fit.restart,
+    )
+
+
+def refit_task(
+    search: FitSearch, near: UnknownValues, workers: FitWorkers | None = None
+) -> FitResult:
+    """Search for the parameters of a task near its start, where a similar fit has ended.
+
+    Args:
+        search: The task, whose start is near the solution, and the budget of its search.
+        near: Unknowns at which the similar fit has ended; those of the segments are used.
+        workers: Workers that simulate parts of the data; None for this process.
+
+    Returns:
+        The fit, whose accuracy is not yet assessed.
+
+    Raises:
+        SimulationDivergedError: The model diverges at the start.
+    """
+    task = search.task
+    problem, held_out = _problems(task, workers)
+    subset = quick_subset(problem)
+    null_space = completed(partial(_unseen_directions, task, problem.of_segments(subset)))
+    problem = problem.pinned(task.start, null_space)
+
+    begin = replace(problem.begin(task.start), private=near.private)
+    weighted, solution = search.solve(problem, begin, "near a similar fit", is_rough=True)
+    return FitResult(
+        task=task,
+        problem=weighted,
+        solution=solution,
+        quality=fit_quality(weighted, solution),
+        null_space=null_space,
+        held_out=held_out,
+        subset=subset,
+        restart=None,
+    )
+
+
+def _problems(task: FitTask, workers: FitWorkers | None) -> tuple[FitProblem, FitProblem | None]:
+    """The least-squares problems of the fitted and of the held-out recordings."""
+    problem = task.problem()
+    held_out = task.held_out_problem()
+    if workers is None:
+        return problem, held_out
+    return problem.on_workers(workers), None if held_out is None else held_out.on_workers(workers)
 
 
 def least_squares(

@@ -80,6 +80,10 @@ INITIAL_STATE_ROUGH_SHARE = 0.01
 # where the noise is estimated afterwards.
 ROUGH_SHARE = 0.1
 
+# Decrease of the cost, as a share of it, that a last step may bring in a fit that is only compared
+# with others by its predictions. They differ by far more.
+COMPARED_ROUGH_SHARE = 1e-4
+
 # Largest number of times that the noise of a robust fit is estimated and the parameters are fitted
 # again.
 MAX_NOISE_ROUNDS = 10
@@ -249,6 +253,8 @@ class FitSearch:
         begin: UnknownValues,
         phase: str = "all data",
         max_iterations: int | None = None,
+        *,
+        is_rough: bool = False,
     ) -> tuple[FitProblem, Solution]:
         """Search over all data.
 
@@ -260,6 +266,8 @@ class FitSearch:
             begin: Unknowns at which the search begins.
             phase: Name of the search for the user.
             max_iterations: Largest number of iterations, if it is below that of the settings.
+            is_rough: True for a fit whose predictions alone count, which hardly change any more
+                long before the search converges.
 
         Returns:
             The problem with the noise that was used, and its solution.
@@ -268,6 +276,10 @@ class FitSearch:
             SimulationDivergedError: The simulation diverges at the begin.
         """
         settings = self._final_settings(problem, max_iterations)
+        if is_rough:
+            settings = replace(
+                settings, tolerance=FIRST_TOLERANCE, rough_share=COMPARED_ROUGH_SHARE
+            )
         if self.task.noise_is_stated:
             return problem, self._minimise(problem, begin, settings, phase)
         if self.task.settings.loss != "linear":

@@ -90,7 +90,8 @@ def estimate_files(recordings: int, held_out: int = 0) -> tuple[str, ...]:
         recordings: Number of recordings that are fitted.
         held_out: Number of recordings that are held out.
     """
-    figures = ("parameters.png", "spectra.png", "trace.png", "pairs.png", "predictions.png")
+    names = ("parameters", "spectra", "trace", "pairs", "predictions", "selection")
+    figures = tuple(f"{name}.png" for name in names)
     fits = tuple(f"{name}.png" for name in (*fit_names(recordings), *held_out_names(held_out)))
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
     return (*data, *figures, *fits, *TABLE_FILES)
@@ -331,7 +332,7 @@ def write_estimate_folder(
     endings = "|".join(PictureFormat)
     _clear(
         folder,
-        rf"((fit|held_out)(_\d+)?|predictions|pairs|trace)\.({endings})|identified(_.*)?\.xml",
+        rf"((fit|held_out)(_\d+)?|predictions|pairs|trace|selection)\.({endings})|identified(_.*)?\.xml",
     )
     archive.save_with_origin(folder, estimate, system)
     write_tables(folder, estimate)

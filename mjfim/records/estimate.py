@@ -12,6 +12,7 @@ from mjfim.arrays import Array, freeze
 from mjfim.records.combinations import join_names
 from mjfim.records.labels import Labels
 from mjfim.records.recording import Recording
+from mjfim.records.selection import Selection
 from mjfim.records.serialization import SavedRecord
 from mjfim.records.shown import ShownRecord
 from mjfim.records.trajectory import Trajectory
@@ -83,6 +84,8 @@ class Estimate(ShownRecord):
         segments: Times at which the segments of each recording begin [s].
         sizes: (p,) sizes of which relative numbers are a share: magnitudes of the values, or of the
             whole vector or tensor of an entry [theta-unit].
+        selection: How the model was extended by terms that it lacked; None where that was not
+            asked for.
     """
 
     parameters: tuple[str, ...]
@@ -127,6 +130,7 @@ class Estimate(ShownRecord):
     nominal: tuple[Array, ...] = ()
     segments: tuple[Array, ...] = ()
     sizes: Array = field(default_factory=lambda: np.zeros(0))
+    selection: Selection | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -226,6 +230,7 @@ class Estimate(ShownRecord):
             "data": self.data,
             "combinations": list(self.combinations),
             "restart": None if self.restart is None else self.restart.summary(),
+            "selection": None if self.selection is None else self.selection.summary(),
         }
 
 

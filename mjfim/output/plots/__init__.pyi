@@ -11,6 +11,7 @@ from .parameters import parameter_intervals, std_bars
 from .recording_fit import fit, held_out
 from .residuals import predictions, residual_spectra
 from .robustness import robustness_figure
+from .selection import selection_figure
 from .style import save
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "residual_spectra",
     "robustness_figure",
     "save",
+    "selection_figure",
     "sensitivity_phase",
     "std_bars",
     "study_overview",

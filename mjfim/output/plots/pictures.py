@@ -103,6 +103,8 @@ def _(estimate: Estimate) -> Pictures:
         "parameters": partial(plots.parameter_intervals, estimate, labels),
         "spectra": partial(plots.residual_spectra, estimate, labels),
     }
+    if estimate.selection is not None:
+        pictures["selection"] = partial(plots.selection_figure, estimate)
     if len(estimate.trace) > 1:
         pictures["trace"] = partial(plots.parameter_trace, estimate, labels)
     if has_pairs(estimate.std):

@@ -28,7 +28,9 @@ from mjfim.output.report.curves import (
 )
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
 from mjfim.output.report.residual_curves import Residuals
+from mjfim.output.report.selection import selection_section
 from mjfim.output.summaries.estimate import FITTED_MARK, FITTED_NOTE, describe_estimate
+from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.summary_parts import Listing, Part, Quantity, Summary
 from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
@@ -75,6 +77,8 @@ def estimate_page(estimate: Estimate) -> Page:
     columns = _shown_outputs(estimate)
 
     sections = [Section(title="Parameters", parts=list(_parameter_parts(estimate, summary)))]
+    if estimate.selection is not None:
+        sections.append(selection_section(estimate.selection))
     if estimate.predictions:
         found: list[Part | PlotGroup] = [summary.table("predictions")]
         found += [summary.table("prediction details"), _prediction_plots(estimate, labels)]
@@ -138,7 +142,10 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
         note += f" Nominal values of 0 have no relative difference: {first_ones(absent)}."
     if panels:
         yield PlotGroup(title="", panels=panels, keys=keys if shares else (), note=note)
+    about_terms = [] if estimate.selection is None else describe_selection(estimate.selection)
     for part in summary.parts:
+        if part in about_terms:
+            continue
         if part is not table and getattr(part, "key", "") not in elsewhere:
             yield part
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from mjfim.errors import listed
 from mjfim.output.summaries.accuracy import NOT_ALONE
+from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.summary_parts import (
     Cell,
     Emphasis,
@@ -54,6 +55,8 @@ def describe_estimate(estimate: Estimate) -> Summary:
     parts: list[Part] = [_estimate_table(estimate), fit]
     if estimate.restart is not None:
         parts.append(Paragraph(text=str(estimate.restart)))
+    if estimate.selection is not None:
+        parts += describe_selection(estimate.selection)
     if estimate.predictions:
         parts.append(Paragraph(text=_prediction_sentence(estimate.predictions)))
     parts.append(

@@ -1,0 +1,212 @@
+"""Losses of predictions of left-out data, by which models with different terms are compared.
+
+Each part of the data is predicted by a fit to the other parts (cross-validation). The losses of two
+models are compared block by block, because the errors of both are large in the same places: the
+scatter of the differences between blocks gives the standard error of their mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from mjfim.arrays import Array, freeze
+from mjfim.budget import Budget
+from mjfim.identification.cross_validation import of_folds
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.left_out_parts import (
+    MAX_FOLDS,
+    LeftOutPart,
+    affordable_part,
+    fit_to_others,
+    left_out_parts,
+    with_initial_states,
+)
+from mjfim.optimize.levenberg_marquardt import UnknownValues
+
+# Number of blocks into which all data are divided. Errors of neighbouring samples are alike, those
+# of different blocks nearly independent.
+BLOCKS = 20
+
+# Fewest segments in each left-out part of a single recording.
+MIN_SEGMENTS_PER_PART = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeldOutLosses:
+    """Losses of predictions of left-out data.
+
+    Attributes:
+        losses: (n,) sum of the loss in each block [squared standard deviations of the noise];
+            infinite where the simulation diverges.
+        counts: (n,) number of values in each block.
+        estimates: (K, p) parameters from the data without each part [theta-unit].
+    """
+
+    losses: Array
+    counts: Array
+    estimates: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, "losses", "counts", "estimates")
+
+    @property
+    def error(self) -> float:
+        """Root mean loss of a value [standard deviations of the noise]."""
+        return float(np.sqrt(self.losses.sum() / self.counts.sum()))
+
+    def reduction(self, other: HeldOutLosses) -> Reduction:
+        """By how much another model predicts the same data better than this one.
+
+        Args:
+            other: The losses of the other model on the same blocks.
+        """
+        if not np.isfinite(other.losses).all():
+            return Reduction(mean=-np.inf, standard_error=np.inf)
+        if not np.isfinite(self.losses).all():
+            return Reduction(mean=np.inf, standard_error=0.0)
+
+        # Sums of independent blocks: the variance of the sum is that of the blocks around the
+        # common mean of a value.
+        difference = self.losses - other.losses
+        mean = float(difference.sum() / self.counts.sum())
+        n = len(difference)
+        scatter = difference - mean * self.counts
+        variance = float(np.sum(scatter**2)) * n / max(n - 1, 1)
+        return Reduction(mean=mean, standard_error=float(np.sqrt(variance) / self.counts.sum()))
+
+    @property
+    def jackknife(self) -> Array:
+        """(p,) standard errors of the estimates by leaving out each part [theta-unit].
+
+        They contain what differs between the parts of the data, also what no model explains. NaN
+        with fewer than two parts. Source: Efron and Stein, The jackknife estimate of variance,
+        1981.
+        """
+        K = len(self.estimates)
+        if K < 2:
+            return np.full(self.estimates.shape[1], np.nan)
+        scatter = self.estimates - self.estimates.mean(axis=0)
+        return np.asarray(np.sqrt((K - 1) / K * np.sum(scatter**2, axis=0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reduction:
+    """Reduction of the mean loss of a value by another model.
+
+    Attributes:
+        mean: The reduction; negative where the other model predicts worse.
+        standard_error: Its standard error.
+    """
+
+    mean: float
+    standard_error: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the other model predicts better by more than one standard error."""
+        return self.mean > self.standard_error
+
+
+def held_out_losses(
+    problem: FitProblem, at: UnknownValues, sigma: Array, budget: Budget
+) -> HeldOutLosses | None:
+    """Predict every part of the data by a fit to the other parts.
+
+    Args:
+        problem: Problem of all data, with the noise by which the fits weight them.
+        at: Its solution.
+        sigma: (ny,) noise by which errors are divided before they are compared [y-unit]. It has to
+            be the same for all models that are compared.
+        budget: Ends the work early.
+
+    Returns:
+        The losses; None after a request to stop, and where there are no parts that can be left out.
+    """
+    problem, at = affordable_part(problem, at)
+    parts = list(_parts(problem))
+    pieces = sum(len(part.recordings) for part in parts)
+    blocks = -(-BLOCKS // max(pieces, 1))
+    folds = [
+        partial(_losses_of_part, at=at, part=part, blocks=blocks, sigma=sigma) for part in parts
+    ]
+    found = [losses for losses in of_folds(problem, folds, budget) if losses is not None]
+    if budget.exhausted is not None or not found:
+        return None
+
+    return HeldOutLosses(
+        losses=np.concatenate([each.losses for each in found]),
+        counts=np.concatenate([each.counts for each in found]),
+        estimates=np.concatenate([each.estimates for each in found]),
+    )
+
+
+def _parts(problem: FitProblem) -> Iterator[LeftOutPart]:
+    """Parts that are left out: groups of recordings, or of segments of a single recording."""
+    count = len(problem.segments)
+    groups = min(MAX_FOLDS, count // MIN_SEGMENTS_PER_PART)
+    if len(problem.recordings) > 1 or groups < 2:
+        yield from left_out_parts(problem)
+        return
+
+    recording = problem.recordings[0]
+    firsts = [group[0] for group in np.array_split(np.arange(count), groups)]
+    times = [float(recording.t[problem.segments[first].rows.start]) for first in firsts]
+    for begin, end in zip(times, [*times[1:], np.inf], strict=True):
+        name = f"{recording.name} from {begin:.3g} s"
+        yield LeftOutPart(name=name, recordings=(0,), begin=begin, end=end)
+
+
+def _losses_of_part(
+    problem: FitProblem,
+    budget: Budget,
+    *,
+    at: UnknownValues,
+    part: LeftOutPart,
+    blocks: int,
+    sigma: Array,
+) -> HeldOutLosses | None:
+    """Losses of the prediction of one part by a fit to the others.
+
+    Args:
+        problem: Problem of all parts.
+        budget: Ends the fit early.
+        at: Unknowns at the fit to all parts.
+        part: The part.
+        blocks: Number of blocks into which each recording of the part is divided.
+        sigma: (ny,) noise by which errors are divided [y-unit].
+
+    Returns:
+        The losses; None after a request to stop, and where the others cannot be fitted.
+    """
+    others = fit_to_others(problem, part, at, budget)
+    if others is None:
+        return None
+
+    masks = part.masks(problem)
+    predicted_problem, begun = with_initial_states(problem, others.theta, masks, budget)
+    predicted = predicted_problem.predict(begun)
+    if budget.exhausted is not None:
+        return None
+
+    losses: list[float] = []
+    counts: list[float] = []
+    for i in part.recordings:
+        rows = np.flatnonzero(masks[i].any(axis=1))
+        for block in np.array_split(rows, min(blocks, len(rows))):
+            counted = masks[i][block]
+            counts.append(float(counted.sum()))
+            if predicted is None:
+                losses.append(np.inf)
+                continue
+            error = (predicted[i][block] - problem.recordings[i].y[block]) / sigma
+            losses.append(problem.loss.value(error[counted]))
+
+    return HeldOutLosses(
+        losses=np.array(losses),
+        counts=np.array(counts),
+        estimates=problem.theta(others)[None],
+    )

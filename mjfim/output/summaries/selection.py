@@ -1,0 +1,84 @@
+"""The selection of terms in words and a table."""
+
+from __future__ import annotations
+
+from mjfim.errors import listed
+from mjfim.output.summary_parts import (
+    Emphasis,
+    Paragraph,
+    Part,
+    Quantity,
+    Row,
+    SummaryTable,
+    columns,
+)
+from mjfim.records.selection import Decision, Selection, SelectionStep
+
+# What each decision is called in the table.
+WORDS = {
+    Decision.BEGUN: "stated model",
+    Decision.ADDED: "added",
+    Decision.REJECTED: "not better",
+    Decision.REMOVED: "not needed",
+}
+
+
+def describe_selection(selection: Selection) -> list[Part]:
+    """Describe which terms were added, the steps that led to them, and what they depend on.
+
+    Args:
+        selection: The selection.
+    """
+    parts: list[Part] = [Paragraph(text=str(selection)), _table(selection)]
+    for step in selection.steps:
+        if step.alternatives:
+            text = (
+                f"The recordings do not tell {step.description} apart from "
+                f"{listed(step.alternatives)}: the prediction is as good with either."
+            )
+            parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
+    if selection.terms:
+        tables = "; ".join(
+            f'[parameters.{term.name}] target = "{term.path}", scale = {term.scale:.2g}'
+            for term in selection.terms
+        )
+        text = f"To keep these terms, add to the experiment file: {tables}"
+        parts.append(Paragraph(text=text, emphasis=Emphasis.WEAK))
+    return parts
+
+
+def _table(selection: Selection) -> SummaryTable:
+    """Tabulate the steps."""
+    return SummaryTable(
+        key="selection",
+        title="Terms that were tried: error of data that were left out of the fit",
+        columns=columns(
+            "term",
+            "decision",
+            "terms",
+            "error [σ]",
+            "reduction [σ²]",
+            "± standard error",
+            left=["decision"],
+            details=["terms"],
+        ),
+        rows=tuple(_row(step) for step in selection.steps),
+    )
+
+
+def _row(step: SelectionStep) -> Row:
+    """Row of a step."""
+    is_begin = step.decision is Decision.BEGUN
+    reduction = "" if is_begin else Quantity(value=step.reduction, digits=2)
+    error = "" if is_begin else Quantity(value=step.standard_error, digits=2)
+    is_other = step.decision is Decision.REJECTED and step.reduction > step.standard_error
+    return Row(
+        cells=(
+            step.description or "as stated",
+            "another is better" if is_other else WORDS[step.decision],
+            str(step.count),
+            Quantity(value=step.error, digits=4),
+            reduction,
+            error,
+        )
+    )

@@ -1,0 +1,119 @@
+"""Records of the selection of terms by which a model is extended."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import Any
+
+
+class Decision(Enum):
+    """What a step of a selection did."""
+
+    BEGUN = "begun"
+    ADDED = "added"
+    REJECTED = "rejected"
+    REMOVED = "removed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectedTerm:
+    """A term that was added to a model, which a parameter of the experiment stands for.
+
+    Attributes:
+        name: Name of the parameter.
+        description: The term in words.
+        path: Target of the parameter.
+        unit: Unit of the parameter; may be empty.
+        scale: Size of the term [unit].
+        source: Publication that describes the term; may be empty.
+    """
+
+    name: str
+    description: str
+    path: str
+    unit: str
+    scale: float
+    source: str = ""
+
+    @property
+    def table(self) -> dict[str, object]:
+        """The table of the parameter in an experiment file."""
+        return {"target": self.path, "scale": self.scale}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionStep:
+    """A step of a selection: a model with one term more or less than the one before.
+
+    Attributes:
+        decision: What was done with the term.
+        description: The term in words; empty for the stated model.
+        path: Target of its parameter; empty for the stated model.
+        count: Number of added terms after the step.
+        error: Held-out error of the model with the term, or without a removed one [sigma].
+        reduction: Reduction of the mean held-out loss by the term [sigma^2].
+        standard_error: Standard error of the reduction [sigma^2].
+        sigmas: Size of the term in standard deviations by the score test; 0 where none was made.
+        share: Share of the sum of squared residuals that the score test promised, 0 to 1.
+        alternatives: Other terms, in words, with which the prediction is as good: by at most one
+            standard error worse.
+    """
+
+    decision: Decision
+    description: str = ""
+    path: str = ""
+    count: int = 0
+    error: float
+    reduction: float = 0.0
+    standard_error: float = 0.0
+    sigmas: float = 0.0
+    share: float = 0.0
+    alternatives: tuple[str, ...] = ()
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the selection continued with the model of this step."""
+        return self.decision is not Decision.REJECTED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """The terms by which a model was extended, and the steps that led to them.
+
+    Attributes:
+        terms: The terms of the final model.
+        steps: The steps, beginning with the stated model.
+        ending: Why the selection ended, in words.
+    """
+
+    terms: tuple[SelectedTerm, ...]
+    steps: tuple[SelectionStep, ...]
+    ending: str
+
+    @property
+    def parameters(self) -> dict[str, dict[str, object]]:
+        """Tables of the terms, for `experiment.replace(parameters=...)`."""
+        return {term.name: term.table for term in self.terms}
+
+    @property
+    def errors(self) -> tuple[float, float]:
+        """Held-out error of the stated and of the final model [sigma]."""
+        kept = [step.error for step in self.steps if step.is_kept]
+        return kept[0], kept[-1]
+
+    def __str__(self) -> str:
+        before, after = self.errors
+        if not self.terms:
+            return f"No term was added; held-out error {before:.3g} σ. {self.ending}"
+        words = ", ".join(term.description for term in self.terms)
+        return f"Added: {words}. Held-out error {before:.3g} → {after:.3g} σ. {self.ending}"
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of `selection` in estimate.json."""
+        return {
+            "words": str(self),
+            "ending": self.ending,
+            "terms": [asdict(term) for term in self.terms],
+            "steps": [{**asdict(step), "decision": step.decision.value} for step in self.steps],
+        }

@@ -1,0 +1,62 @@
+"""Losses of predictions of left-out data, and the rule by which they are compared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mjfim.identification.held_out_losses import HeldOutLosses
+
+
+def losses(values: list[float], counts: list[float] | None = None) -> HeldOutLosses:
+    """Losses of some blocks."""
+    return HeldOutLosses(
+        losses=np.array(values),
+        counts=np.ones(len(values)) if counts is None else np.array(counts),
+        estimates=np.zeros((1, 1)),
+    )
+
+
+def test_the_standard_error_is_that_of_paired_differences() -> None:
+    rng = np.random.default_rng(0)
+    common = 10.0 * rng.random(2000)
+    first = losses((common + 1.0).tolist())
+    second = losses((common + rng.normal(0.0, 0.2, 2000)).tolist())
+    reduction = first.reduction(second)
+
+    # What both have in common does not count.
+    assert reduction.mean == pytest.approx(1.0, abs=0.02)
+    assert reduction.standard_error == pytest.approx(0.2 / np.sqrt(2000), rel=0.1)
+    assert reduction.is_clear
+    assert not second.reduction(first).is_clear
+
+
+def test_the_standard_error_with_blocks_of_different_sizes_is_that_of_the_scatter() -> None:
+    rng = np.random.default_rng(1)
+    counts = np.array([5.0, 20.0, 10.0, 40.0, 15.0, 10.0])
+    means = []
+    stated = []
+    for _ in range(3000):
+        difference = np.array([rng.normal(0.3, 1.0, int(count)).sum() for count in counts])
+        reduction = losses(difference.tolist(), counts.tolist()).reduction(
+            losses([0.0] * len(counts), counts.tolist())
+        )
+        means.append(reduction.mean)
+        stated.append(reduction.standard_error**2)
+    assert np.mean(means) == pytest.approx(0.3, abs=0.01)
+    assert np.mean(stated) == pytest.approx(np.var(means), rel=0.25)
+
+
+def test_a_model_that_diverges_is_never_better() -> None:
+    good, bad = losses([1.0, 2.0]), losses([1.0, np.inf])
+    assert not good.reduction(bad).is_clear
+    assert bad.reduction(good).is_clear
+    assert not bad.reduction(bad).is_clear
+
+
+def test_the_jackknife_gives_the_standard_error_of_a_mean() -> None:
+    rng = np.random.default_rng(2)
+    data = rng.normal(3.0, 2.0, 25)
+    left_out = np.array([[np.delete(data, i).mean()] for i in range(25)])
+    found = HeldOutLosses(losses=np.ones(1), counts=np.ones(1), estimates=left_out)
+    assert found.jackknife[0] == pytest.approx(data.std(ddof=1) / 5.0)

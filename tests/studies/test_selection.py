@@ -1,0 +1,112 @@
+"""Terms that a model lacks are selected by prediction of left-out data, and no others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.budget import StopToken
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.records.recording import Recording
+from mjfim.records.selection import Decision
+from tests.support.paths import ROOT
+
+CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
+
+
+def stated(**tables: object) -> mjfim.Experiment:
+    """The cart-pendulum under a multisine."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    return base.replace(initial={"control": CONTROL}, fit={"bootstrap": 0}, **tables)
+
+
+def recorded(
+    folder: Path, added: str, count: int, horizon: float = 2.0, begin: int = 0
+) -> list[Recording]:
+    """Recordings of a robot whose cart has attributes that the model lacks."""
+    text = (ROOT / "models" / "cart_pendulum.xml").read_text(encoding="utf-8")
+    changed = text.replace('axis="1 0 0"/>', f'axis="1 0 0" {added}/>')
+    (folder / "cart_pendulum.xml").write_text(changed, encoding="utf-8")
+    values = stated(horizon=horizon).model_dump(exclude_unset=True)
+    task = DesignTask.resolve(mjfim.Experiment(**{**values, "directory": folder}))
+    return [simulate_system(task.system, task.initial, begin + seed) for seed in range(count)]
+
+
+def test_the_missing_term_is_added_and_nothing_else(tmp_path: Path) -> None:
+    logs = recorded(tmp_path, 'frictionloss="0.5"', count=3)
+    *fitted, kept = logs
+    found = mjfim.select_terms(stated(), fitted, held_out=[kept])
+    selection = found.selection
+    assert selection is not None
+    assert [term.path for term in selection.terms] == ["joint/slide:frictionloss"]
+    assert [step.decision for step in selection.steps if step.is_kept] == [
+        Decision.BEGUN,
+        Decision.ADDED,
+    ]
+    assert not found.misfit
+
+    # With the term, left-out data are predicted as well as the noise permits.
+    before, after = selection.errors
+    assert before > after + 0.1
+    assert after == pytest.approx(1.0, abs=0.1)
+    (prediction,) = found.predictions
+    assert prediction.held_out
+    assert (prediction.identified.rms < prediction.nominal.rms).all()
+
+    # The interval of the new parameter covers the true value.
+    j = found.parameters.index("slide_frictionloss")
+    low, high = found.interval[j]
+    assert low < 0.5 < high
+    assert found.initial_theta[j] == 0.0
+
+    # The same experiment with the terms is what was identified.
+    again = mjfim.identify(stated().replace(parameters=selection.parameters), fitted)
+    np.testing.assert_allclose(again.theta, found.theta, rtol=2e-2)
+
+
+def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
+    found = mjfim.select_terms(stated(), recorded(tmp_path, "", count=2))
+    assert found.selection is not None
+    assert not found.selection.terms
+    assert len(found.selection.steps) == 1
+    assert found.parameters == ("m", "l", "c")
+
+    # Without a term, the estimate is that of an ordinary identification.
+    plain = mjfim.identify(stated(), recorded(tmp_path, "", count=2))
+    np.testing.assert_array_equal(found.theta, plain.theta)
+    np.testing.assert_array_equal(found.interval, plain.interval)
+
+
+def test_a_selection_that_is_stopped_returns_what_it_has(tmp_path: Path) -> None:
+    stop = StopToken()
+    logs = recorded(tmp_path, 'frictionloss="0.5"', count=2)
+    found = mjfim.select_terms(stated(), logs, stop=stop, callback=lambda event: stop.request())
+    assert found.interrupted
+    assert len(found.theta) == 3
+
+
+def test_a_selection_is_saved_and_loaded(tmp_path: Path) -> None:
+    found = mjfim.select_terms(stated(), recorded(tmp_path, 'stiffness="8"', count=2))
+    assert found.selection is not None
+    assert [term.path for term in found.selection.terms] == ["joint/slide:stiffness"]
+    found.save(tmp_path / "results")
+    loaded = mjfim.Estimate.load(tmp_path / "results")
+    assert loaded.selection == found.selection
+    assert "selection" in loaded.pictures
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_two_missing_terms_are_both_found(tmp_path: Path, seed: int) -> None:
+    logs = recorded(
+        tmp_path, 'frictionloss="0.3" stiffness="2"', count=4, horizon=4.0, begin=10 * seed
+    )
+    found = mjfim.select_terms(stated(), logs)
+    assert found.selection is not None
+    paths = {term.path for term in found.selection.terms}
+    assert paths == {"joint/slide:frictionloss", "joint/slide:stiffness"}
+    assert not found.misfit
