@@ -103,7 +103,7 @@ def identify(
     logs = recording_paths(recordings, system.channels)
     held_out_logs = recording_paths(held_out or [], system.channels)
     names = (
-        *estimate_files(len(logs), len(held_out_logs)),
+        *estimate_files(len(logs), len(held_out_logs), select=select),
         *parts_of_identified(output, system.model_path),
     )
     claim_video(video, inputs, force=force)

@@ -1,9 +1,10 @@
 """Score tests of physical terms that a model may lack.
 
-Candidates are dry friction, damping, stiffness and rotor inertia of every joint, and bias and delay
-of outputs. Each candidate has a column of sensitivities at the estimate. With its score g and its
-information I, both after the parameters are eliminated, the term would reduce the sum of squared
-residuals by `g^2 / I`, and its estimated size is `-g / I`. One linearisation tests all candidates.
+Candidates are dry friction, damping, stiffness and rotor inertia of every joint, the gain of every
+direct drive, a tilt of the base, and bias and delay of outputs. Each candidate has a column of
+sensitivities at the estimate. With its score g and its information I, both after the parameters are
+eliminated, the term would reduce the sum of squared residuals by `g^2 / I`, and its estimated size
+is `-g / I`. One linearisation tests all candidates.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mujoco
 import numpy as np
 import scipy
 
@@ -20,8 +22,9 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.model.coordinates import scalar_joints
+from mjfim.model.elements import element_name
+from mjfim.model.paths import unit_of
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
-from mjfim.model.units import JOINT_FIELD_UNITS
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.estimate import MissingTerm
@@ -58,9 +61,13 @@ SMALLEST_NORM = 1e-300
 JOINT_TERMS = {
     "frictionloss": "dry friction",
     "damping": "viscous damping",
+    "damping[1]": "quadratic damping",
     "armature": "rotor inertia",
     "stiffness": "a spring",
 }
+
+# Smallest component of gravity, as a share of it, that does not count as zero.
+MIN_GRAVITY_SHARE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,7 +284,8 @@ def _candidates(system: System, free_starts: bool) -> Iterator[Candidate]:
         for target in parameter.targets
     }
 
-    for candidate in (*_joint_terms(system), *_output_biases(system)):
+    physical = (*_joint_terms(system), *_tilts(system), *_gains(system))
+    for candidate in (*physical, *_output_biases(system)):
         if candidate.path not in targets:
             yield candidate
 
@@ -308,6 +316,7 @@ def _joint_terms(system: System) -> Iterator[Candidate]:
     sizes = {
         "frictionloss": force,
         "damping": stiffness * time,
+        "damping[1]": stiffness * time**2 / position_sizes(model),
         "armature": stiffness * time**2,
         "stiffness": stiffness,
     }
@@ -317,19 +326,69 @@ def _joint_terms(system: System) -> Iterator[Candidate]:
             # MuJoCo stores stiffness by joint, the other fields by degree of freedom.
             if field == "stiffness":
                 value = float(model.jnt_stiffness[joint.joint])
+            elif field == "damping[1]":
+                value = float(model.dof_dampingpoly[joint.v, 0])
             else:
                 value = float(getattr(model, f"dof_{field}")[joint.v])
 
             size = float(sizes[field][joint.v])
+            path = f"joint/{joint.name}:{field}"
             yield Candidate(
                 description=f"{words} of {joint.name}",
-                path=f"joint/{joint.name}:{field}",
-                unit=JOINT_FIELD_UNITS[field][joint.unit],
+                path=path,
+                unit=unit_of(model, path),
                 positive=True,
                 value=value,
                 linearised_at=value or size,
                 size=size,
             )
+
+
+def _tilts(system: System) -> Iterator[Candidate]:
+    """Components of gravity along the axes of the world that the model has none along.
+
+    A base that is not level turns gravity in the frame of the base.
+    """
+    model: Any = system.model
+    gravity = np.array(model.opt.gravity)
+    strength = float(np.linalg.norm(gravity))
+    level = np.flatnonzero(np.abs(gravity) <= MIN_GRAVITY_SHARE * strength)
+    if strength == 0.0:
+        return
+
+    for axis in level.tolist():
+        yield Candidate(
+            description=f"a tilt of the base along {'xyz'[axis]}",
+            path=f"option:gravity[{axis}]",
+            unit="m/s²",
+            positive=False,
+            value=float(gravity[axis]),
+            linearised_at=float(gravity[axis]),
+            size=LINEARISATION_SIZE * strength,
+        )
+
+
+def _gains(system: System) -> Iterator[Candidate]:
+    """Gain of every direct drive, such as a torque constant; servos have gains of their own."""
+    model: Any = system.model
+    fixed, without_bias = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_NONE)
+    for actuator in range(model.nactuator):
+        name = element_name(model, "actuator", actuator)
+        gain = float(model.actuator_gainprm[actuator, 0])
+        is_direct = int(model.actuator_gaintype[actuator]) == fixed
+        if not (name and gain and is_direct) or model.actuator_biastype[actuator] != without_bias:
+            continue
+
+        path = f"actuator/{name}:gainprm[0]"
+        yield Candidate(
+            description=f"another gain of {name}",
+            path=path,
+            unit=unit_of(model, path),
+            positive=False,
+            value=gain,
+            linearised_at=gain,
+            size=LINEARISATION_SIZE * abs(gain),
+        )
 
 
 def _output_biases(system: System) -> Iterator[Candidate]:

@@ -33,7 +33,7 @@ from mjfim.model.targets import (
     SpecField,
     TargetField,
 )
-from mjfim.model.units import ANGLE, FIELD_UNITS, JOINT_FIELD_UNITS, LENGTH, gain_unit
+from mjfim.model.units import ANGLE, FIELD_UNITS, LENGTH, gain_unit, joint_field_unit
 
 # A parameter path: the kind, the name (absent for options and the delay), the field, and
 # optionally an index or the part of a joint.
@@ -80,6 +80,11 @@ MODEL_ARRAYS: dict[str, dict[str, str]] = {
         "viscosity": "viscosity",
     },
 }
+
+# Fields of a joint whose force is a polynomial, and the arrays of its coefficients of higher order.
+# MuJoCo applies `-(b[0] v + b[1] v |v| + b[2] v^3)` for the damping b and the velocity v, and the
+# like for the stiffness and the displacement from the spring's reference.
+POLYNOMIAL_ARRAYS = {"damping": "dof_dampingpoly", "stiffness": "jnt_stiffnesspoly"}
 
 # Field of a body -> (parametrisation of its inertia, place of the first coordinate, their number).
 INERTIAL_FIELDS = {
@@ -243,7 +248,7 @@ def unit_of(model: Any, text: str) -> str:
         # One number holds for all coordinates of a ball or free joint; it gets the unit for a
         # rotation.
         slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
-        return JOINT_FIELD_UNITS.get(path.field, {}).get(LENGTH if slides else ANGLE, "")
+        return joint_field_unit(path.field, LENGTH if slides else ANGLE, path.component)
 
     if path.field in SERVO_FIELDS:
         return gain_unit(model, identifier(model, "actuator", path.name), path.field)
@@ -386,7 +391,10 @@ def _array_field(model: Any, path: ParameterPath, number: int) -> ModelField:
     holder = getattr(model, array)
 
     column = None
-    if holder.ndim == 2:
+    if path.kind == "joint" and path.field in POLYNOMIAL_ARRAYS and path.component > 0:
+        array = POLYNOMIAL_ARRAYS[path.field]
+        column = path.component_of(1 + getattr(model, array).shape[1]) - 1
+    elif holder.ndim == 2:
         column = path.component_of(holder.shape[1])
     else:
         path.component_of(1)

@@ -35,6 +35,11 @@ def physical_bounds(targets: Iterable[Target]) -> tuple[float, float]:
         if path.field not in NOT_NEGATIVE.get(path.kind, ()):
             continue
 
+        # A coefficient of higher order may be negative while the whole force brakes: dry friction
+        # that decreases with the speed has one.
+        if path.kind == "joint" and path.component > 0:
+            continue
+
         # The target is zero at this value of the parameter.
         zero = -target.offset / target.scale + 0.0
         if target.scale > 0.0:

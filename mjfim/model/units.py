@@ -37,6 +37,15 @@ JOINT_FIELD_UNITS = {
     "springref": {LENGTH: LENGTH, ANGLE: ANGLE},
 }
 
+# Units of the coefficients of higher order of forces that are polynomials, by the order above 1.
+POLYNOMIAL_UNITS = {
+    "damping": {
+        LENGTH: ("N s²/m²", "N s³/m³"),
+        ANGLE: ("N m s²/rad²", "N m s³/rad³"),
+    },
+    "stiffness": {LENGTH: ("N/m²", "N/m³"), ANGLE: ("N m/rad²", "N m/rad³")},
+}
+
 # Fields of a joint whose units those of the gains of a servo at the joint have.
 FIELD_OF_GAIN = {"kp": "stiffness", "kv": "damping"}
 
@@ -158,6 +167,23 @@ def gain_unit(model: Any, actuator: int, field: str) -> str:
     if mujoco.mjtJoint(int(model.jnt_type[joint])) not in SCALAR_JOINTS:
         return ""
     return JOINT_FIELD_UNITS[FIELD_OF_GAIN[field]][joint_unit(model, joint)]
+
+
+def joint_field_unit(field: str, coordinate: str, order: int = 0) -> str:
+    """Unit of a field of a joint.
+
+    Args:
+        field: Field of a path, such as `damping`.
+        coordinate: Unit of the joint's coordinate.
+        order: Index of the coefficient of a force that is a polynomial, from 0.
+
+    Returns:
+        The unit; empty where the field has none.
+    """
+    if order == 0:
+        return JOINT_FIELD_UNITS.get(field, {}).get(coordinate, "")
+    units = POLYNOMIAL_UNITS.get(field, {}).get(coordinate, ())
+    return units[order - 1] if order <= len(units) else ""
 
 
 def control_unit(model: Any, actuator: int) -> str:

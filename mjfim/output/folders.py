@@ -83,15 +83,16 @@ def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:
     return copies_of_included_files(folder / IDENTIFIED, model)
 
 
-def estimate_files(recordings: int, held_out: int = 0) -> tuple[str, ...]:
+def estimate_files(recordings: int, held_out: int = 0, *, select: bool = False) -> tuple[str, ...]:
     """List the files that `mjfim identify` may write for every model.
 
     Args:
         recordings: Number of recordings that are fitted.
         held_out: Number of recordings that are held out.
+        select: Whether terms of the model are selected.
     """
-    names = ("parameters", "spectra", "trace", "pairs", "predictions", "selection")
-    figures = tuple(f"{name}.png" for name in names)
+    names = ("parameters", "spectra", "trace", "pairs", "predictions")
+    figures = tuple(f"{name}.png" for name in (*names, *(["selection"] if select else [])))
     fits = tuple(f"{name}.png" for name in (*fit_names(recordings), *held_out_names(held_out)))
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
     return (*data, *figures, *fits, *TABLE_FILES)

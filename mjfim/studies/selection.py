@@ -151,11 +151,13 @@ class _Model:
     Attributes:
         result: The fit.
         losses: The losses.
+        cost: Cost of the fit with the noise of the fit of the stated model.
         terms: The terms that were added to the stated model.
     """
 
     result: FitResult
     losses: HeldOutLosses
+    cost: float
     terms: tuple[SelectedTerm, ...]
 
 
@@ -185,7 +187,7 @@ class _Selector:
             ending = "The selection was interrupted, or no part of the data can be left out."
             return estimate_from(result, self.budget), task.system
 
-        first = _Model(result=result, losses=losses, terms=())
+        first = _Model(result=result, losses=losses, cost=result.solution.cost, terms=())
         steps = [SelectionStep(decision=Decision.BEGUN, error=losses.error)]
         model, ending = self._grown(first, first, steps)
         model = self._pruned(model, first, steps)
@@ -258,8 +260,16 @@ class _Selector:
                 reduction = model.losses.reduction(extended.losses)
                 tried.append((extended, _tried(candidate, extended, reduction)))
 
+        # Of the models that do not clearly predict worse than the best one, the one that fits the
+        # data best is chosen: the fit uses all data, so that it tells similar terms apart better.
         clear = [pair for pair in tried if pair[1].reduction > pair[1].standard_error]
-        best = min(clear, key=lambda pair: pair[1].error, default=None)
+        least = min(clear, key=lambda pair: pair[1].error, default=None)
+        best = None
+        if least is not None:
+            similar = [
+                pair for pair in clear if not pair[0].losses.reduction(least[0].losses).is_clear
+            ]
+            best = min(similar, key=lambda pair: pair[0].cost)
         steps.extend(step for found, step in tried if best is None or found is not best[0])
         if best is None:
             return None
@@ -364,9 +374,13 @@ class _Selector:
             near = model.result.solution.unknowns
             result = refit_task(self._search(task), near, self.workers)
             losses = self._losses(result, first.result)
+            weighted = result.problem.with_noise(first.result.problem.noise)
+            cost = weighted.cost(result.solution.unknowns)
         except InterruptedPassError:
             return None
-        return None if losses is None else _Model(result=result, losses=losses, terms=terms)
+        if losses is None:
+            return None
+        return _Model(result=result, losses=losses, cost=cost, terms=terms)
 
     def _candidates(self, model: _Model) -> tuple[MissingTerm, ...]:
         """Significant terms that the model lacks, the most promising one first."""

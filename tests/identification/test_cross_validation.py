@@ -9,7 +9,7 @@ import mjfim
 from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import cross_validation
+from mjfim.identification import cross_validation, left_out_parts
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
 from mjfim.recordings.plausibility import plausibility_remarks
@@ -82,7 +82,7 @@ def test_predictions_of_some_segments_say_how_many(
     everything = cross_validation.predict_unfitted(problem, at, None, Budget())
     assert [found.name for found in everything] == ["simulated"] * 2
 
-    monkeypatch.setattr(cross_validation, "MAX_SAMPLES", problem.sample_count // 2)
+    monkeypatch.setattr(left_out_parts, "MAX_SAMPLES", problem.sample_count // 2)
     some = cross_validation.predict_unfitted(problem, at, None, Budget())
     assert [found.name for found in some] == ["simulated (2 of 4 segments)"] * 2
 

@@ -17,7 +17,13 @@ import mjfim
 from mjfim.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import cross_validation, fit_workers, searches, segment_simulation
+from mjfim.identification import (
+    cross_validation,
+    fit_workers,
+    left_out_parts,
+    searches,
+    segment_simulation,
+)
 from mjfim.identification.fit_orders import BatchOrder
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
@@ -261,7 +267,7 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
     It needs only the recordings of a subset, and the names of the parts are those of all.
     """
     monkeypatch.setattr(cross_validation, "LARGEST_SENT_BYTES", largest)
-    monkeypatch.setattr(cross_validation, "MAX_SAMPLES", samples)
+    monkeypatch.setattr(left_out_parts, "MAX_SAMPLES", samples)
     named = [replace(recording, name=f"log {i}") for i, recording in enumerate(recordings)]
     problem = problem_of(experiment, named, WHOLE)
     plant = problem.system.plant

@@ -22,6 +22,7 @@ from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors, Whiteness
 from mjfim.records.labels import Labels
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
+from mjfim.records.selection import Decision, Selection, SelectionStep
 from tests.support.figure_text import misplaced_texts
 from tests.support.made_records import (
     make_comparison,
@@ -267,6 +268,22 @@ def campaign_figure(size: Size) -> Figure:
     return plots.campaign_figure(campaign, parameters)
 
 
+def selection_figure(size: Size) -> Figure:
+    """Figure of a selection with as many terms as joints, and as many rejected ones."""
+    steps = [SelectionStep(decision=Decision.BEGUN, error=2.0)]
+    for i in range(size.joints):
+        term = f"viscous damping of joint number {i + 1}"
+        error = 1.0 + 1.0 / (i + 2)
+        rejected = SelectionStep(
+            decision=Decision.REJECTED, description=term, count=i, error=error + 0.05
+        )
+        added = dataclasses.replace(rejected, decision=Decision.ADDED, count=i + 1, error=error)
+        steps += [rejected, added]
+    ending = "No further term that was tested is significant."
+    selection = Selection(terms=(), steps=tuple(steps), ending=ending)
+    return plots.selection_figure(dataclasses.replace(estimate(size), selection=selection))
+
+
 FIGURES: dict[str, Callable[[Size], Figure]] = {
     "campaign_figure": campaign_figure,
     "check_figure": lambda size: plots.check_figure(check(size)),
@@ -283,6 +300,7 @@ FIGURES: dict[str, Callable[[Size], Figure]] = {
     "predictions": lambda size: plots.predictions(estimate(size), size.labels),
     "residual_spectra": lambda size: plots.residual_spectra(estimate(size), size.labels),
     "robustness_figure": lambda size: plots.robustness_figure(robustness(size)),
+    "selection_figure": selection_figure,
     "sensitivity_phase": lambda size: plots.sensitivity_phase(design(size), size.labels),
     "std_bars": lambda size: plots.std_bars(design(size), size.labels),
     "study_overview": lambda size: plots.study_overview(make_study(size.parameters), size.labels),

@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ModelError
 from mjfim.model.elements import element_name
 from mjfim.model.parameters import ParameterSet, Target
-from mjfim.model.paths import ParameterPath
+from mjfim.model.paths import MODEL_ARRAYS, POLYNOMIAL_ARRAYS, ParameterPath
 from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TargetField
 from mjfim.output.mjcf.actuators import ARRAYS, attribute_changes
 from mjfim.output.mjcf.document import MjcfDocument, all_digits, nearly_equal
@@ -162,6 +162,9 @@ class ParameterEdits:
 
         old = _numbers(self._old, target_field)
         new = _numbers(self._wanted, target_field)
+        if kind == "joint" and field in POLYNOMIAL_ARRAYS:
+            # One attribute states all coefficients.
+            old, new = (_coefficients(model, field, name) for model in (self._old, self._wanted))
         if nearly_equal(old, new).all():
             return
         if kind == "option":
@@ -292,6 +295,14 @@ def _numbers(model: Any, target_field: ModelField) -> Array:
     if target_field.in_options:
         return np.atleast_1d(getattr(model.opt, target_field.array))
     return np.atleast_1d(getattr(model, target_field.array)[target_field.rows[0]])
+
+
+def _coefficients(model: Any, field: str, joint: str) -> Array:
+    """Return the coefficients of the force of a joint's spring or damper, from the first order."""
+    number = model.joint(joint).id
+    row = number if field == "stiffness" else int(model.jnt_dofadr[number])
+    first = getattr(model, MODEL_ARRAYS["joint"][field])[row]
+    return np.array([first, *getattr(model, POLYNOMIAL_ARRAYS[field])[row]])
 
 
 def _derived_rows(model: Any) -> Iterator[tuple[str, str, str, int, int]]:

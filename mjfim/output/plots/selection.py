@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
 from mjfim.output.plots import style
 from mjfim.records.estimate import Estimate
@@ -14,10 +13,10 @@ from mjfim.records.selection import Decision, SelectionStep
 # Characters to which the names of terms are shortened.
 TERM_WIDTH = 40
 
-# Distance of the name of a term from its mark [points].
-NAME_DISTANCE = 8
+# Height of a row, and of all else [inch].
+ROW_HEIGHT, FIXED_HEIGHT = 0.3, 1.4
 
-# Errors of rejected terms above this multiple of the largest kept one are drawn at the upper end.
+# Errors of rejected terms above this multiple of the largest kept one are drawn at the right end.
 LARGEST_DRAWN_RATIO = 1.5
 
 
@@ -31,36 +30,28 @@ def selection_figure(estimate: Estimate) -> Figure:
     selection = estimate.selection
     assert selection is not None
     kept = [step for step in selection.steps if step.is_kept]
-    rejected = [step for step in selection.steps if not step.is_kept]
 
-    figure = style.new_figure(3.6)
+    figure = style.new_figure(FIXED_HEIGHT + ROW_HEIGHT * (len(kept) + 1))
     axes = figure.subplots()
-    style.format_axes(axes, "number of added terms", "error of left-out data [σ of the noise]")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    style.format_axes(axes, "error of left-out data [σ of the noise]")
 
+    # A row for each kept step, the stated model on top; the crosses of a row are the terms that
+    # were tried in its place.
     errors = np.array([step.error for step in kept])
-    counts = np.array([step.count for step in kept])
-    axes.plot(counts, errors, "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
-    top = LARGEST_DRAWN_RATIO * float(errors.max())
-    for step in rejected:
-        error = min(step.error, top)
-        axes.plot(step.count + 1, error, "x", color=style.MUTED_COLOUR, markersize=6.0)
+    axes.plot(errors, np.arange(len(kept)), "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
+    right = LARGEST_DRAWN_RATIO * float(errors.max())
+    row = 0
+    for step in selection.steps:
+        if step.is_kept:
+            row += 1
+        else:
+            axes.plot(min(step.error, right), row, "x", color=style.MUTED_COLOUR, markersize=6.0)
 
-    for step in kept:
-        axes.annotate(
-            _label(step),
-            (step.count, step.error),
-            (NAME_DISTANCE, NAME_DISTANCE),
-            textcoords="offset points",
-            fontsize=style.SMALL_FONT,
-            color=style.TEXT_COLOUR,
-        )
-
-    # Names stand to the right of their marks.
-    most = max(step.count + (not step.is_kept) for step in selection.steps)
-    axes.set_xlim(-0.2, most + 0.9)
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.12 * (high - low))
+    # Terms that were tried at the end, and not added, have a row of their own.
+    has_end = not selection.steps[-1].is_kept
+    names = [_label(step) for step in kept] + (["no further term"] if has_end else [])
+    axes.set_yticks(np.arange(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.5)
 
     handles = [
         Line2D([], [], color=style.IDENTIFIED_COLOUR, marker="o", label="model of this step"),
