@@ -173,6 +173,10 @@ class ClosedForm:
         Returns:
             The derivatives; None where the samples have another equation of motion.
         """
+        # Parameters may give a polynomial force to a model that has none at its nominal values.
+        if _has_polynomial_forces(model):
+            return None
+
         forces = AffineForces.measured(self.simulator, model, states[0], ctrl[0], self.sizes)
         system = _System(
             simulator=self.simulator,

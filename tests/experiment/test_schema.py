@@ -545,7 +545,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     ),
     "path index": (target("body/bob:pos[3]"), E, [HOME, "parameters.m", "index 3", "0 to 2"]),
     "path index of a scalar": (
-        target("joint/hinge:damping[1]"),
+        target("joint/hinge:armature[1]"),
         E,
         [HOME, "parameters.m", "index 1", "0 to 0"],
     ),

@@ -72,7 +72,12 @@ PARAMETERS: dict[str, Any] = {
 CHIRP = {"control": {"kind": "chirp", "amplitude": 0.8, "frequency": 1.0}}
 
 
-def tree_task(folder: Path, option: str = 'integrator="implicitfast"', **parts: str) -> DesignTask:
+def tree_task(
+    folder: Path,
+    option: str = 'integrator="implicitfast"',
+    more_parameters: dict[str, Any] | None = None,
+    **parts: str,
+) -> DesignTask:
     """A task for the tree: 20 samples of two engine steps."""
     filled = {"joint": "", "load": "", **parts}
     return make_task(
@@ -81,7 +86,7 @@ def tree_task(folder: Path, option: str = 'integrator="implicitfast"', **parts: 
         rate=100.0,
         horizon=0.2,
         noise={"state": 0.01},
-        parameters=PARAMETERS,
+        parameters={**PARAMETERS, **(more_parameters or {})},
         initial=CHIRP,
         limits={"enforce": False},
     )
@@ -298,6 +303,19 @@ def test_springs_and_dampers_of_higher_order_have_no_closed_form(spring: str) ->
     text = TREE.format(option="", joint="", load="")
     text = text.replace('stiffness="30" damping="1"', spring)
     assert closed_form_tree(mujoco.MjModel.from_xml_string(text)) is None
+
+
+def test_a_parameter_may_make_a_force_a_polynomial(tmp_path) -> None:
+    drag = {"target": "joint/elbow:damping[1]", "guess": 0.4}
+    task = tree_task(tmp_path, more_parameters={"drag": drag})
+    assert task.plant.closed_form_memory.tree is not None
+
+    trajectory, derivatives = curve(task), task.plant.derivatives
+    found = derivatives.sensitivity(task.theta, trajectory, closed_form=True)
+    expected = derivatives.sensitivity(task.theta, trajectory)
+    assert found is not None and expected is not None
+    np.testing.assert_array_equal(found.psi, expected.psi)
+    assert np.abs(found.psi[..., -1]).max() > 1e-6
 
 
 @pytest.mark.parametrize(
