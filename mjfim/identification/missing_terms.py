@@ -46,6 +46,10 @@ MAX_CANDIDATES = 60
 # Largest number of terms that are reported.
 MAX_NAMED_TERMS = 4
 
+# Terms whose significances differ by less than this share explain the residuals equally well. They
+# keep the order of the candidates, which rounding errors cannot change.
+EQUAL_SIGNIFICANCE = 1e-3
+
 # Smallest share of a term's information that remains after the parameters are eliminated. With
 # less, the term is not identifiable separately from the parameters.
 MIN_REMAINING_SHARE = 1e-8
@@ -145,8 +149,18 @@ def find_missing_terms(
         if term is not None:
             found.append(term)
 
-    found.sort(key=lambda term: -term.sigmas)
-    return tuple(found[:MAX_NAMED_TERMS])
+    return tuple(_by_significance(found)[:MAX_NAMED_TERMS])
+
+
+def _by_significance(terms: Sequence[MissingTerm]) -> list[MissingTerm]:
+    """The terms, most significant first; equally significant ones in their given order."""
+    left = list(terms)
+    ordered = []
+    while left:
+        least = (1.0 - EQUAL_SIGNIFICANCE) * max(term.sigmas for term in left)
+        ordered += [term for term in left if term.sigmas >= least]
+        left = [term for term in left if term.sigmas < least]
+    return ordered
 
 
 def _linearise(
