@@ -34,6 +34,10 @@ BLOCKS = 20
 # Fewest segments in each left-out part of a single recording.
 MIN_SEGMENTS_PER_PART = 2
 
+# Share of the mean loss below which a difference between two models does not count, however small
+# its scatter is. Models that no data tell apart differ by where their searches ended.
+EQUAL_LOSS = 1e-3
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldOutLosses:
@@ -76,7 +80,9 @@ class HeldOutLosses:
         n = len(difference)
         scatter = difference - mean * self.counts
         variance = float(np.sum(scatter**2)) * n / max(n - 1, 1)
-        return Reduction(mean=mean, standard_error=float(np.sqrt(variance) / self.counts.sum()))
+        standard_error = float(np.sqrt(variance) / self.counts.sum())
+        least = EQUAL_LOSS * float(min(self.losses.sum(), other.losses.sum()) / self.counts.sum())
+        return Reduction(mean=mean, standard_error=standard_error, least=least)
 
     @property
     def jackknife(self) -> Array:
@@ -100,15 +106,17 @@ class Reduction:
     Attributes:
         mean: The reduction; negative where the other model predicts worse.
         standard_error: Its standard error.
+        least: Reduction below which both models predict equally well.
     """
 
     mean: float
     standard_error: float
+    least: float = 0.0
 
     @property
     def is_clear(self) -> bool:
         """Whether the other model predicts better by more than one standard error."""
-        return self.mean > self.standard_error
+        return self.mean > max(self.standard_error, self.least)
 
 
 def held_out_losses(

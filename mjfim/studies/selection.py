@@ -41,6 +41,10 @@ MAX_TERMS = 6
 # together with it in the first attempt of a step, because the test is linear.
 SIMILAR_SHARE = 0.5
 
+# Difference of the costs of two fits (half of the sum of squared residuals in standard deviations)
+# below which both explain the data equally well: by one standard deviation at most.
+EQUAL_COST = 0.5
+
 # Probability that an interval holds the true value.
 CONFIDENCE = 0.95
 
@@ -262,14 +266,17 @@ class _Selector:
 
         # Of the models that do not clearly predict worse than the best one, the one that fits the
         # data best is chosen: the fit uses all data, so that it tells similar terms apart better.
-        clear = [pair for pair in tried if pair[1].reduction > pair[1].standard_error]
+        # Where no data tell terms apart, the first one of the candidates is chosen, so that the
+        # choice does not depend on rounding errors.
+        clear = [pair for pair in tried if model.losses.reduction(pair[0].losses).is_clear]
         least = min(clear, key=lambda pair: pair[1].error, default=None)
         best = None
         if least is not None:
             similar = [
                 pair for pair in clear if not pair[0].losses.reduction(least[0].losses).is_clear
             ]
-            best = min(similar, key=lambda pair: pair[0].cost)
+            highest = min(pair[0].cost for pair in similar) + EQUAL_COST
+            best = next(pair for pair in similar if pair[0].cost <= highest)
         steps.extend(step for found, step in tried if best is None or found is not best[0])
         if best is None:
             return None
@@ -389,10 +396,9 @@ class _Selector:
         at = replace(unknowns, private=unknowns.private[result.subset])
         problem = result.problem.of_segments(result.subset)
         try:
-            found = find_missing_terms(problem, result.task.recordings, result.subset, at)
+            return find_missing_terms(problem, result.task.recordings, result.subset, at)
         except InterruptedPassError:
             return ()
-        return tuple(sorted(found, key=lambda term: -term.share))
 
     def _losses(self, result: FitResult, first: FitResult) -> HeldOutLosses | None:
         """Losses of the predictions of left-out data; None after a request to stop."""

@@ -28,6 +28,7 @@ BENCHMARKS = {
     "scale": "do the verbs give the same on a cluster, and how well do they scale?",
     "rail": "how many passes over its data does a fit with dry friction take?",
     "prove_identification": "do the 95 % intervals hold the true values?",
+    "selection": "does `identify --select` find the term that a model lacks, and no other?",
 }
 
 

@@ -54,6 +54,13 @@ def test_a_model_that_diverges_is_never_better() -> None:
     assert not bad.reduction(bad).is_clear
 
 
+def test_a_difference_without_scatter_is_not_clear_where_it_is_tiny() -> None:
+    # Two models that no data tell apart, whose searches ended at slightly different places.
+    first = losses([1.0] * 20)
+    assert not first.reduction(losses([1.0 - 1e-6] * 20)).is_clear
+    assert first.reduction(losses([1.0 - 1e-2] * 20)).is_clear
+
+
 def test_the_jackknife_gives_the_standard_error_of_a_mean() -> None:
     rng = np.random.default_rng(2)
     data = rng.normal(3.0, 2.0, 25)

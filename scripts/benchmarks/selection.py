@@ -1,0 +1,322 @@
+"""Whether `identify --select` finds the term that a model lacks, over many simulated robots.
+
+    python -m scripts.benchmarks selection [--runs 100] [--seed 0] [-o FILE.json]
+
+The robot is the cart-pendulum with one physical term that the identified model lacks: friction,
+damping or a spring in a joint, rotor inertia, another gain of the motor, a tilted base, or a wrong
+zero of a sensor. The kind of the term changes from run to run, and its size is random. As many
+robots lack nothing. Each robot is recorded four times for 4 s under a multisine, and identified
+twice: as the experiment states it, and with the selection of terms. The script counts how often
+the right term is chosen first, how often `misfit` remains, how often a term is chosen where none is
+missing, and how often the 95 % intervals hold the true values.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import Counter
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import mjfim
+from mjfim.atomic_io import replacing
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.parallel import cores
+from mjfim.records.estimate import Estimate
+
+# Top folder of the repository.
+ROOT = Path(__file__).resolve().parents[2]
+
+# Recordings of each robot, and their duration [s].
+RECORDINGS = 4
+HORIZON = 4.0
+
+# Control of all recordings.
+CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
+
+# Name of the missing term among the parameters of the robot.
+MISSING = "missing"
+
+# Wanted shares.
+WANTED_RIGHT = 0.90
+WANTED_WITHOUT_MISFIT = 0.90
+WANTED_NOTHING = 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """A kind of term that the model lacks.
+
+    Attributes:
+        words: The term in words.
+        path: Target of its parameter.
+        low: Smallest size [unit of the target].
+        high: Largest size [unit of the target].
+    """
+
+    words: str
+    path: str
+    low: float
+    high: float
+
+
+# The sizes change the motion by a few standard deviations of the noise at least.
+KINDS = (
+    Kind(words="dry friction of the slide", path="joint/slide:frictionloss", low=0.2, high=1.0),
+    Kind(words="damping of the slide", path="joint/slide:damping", low=0.3, high=1.0),
+    Kind(words="quadratic damping of the slide", path="joint/slide:damping[1]", low=0.3, high=1.0),
+    Kind(words="a spring in the slide", path="joint/slide:stiffness", low=1.0, high=8.0),
+    Kind(words="rotor inertia of the slide", path="joint/slide:armature", low=0.3, high=1.0),
+    Kind(words="dry friction of the hinge", path="joint/hinge:frictionloss", low=0.2, high=0.8),
+    Kind(words="a spring in the hinge", path="joint/hinge:stiffness", low=0.5, high=3.0),
+    Kind(words="another gain of the motor", path="actuator/force:gainprm[0]", low=1.1, high=1.3),
+    Kind(words="a tilt of the base", path="option:gravity[0]", low=0.2, high=0.8),
+    Kind(words="a bias of the angle", path="output/qpos:hinge:bias", low=0.03, high=0.15),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Outcome of one run.
+
+    Attributes:
+        kind: The missing term in words; empty where none is missing.
+        chosen: The chosen terms as paths, in their order.
+        is_right: Whether the missing term was chosen first.
+        is_alternative: Whether the missing term was named among those that predict as well as the
+            first one.
+        misfit: Whether a misfit remains after the selection.
+        misfit_before: Whether an identification without selection raises a misfit.
+        inside: Whether the interval holds the true value, for each parameter of the experiment.
+        inside_before: The same without selection.
+        seconds: Time of the selection [s].
+        passes: Simulations of all data by the selection.
+    """
+
+    kind: str
+    chosen: tuple[str, ...]
+    is_right: bool
+    is_alternative: bool
+    misfit: bool
+    misfit_before: bool
+    inside: tuple[bool, ...]
+    inside_before: tuple[bool, ...]
+    seconds: float
+    passes: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One run of the study.
+
+    Attributes:
+        seed: Seed of the study.
+        number: Number of the run.
+        kind: The missing term, or None.
+    """
+
+    seed: int
+    number: int
+    kind: Kind | None
+
+
+def stated() -> mjfim.Experiment:
+    """The experiment as the user states it."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    return base.replace(horizon=HORIZON, initial={"control": CONTROL})
+
+
+def run(job: Job) -> Outcome:
+    """Record and identify one robot.
+
+    Args:
+        job: The run.
+
+    Returns:
+        Outcome of the run.
+    """
+    rng = np.random.default_rng([job.seed, job.number, int(job.kind is None)])
+    experiment = stated()
+    robot = experiment
+    if job.kind is not None:
+        value = float(rng.uniform(job.kind.low, job.kind.high))
+        robot = experiment.replace(
+            parameters={MISSING: {"target": job.kind.path, "guess": value, "true": value}}
+        )
+
+    # The last parameter of the robot is the one that the experiment lacks.
+    task = DesignTask.resolve(robot, threads=1)
+    true = task.parameters.true[: len(experiment.parameters)]
+    seeds = rng.integers(2**31, size=RECORDINGS)
+    recordings = [simulate_system(task.system, task.initial, int(seed)) for seed in seeds]
+
+    before = mjfim.identify(experiment, recordings, threads=1, progress=False)
+    begun = time.perf_counter()
+    found = mjfim.select_terms(experiment, recordings, threads=1, progress=False)
+    seconds = time.perf_counter() - begun
+
+    selection = found.selection
+    assert selection is not None
+    added = [step for step in selection.steps if step.decision.value == "added"]
+    path = "" if job.kind is None else job.kind.path
+    first = added[0].path if added else ""
+    steps = sum(len(recording.ctrl) for recording in recordings) * task.plant.simulator.substeps
+    return Outcome(
+        kind="" if job.kind is None else job.kind.words,
+        chosen=tuple(term.path for term in selection.terms),
+        is_right=bool(path) and first == path,
+        is_alternative=bool(added) and first != path and _names(added[0].alternatives, job.kind),
+        misfit=found.misfit,
+        misfit_before=before.misfit,
+        inside=_inside(found, true),
+        inside_before=_inside(before, true),
+        seconds=seconds,
+        passes=found.steps / steps,
+    )
+
+
+def _names(alternatives: Sequence[str], kind: Kind | None) -> bool:
+    """Whether alternatives in words name a kind of term."""
+    # "dry friction of the slide" of this script is "dry friction of slide" in the selection.
+    words = "" if kind is None else kind.words.replace("the ", "").replace("in ", "of ")
+    return words in alternatives
+
+
+def _inside(found: Estimate, true: np.ndarray) -> tuple[bool, ...]:
+    """Whether the intervals of the parameters of the experiment hold their true values."""
+    low, high = found.interval[: len(true)].T
+    return tuple(((low <= true) & (true <= high)).tolist())
+
+
+def study(jobs: Sequence[Job], title: str) -> list[Outcome]:
+    """Run many robots on all cores.
+
+    Args:
+        jobs: The runs.
+        title: Title of the bar of progress.
+
+    Returns:
+        Outcomes of all runs.
+    """
+    context = get_context("spawn")
+    with ProcessPoolExecutor(cores(), mp_context=context) as pool:
+        return list(track(pool.map(run, jobs), title, total=len(jobs)))
+
+
+def kinds_table(found: Sequence[Outcome]) -> Table:
+    """Make a table of the selections by kind of the missing term.
+
+    Args:
+        found: Outcomes of the runs with a missing term.
+
+    Returns:
+        Table with one row for each kind, and one for all.
+    """
+    table = Table(title="Robots with a term that the model lacks", title_justify="left")
+    table.add_column("missing term")
+    headings = ("runs", "right first", "named as alternative", "misfit before", "misfit after")
+    for heading in (*headings, "inside before", "inside after", "chosen instead"):
+        table.add_column(heading, justify="right")
+
+    for words in [*dict.fromkeys(outcome.kind for outcome in found), "all"]:
+        group = [outcome for outcome in found if words in (outcome.kind, "all")]
+        wrong = Counter(o.chosen[0] if o.chosen else "none" for o in group if not o.is_right)
+        table.add_row(
+            words,
+            str(len(group)),
+            _percent([o.is_right for o in group]),
+            _percent([o.is_alternative for o in group]),
+            _percent([o.misfit_before for o in group]),
+            _percent([o.misfit for o in group]),
+            _percent([flag for o in group for flag in o.inside_before]),
+            _percent([flag for o in group for flag in o.inside]),
+            ", ".join(f"{name} ({count})" for name, count in wrong.items())
+            if words != "all"
+            else "",
+        )
+    return table
+
+
+def share(flags: Sequence[bool]) -> float:
+    """Share of true values; 0 of none."""
+    return float(np.mean(flags)) if flags else 0.0
+
+
+def _percent(flags: Sequence[bool]) -> str:
+    """Share of true values in percent."""
+    return f"{100.0 * share(flags):.0f} %"
+
+
+def main() -> int:
+    """Run both studies and print the shares; return 1 where a share is too small."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=int, default=100, help="robots of each of both studies")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("-o", "--output", type=Path, help="JSON file with the shares")
+    args = parser.parse_args()
+    if args.runs < 1:
+        parser.error(f"--runs is {args.runs}; it must be 1 or more")
+
+    clock = time.perf_counter()
+    numbers = range(args.runs)
+    jobs = [Job(seed=args.seed, number=i, kind=KINDS[i % len(KINDS)]) for i in numbers]
+    lacking = study(jobs, "a term is missing")
+    complete = study([Job(seed=args.seed, number=i, kind=None) for i in numbers], "none is missing")
+
+    right = share([outcome.is_right for outcome in lacking])
+    without_misfit = share([not outcome.misfit for outcome in lacking])
+    nothing = share([not outcome.chosen for outcome in complete])
+    inside = share([flag for outcome in lacking for flag in outcome.inside])
+    inside_complete = share([flag for outcome in complete for flag in outcome.inside])
+    seconds = float(np.median([outcome.seconds for outcome in (*lacking, *complete)]))
+    passes = float(np.median([outcome.passes for outcome in lacking]))
+
+    console = Console(width=180)
+    console.print(kinds_table(lacking))
+    console.print(
+        f"right term first: {100 * right:.0f} % ({100 * WANTED_RIGHT:.0f} % wanted)\n"
+        f"without misfit after the selection: {100 * without_misfit:.0f} % "
+        f"({100 * WANTED_WITHOUT_MISFIT:.0f} % wanted)\n"
+        f"no term where none is missing: {100 * nothing:.0f} % "
+        f"({100 * WANTED_NOTHING:.0f} % wanted)\n"
+        f"misfit where none is missing: "
+        f"{100 * share([o.misfit for o in complete]):.0f} %\n"
+        f"true values inside the 95 % intervals: {100 * inside:.1f} % where a term is missing, "
+        f"{100 * inside_complete:.1f} % where none is\n"
+        f"median selection: {seconds:.1f} s on one thread, {passes:.0f} passes over the data\n"
+        f"{2 * args.runs} selections in {time.perf_counter() - clock:.0f} s on {cores()} cores"
+    )
+
+    if args.output is not None:
+        summary = {
+            "runs": args.runs,
+            "right": right,
+            "without_misfit": without_misfit,
+            "nothing": nothing,
+            "inside": inside,
+            "inside_complete": inside_complete,
+            "seconds": seconds,
+            "passes": passes,
+        }
+        with replacing(args.output) as temporary:
+            temporary.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+    is_good = (
+        right >= WANTED_RIGHT
+        and without_misfit >= WANTED_WITHOUT_MISFIT
+        and nothing >= WANTED_NOTHING
+    )
+    return 0 if is_good else 1
