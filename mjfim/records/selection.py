@@ -43,6 +43,22 @@ class SelectedTerm:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AlternativeTerm:
+    """A term with which a model predicts as well as with the one that was added.
+
+    Attributes:
+        description: The term in words.
+        path: Target of its parameter.
+        values: Values that the parameters of the experiment would have with it instead
+            [theta-unit].
+    """
+
+    description: str
+    path: str
+    values: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
 class SelectionStep:
     """A step of a selection: a model with one term more or less than the one before.
 
@@ -56,8 +72,8 @@ class SelectionStep:
         standard_error: Standard error of the reduction [sigma^2].
         sigmas: Size of the term in standard deviations by the score test; 0 where none was made.
         share: Share of the sum of squared residuals that the score test promised, 0 to 1.
-        alternatives: Other terms, in words, with which the prediction is as good: by at most one
-            standard error worse.
+        alternatives: Other terms with which the prediction is as good: by at most one standard
+            error worse.
     """
 
     decision: Decision
@@ -69,7 +85,7 @@ class SelectionStep:
     standard_error: float = 0.0
     sigmas: float = 0.0
     share: float = 0.0
-    alternatives: tuple[str, ...] = ()
+    alternatives: tuple[AlternativeTerm, ...] = ()
 
     @property
     def is_kept(self) -> bool:

@@ -32,7 +32,13 @@ from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.records.estimate import Estimate, MissingTerm
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
-from mjfim.records.selection import Decision, SelectedTerm, Selection, SelectionStep
+from mjfim.records.selection import (
+    AlternativeTerm,
+    Decision,
+    SelectedTerm,
+    Selection,
+    SelectionStep,
+)
 
 # Largest number of terms that are added.
 MAX_TERMS = 6
@@ -284,7 +290,9 @@ class _Selector:
         # What the data do not tell apart is said.
         chosen, step = best
         alternatives = tuple(
-            other.description
+            AlternativeTerm(
+                description=other.description, path=other.path, values=_stated_values(found, first)
+            )
             for found, other in clear
             if found is not chosen and not found.losses.reduction(chosen.losses).is_clear
         )
@@ -415,6 +423,13 @@ class _Selector:
     def _is_stopped(self) -> bool:
         """True after a request to stop."""
         return self.budget.stop.requested
+
+
+def _stated_values(model: _Model, first: _Model) -> dict[str, float]:
+    """Values of the parameters of the stated model in an extended one [theta-unit]."""
+    names = model.result.task.system.parameters.names
+    values = dict(zip(names, model.result.theta.tolist(), strict=True))
+    return {name: values[name] for name in first.result.task.system.parameters.names}
 
 
 def _tried(candidate: MissingTerm, model: _Model, reduction: Reduction) -> SelectionStep:

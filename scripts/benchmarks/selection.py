@@ -176,7 +176,7 @@ def run(job: Job) -> Outcome:
         kind="" if job.kind is None else job.kind.words,
         chosen=tuple(term.path for term in selection.terms),
         is_right=bool(path) and first == path,
-        is_alternative=bool(added) and first != path and _names(added[0].alternatives, job.kind),
+        is_alternative=bool(added) and path in [other.path for other in added[0].alternatives],
         misfit=found.misfit,
         misfit_before=before.misfit,
         inside=_inside(found, true),
@@ -184,13 +184,6 @@ def run(job: Job) -> Outcome:
         seconds=seconds,
         passes=found.steps / steps,
     )
-
-
-def _names(alternatives: Sequence[str], kind: Kind | None) -> bool:
-    """Whether alternatives in words name a kind of term."""
-    # "dry friction of the slide" of this script is "dry friction of slide" in the selection.
-    words = "" if kind is None else kind.words.replace("the ", "").replace("in ", "of ")
-    return words in alternatives
 
 
 def _inside(found: Estimate, true: np.ndarray) -> tuple[bool, ...]:

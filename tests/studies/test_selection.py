@@ -81,6 +81,25 @@ def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.interval, plain.interval)
 
 
+def test_terms_that_no_data_tell_apart_are_named_with_what_they_imply(tmp_path: Path) -> None:
+    """Inertia of the cart, inertia of the hinge and a weaker motor have the same effect."""
+    found = mjfim.select_terms(stated(), recorded(tmp_path, 'armature="0.9"', count=2))
+    assert found.selection is not None
+    (term,) = found.selection.terms
+    assert term.path == "joint/slide:armature"
+    (step,) = [step for step in found.selection.steps if step.decision is Decision.ADDED]
+    others = {other.path: other.values for other in step.alternatives}
+    assert set(others) == {"joint/hinge:armature", "actuator/force:gainprm[0]"}
+
+    # Inertia about the hinge instead of the cart's needs a heavier bob on a shorter rod:
+    # m = 2 + 0.9 and m l = 2.
+    values = others["joint/hinge:armature"]
+    assert values["m"] == pytest.approx(2.9, rel=0.1)
+    assert values["m"] * values["l"] == pytest.approx(2.0, rel=0.05)
+    found.save(tmp_path / "results")
+    assert mjfim.Estimate.load(tmp_path / "results").selection == found.selection
+
+
 def test_a_selection_that_is_stopped_returns_what_it_has(tmp_path: Path) -> None:
     stop = StopToken()
     logs = recorded(tmp_path, 'frictionloss="0.5"', count=2)

@@ -32,10 +32,7 @@ def describe_selection(selection: Selection) -> list[Part]:
     parts: list[Part] = [Paragraph(text=str(selection)), _table(selection)]
     for step in selection.steps:
         if step.alternatives:
-            text = (
-                f"The recordings do not tell {step.description} apart from "
-                f"{listed(step.alternatives)}: the prediction is as good with either."
-            )
+            text = _describe_alternatives(step)
             parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
     if selection.terms:
         tables = "; ".join(
@@ -45,6 +42,19 @@ def describe_selection(selection: Selection) -> list[Part]:
         text = f"To keep these terms, add to the experiment file: {tables}"
         parts.append(Paragraph(text=text, emphasis=Emphasis.WEAK))
     return parts
+
+
+def _describe_alternatives(step: SelectionStep) -> str:
+    """Say which terms the data do not tell apart, and what the parameters would be with each."""
+    names = listed([alternative.description for alternative in step.alternatives])
+    text = (
+        f"The recordings do not tell {step.description} apart from {names}: "
+        "the prediction is as good with either."
+    )
+    for alternative in step.alternatives:
+        values = listed([f"{name} = {value:.4g}" for name, value in alternative.values.items()])
+        text += f" With {alternative.description}, {values}."
+    return text
 
 
 def _table(selection: Selection) -> SummaryTable:
