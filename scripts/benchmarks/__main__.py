@@ -29,6 +29,7 @@ BENCHMARKS = {
     "rail": "how many passes over its data does a fit with dry friction take?",
     "prove_identification": "do the 95 % intervals hold the true values?",
     "selection": "does `identify --select` find the term that a model lacks, and no other?",
+    "measured_data": "how well are measured data of other groups predicted, with added terms?",
 }
 
 

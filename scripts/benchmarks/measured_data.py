@@ -1,0 +1,197 @@
+"""Identification of measured data of other groups, with and without the selection of terms.
+
+    python -m scripts.benchmarks measured_data [--data ../shared/data] [--only NAME]
+
+Each set is fitted from some of its recordings and predicts the others, as the experiment in
+`models/` states it and with terms that `identify --select` adds. The guess is what the authors of
+the data published. The script prints the chosen terms, the error of the prediction over that of the
+published parameters, the mean half width of the 95 % intervals, the reasons of a misfit, seconds
+and simulations of all data. The recordings are not part of the repository; where they come from is
+in docs/benchmarks.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import mjfim
+from mjfim.experiment.system import System
+from mjfim.identification.identify import identify_system
+from mjfim.recordings.read import read_recording
+from mjfim.records.estimate import Estimate
+from mjfim.studies.selection import select_terms_system
+
+# Top folder of the repository.
+ROOT = Path(__file__).resolve().parents[2]
+
+# Constants of the servo as published: kt [N m/A], R [Ohm].
+SERVO_KT = 0.32321
+SERVO_R = 4.76365
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredSet:
+    """Recordings of one robot.
+
+    Attributes:
+        name: Name of the set, and of its experiment in `models/`.
+        folder: Folder of the recordings below that of all data.
+        fitted: Files that are fitted.
+        held_out: Files that are predicted.
+        published: Published values of parameters [theta-unit].
+    """
+
+    name: str
+    folder: str
+    fitted: tuple[str, ...]
+    held_out: tuple[str, ...]
+    published: dict[str, float] = field(default_factory=dict)
+
+
+def _servo_files(*times: str) -> tuple[str, ...]:
+    """Names of the servo's files."""
+    return tuple(f"2026-01-15_10h{each}.json" for each in times)
+
+
+SETS = (
+    # The Coulomb friction of the publication follows atan(100 qd), which levels off at pi/2.
+    MeasuredSet(
+        name="dfki_simple_pendulum",
+        folder="dfki_simple_pendulum",
+        fitted=("dircol_measured.csv",),
+        held_out=("energy_shaping_measured.csv",),
+        published={"J": 0.06259, "mc": 0.1022, "damping": 0.04707, "coulomb": 0.1839 * np.pi / 2},
+    ),
+    # The model in models/ has the published parameters.
+    MeasuredSet(
+        name="dfki_double_pendulum",
+        folder="dfki_double_pendulum",
+        fitted=("A0_00.csv.gz", "A0_01.csv.gz"),
+        held_out=("A0_02.csv.gz",),
+    ),
+    MeasuredSet(
+        name="bam_xl330",
+        folder="bam_xl330/raw",
+        fitted=_servo_files("28m10", "28m17", "28m57", "29m04"),
+        held_out=_servo_files("28m24", "28m32", "28m42", "28m49"),
+        published={
+            "gain": SERVO_KT / SERVO_R,
+            "brake": SERVO_KT**2 / SERVO_R,
+            "damping": 0.0104948,
+            "coulomb": 0.00696597,
+            "armature": 0.00164322,
+            "mounting": 0.0179525,
+        },
+    ),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Result:
+    """Result of one identification of a set.
+
+    Attributes:
+        found: The estimate.
+        passes: Simulations of all fitted data.
+        seconds: Time [s].
+    """
+
+    found: Estimate
+    passes: float
+    seconds: float
+
+
+def identified(data: Path, measured: MeasuredSet, is_selecting: bool) -> Result:
+    """Identify a set.
+
+    Args:
+        data: Folder of all data.
+        measured: The set.
+        is_selecting: Whether terms are selected.
+
+    Returns:
+        The result.
+    """
+    experiment = mjfim.Experiment.from_file(ROOT / "models" / f"{measured.name}.toml").replace(
+        parameters={name: {"guess": value} for name, value in measured.published.items()}
+    )
+    system = System.resolve(experiment)
+    read: Callable[[str], mjfim.Recording] = lambda name: read_recording(  # noqa: E731
+        data / measured.folder / name, system.channels
+    )
+    fitted = [read(name) for name in measured.fitted]
+    held_out = [read(name) for name in measured.held_out]
+
+    begun = time.perf_counter()
+    if is_selecting:
+        found = select_terms_system(system, fitted, held_out=held_out).estimate
+    else:
+        found = identify_system(system, fitted, held_out=held_out)
+    seconds = time.perf_counter() - begun
+
+    timestep = float(system.model.opt.timestep)
+    steps = sum((recording.t[-1] - recording.t[0]) / timestep for recording in fitted)
+    return Result(found=found, passes=found.steps / steps, seconds=seconds)
+
+
+def row_of(measured: MeasuredSet, result: Result, is_selecting: bool) -> list[str]:
+    """Cells of a result."""
+    found = result.found
+    terms = found.selection.terms if found.selection is not None else ()
+    ratios = [prediction.ratio for prediction in found.predictions if prediction.held_out]
+    halves = 0.5 * np.ptp(found.interval, axis=1) / np.maximum(np.abs(found.theta), 1e-300)
+    reasons = "; ".join(found.reasons) if found.misfit else "none"
+    return [
+        measured.name if not is_selecting else "",
+        "--select" if is_selecting else "as stated",
+        ", ".join(term.description for term in terms) or "–",
+        ", ".join(f"{ratio:.3g}" for ratio in ratios),
+        f"{100.0 * float(np.median(halves)):.1f} %",
+        reasons,
+        f"{result.seconds:.0f}",
+        f"{result.passes:.0f}",
+    ]
+
+
+def main() -> int:
+    """Identify every set with and without selection, and print what was found."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
+    parser.add_argument("--only", choices=[each.name for each in SETS], help="one set")
+    args = parser.parse_args()
+
+    table = Table(title="Measured data of other groups", title_justify="left", show_lines=True)
+    for heading in ("set", "identified", "added terms"):
+        table.add_column(heading)
+    for heading in ("held-out / published", "median interval", "misfit", "seconds", "passes"):
+        table.add_column(heading, justify="right")
+
+    for measured in SETS:
+        if args.only not in (None, measured.name):
+            continue
+        if not (args.data / measured.folder).is_dir():
+            print(f"skipped: {args.data / measured.folder} is not there", file=sys.stderr)
+            continue
+        for is_selecting in (False, True):
+            result = identified(args.data, measured, is_selecting)
+            table.add_row(*row_of(measured, result, is_selecting))
+            if result.found.selection is not None:
+                print(measured.name, result.found.selection, flush=True)
+
+    Console(width=200).print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
