@@ -47,15 +47,18 @@ class HeldOutLosses:
         losses: (n,) sum of the loss in each block [squared standard deviations of the noise];
             infinite where the simulation diverges.
         counts: (n,) number of values in each block.
+        parts: (n,) index of the left-out part to which each block belongs.
         estimates: (K, p) parameters from the data without each part [theta-unit].
     """
 
     losses: Array
     counts: Array
+    parts: np.ndarray
     estimates: Array
 
     def __post_init__(self) -> None:
         freeze(self, "losses", "counts", "estimates")
+        self.parts.setflags(write=False)
 
     @property
     def error(self) -> float:
@@ -73,14 +76,16 @@ class HeldOutLosses:
         if not np.isfinite(self.losses).all():
             return Reduction(mean=np.inf, standard_error=0.0)
 
-        # Sums of independent blocks: the variance of the sum is that of the blocks around the
-        # common mean of a value.
+        # Blocks of one recording are alike where something differs from recording to recording, so
+        # that the scatter between the parts counts as well.
         difference = self.losses - other.losses
+        n_parts = int(self.parts.max()) + 1
+        by_part = np.bincount(self.parts, difference, n_parts).astype(float)
+        counts_by_part = np.bincount(self.parts, self.counts, n_parts).astype(float)
+        standard_error = max(
+            _standard_error(difference, self.counts), _standard_error(by_part, counts_by_part)
+        )
         mean = float(difference.sum() / self.counts.sum())
-        n = len(difference)
-        scatter = difference - mean * self.counts
-        variance = float(np.sum(scatter**2)) * n / max(n - 1, 1)
-        standard_error = float(np.sqrt(variance) / self.counts.sum())
         least = EQUAL_LOSS * float(min(self.losses.sum(), other.losses.sum()) / self.counts.sum())
         return Reduction(mean=mean, standard_error=standard_error, least=least)
 
@@ -119,6 +124,24 @@ class Reduction:
         return self.mean > max(self.standard_error, self.least)
 
 
+def _standard_error(sums: Array, counts: Array) -> float:
+    """Standard error of the mean of values of which sums over independent groups are known.
+
+    The variance of the total is that of the sums around the common mean of a value; 0 with a single
+    group.
+
+    Args:
+        sums: (n,) sums of the values of each group.
+        counts: (n,) number of values in each group.
+    """
+    n = len(sums)
+    if n < 2:
+        return 0.0
+    scatter = sums - sums.sum() / counts.sum() * counts
+    variance = float(np.sum(scatter**2)) * n / (n - 1)
+    return float(np.sqrt(variance) / counts.sum())
+
+
 def held_out_losses(
     problem: FitProblem, at: UnknownValues, sigma: Array, budget: Budget
 ) -> HeldOutLosses | None:
@@ -148,6 +171,7 @@ def held_out_losses(
     return HeldOutLosses(
         losses=np.concatenate([each.losses for each in found]),
         counts=np.concatenate([each.counts for each in found]),
+        parts=np.repeat(np.arange(len(found)), [len(each.losses) for each in found]),
         estimates=np.concatenate([each.estimates for each in found]),
     )
 
@@ -216,5 +240,6 @@ def _losses_of_part(
     return HeldOutLosses(
         losses=np.array(losses),
         counts=np.array(counts),
+        parts=np.zeros(len(counts), dtype=np.intp),
         estimates=problem.theta(others)[None],
     )

@@ -232,14 +232,12 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
     )
 
 
-def refit_task(
-    search: FitSearch, near: UnknownValues, workers: FitWorkers | None = None
-) -> FitResult:
+def refit_task(search: FitSearch, near: FitResult, workers: FitWorkers | None = None) -> FitResult:
     """Search for the parameters of a task near its start, where a similar fit has ended.
 
     Args:
         search: The task, whose start is near the solution, and the budget of its search.
-        near: Unknowns at which the similar fit has ended; those of the segments are used.
+        near: The similar fit, whose initial states of the segments are used.
         workers: Workers that simulate parts of the data; None for this process.
 
     Returns:
@@ -254,7 +252,13 @@ def refit_task(
     null_space = completed(partial(_unseen_directions, task, problem.of_segments(subset)))
     problem = problem.pinned(task.start, null_space)
 
-    begin = replace(problem.begin(task.start), private=near.private)
+    # With a delay among the parameters, segments begin earlier, and their initial states are
+    # others.
+    begin = problem.begin(task.start)
+    begins = [segment.begin for segment in near.problem.segments]
+    if begins == [segment.begin for segment in problem.segments]:
+        begin = replace(begin, private=near.solution.unknowns.private)
+
     weighted, solution = search.solve(problem, begin, "near a similar fit", is_rough=True)
     return FitResult(
         task=task,

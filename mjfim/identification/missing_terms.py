@@ -1,10 +1,10 @@
 """Score tests of physical terms that a model may lack.
 
 Candidates are dry friction, damping, stiffness and rotor inertia of every joint, the gain of every
-direct drive, a tilt of the base, and bias and delay of outputs. Each candidate has a column of
-sensitivities at the estimate. With its score g and its information I, both after the parameters are
-eliminated, the term would reduce the sum of squared residuals by `g^2 / I`, and its estimated size
-is `-g / I`. One linearisation tests all candidates.
+direct drive, a tilt of the base, bias of outputs, and a delay between controls and outputs. Each
+candidate has a column of sensitivities at the estimate. With its score g and its information I,
+both after the parameters are eliminated, the term would reduce the sum of squared residuals by
+`g^2 / I`, and its estimated size is `-g / I`. One linearisation tests all candidates.
 """
 
 from __future__ import annotations
@@ -120,25 +120,24 @@ class _Linearisation:
 
 
 def find_missing_terms(
-    problem: FitProblem, recordings: Sequence[Recording], segments: np.ndarray, at: UnknownValues
+    problem: FitProblem, recordings: Sequence[Recording], at: UnknownValues
 ) -> tuple[MissingTerm, ...]:
     """Terms that would explain significant residuals.
 
     Args:
         problem: The least-squares problem of some segments.
         recordings: All recordings.
-        segments: Indices of these segments among those of all recordings.
         at: Solution of the problem.
 
     Returns:
         The terms, most significant first; empty where no term is significant.
     """
     system = problem.system
-    candidates = list(_candidates(system, problem.layout.free_starts))[:MAX_CANDIDATES]
+    candidates = list(_candidates(system))[:MAX_CANDIDATES]
     if not candidates:
         return ()
 
-    linearisation = _linearise(problem, recordings, segments, at, candidates)
+    linearisation = _linearise(problem, recordings, at, candidates)
     if linearisation is None:
         return ()
 
@@ -166,7 +165,6 @@ def _by_significance(terms: Sequence[MissingTerm]) -> list[MissingTerm]:
 def _linearise(
     problem: FitProblem,
     recordings: Sequence[Recording],
-    segments: np.ndarray,
     at: UnknownValues,
     candidates: Sequence[Candidate],
 ) -> _Linearisation | None:
@@ -185,8 +183,18 @@ def _linearise(
     theta = np.array(extended.parameters.guess)
     theta[places] = at.theta
 
-    wider = FitProblem.of(extended, recordings).of_segments(segments).with_noise(problem.noise)
-    wider = replace(wider, difference_step=problem.difference_step, central=problem.central)
+    # The rows and initial states are those of the solution; a delay as a parameter would let the
+    # segments begin earlier.
+    wider = FitProblem.of(extended, recordings)
+    simulation = replace(wider.simulation, segments=problem.segments)
+    wider = replace(
+        wider,
+        simulation=simulation,
+        masks=problem.masks,
+        noise=problem.noise,
+        difference_step=problem.difference_step,
+        central=problem.central,
+    )
     condensed = wider.condense(replace(at, theta=theta))
     if condensed is None:
         return None
@@ -289,7 +297,7 @@ def _score_test(
     )
 
 
-def _candidates(system: System, free_starts: bool) -> Iterator[Candidate]:
+def _candidates(system: System) -> Iterator[Candidate]:
     """All terms that are not among the parameters of the experiment."""
     parameters = system.parameters
     targets = {
@@ -303,13 +311,13 @@ def _candidates(system: System, free_starts: bool) -> Iterator[Candidate]:
         if candidate.path not in targets:
             yield candidate
 
-    # A delay would shift the segments whose initial states are free.
-    if not free_starts and not parameters.delay_derivative.any():
+    # The delay is negative where the controls act later than the readings are late.
+    if not parameters.delay_derivative.any():
         yield Candidate(
-            description="a delay of all outputs",
+            description="a delay between controls and outputs",
             path="output:delay",
             unit="s",
-            positive=True,
+            positive=False,
             value=0.0,
             linearised_at=0.0,
             size=LINEARISATION_SIZE * _period(system),

@@ -202,7 +202,7 @@ def _missing_terms(
     problem = result.problem.of_segments(result.subset)
     missing: tuple[MissingTerm, ...] = ()
     with suppress(InterruptedPassError):
-        missing = find_missing_terms(problem, result.task.recordings, result.subset, at)
+        missing = find_missing_terms(problem, result.task.recordings, at)
     return () if budget.stop.requested else missing
 
 

@@ -386,8 +386,7 @@ class _Selector:
 
         task = FitTask.of(system, first.result.task.recordings, start=start)
         try:
-            near = model.result.solution.unknowns
-            result = refit_task(self._search(task), near, self.workers)
+            result = refit_task(self._search(task), model.result, self.workers)
             losses = self._losses(result, first.result)
             weighted = result.problem.with_noise(first.result.problem.noise)
             cost = weighted.cost(result.solution.unknowns)
@@ -404,7 +403,7 @@ class _Selector:
         at = replace(unknowns, private=unknowns.private[result.subset])
         problem = result.problem.of_segments(result.subset)
         try:
-            return find_missing_terms(problem, result.task.recordings, result.subset, at)
+            return find_missing_terms(problem, result.task.recordings, at)
         except InterruptedPassError:
             return ()
 

@@ -8,11 +8,14 @@ import pytest
 from mjfim.identification.held_out_losses import HeldOutLosses
 
 
-def losses(values: list[float], counts: list[float] | None = None) -> HeldOutLosses:
+def losses(
+    values: list[float], counts: list[float] | None = None, parts: list[int] | None = None
+) -> HeldOutLosses:
     """Losses of some blocks."""
     return HeldOutLosses(
         losses=np.array(values),
         counts=np.ones(len(values)) if counts is None else np.array(counts),
+        parts=np.zeros(len(values), dtype=int) if parts is None else np.array(parts),
         estimates=np.zeros((1, 1)),
     )
 
@@ -61,9 +64,22 @@ def test_a_difference_without_scatter_is_not_clear_where_it_is_tiny() -> None:
     assert first.reduction(losses([1.0 - 1e-2] * 20)).is_clear
 
 
+def test_a_reduction_in_one_recording_only_is_not_clear() -> None:
+    """Twenty blocks agree within each recording, but the recordings contradict each other."""
+    parts = [0] * 10 + [1] * 10
+    before = losses([1.0] * 20, parts=parts)
+    one_better = losses([0.7] * 10 + [1.1] * 10, parts=parts)
+    both_better = losses([0.8] * 10 + [0.9] * 10, parts=parts)
+    assert before.reduction(one_better).mean == pytest.approx(0.1)
+    assert not before.reduction(one_better).is_clear
+    assert before.reduction(both_better).is_clear
+
+
 def test_the_jackknife_gives_the_standard_error_of_a_mean() -> None:
     rng = np.random.default_rng(2)
     data = rng.normal(3.0, 2.0, 25)
     left_out = np.array([[np.delete(data, i).mean()] for i in range(25)])
-    found = HeldOutLosses(losses=np.ones(1), counts=np.ones(1), estimates=left_out)
+    found = HeldOutLosses(
+        losses=np.ones(1), counts=np.ones(1), parts=np.zeros(1, dtype=int), estimates=left_out
+    )
     assert found.jackknife[0] == pytest.approx(data.std(ddof=1) / 5.0)
