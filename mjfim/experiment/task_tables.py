@@ -385,11 +385,13 @@ class Boundary(Section):
 class FitSpec(Section):
     """Segments, loss, noise and initial guesses with which parameters are fitted to recordings."""
 
-    segments: Seconds | None = Field(
+    segments: Seconds | Literal["whole"] | None = Field(
         default=None,
         description=(
             "Recordings are cut into segments of this length [s], each with an unknown initial "
-            "state (multiple shooting). Default: one segment per recording."
+            'state (multiple shooting). "whole": one segment per recording. Default: one segment '
+            "per recording where the model explains the recordings, and otherwise the length whose "
+            "fit predicts left-out data best."
         ),
     )
     start: Literal["stated", "measured"] = Field(
@@ -449,3 +451,8 @@ class FitSpec(Section):
         le=MAX_REPLICATES,
         description="Number of bootstrap replicates. 0: no bootstrap.",
     )
+
+    @property
+    def segment_length(self) -> float | None:
+        """Stated length of the segments [s]; None for one segment per recording."""
+        return None if self.segments == "whole" else self.segments

@@ -22,7 +22,8 @@ from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality, fit_quality
 from mjfim.identification.residual_tests import misfit_reasons
-from mjfim.identification.searches import FitSearch, quick_subset
+from mjfim.identification.searches import FitSearch
+from mjfim.identification.subsets import restart_subset
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.levenberg_marquardt import (
@@ -55,9 +56,10 @@ RESTART_ITERATIONS = 25
 ITERATIONS_OF_ALL_SEGMENTS = 45
 FEWEST_SEGMENT_ITERATIONS = 3
 
-# Length of a step [standard deviations] at which a fit over segments ends; only its neighbourhood
-# is needed.
+# Length of a step [standard deviations], and decrease of the cost as a share of it, at which a fit
+# over segments ends; only its neighbourhood is needed.
 SEGMENT_TOLERANCE = 0.1
+SEGMENT_ROUGH_SHARE = 0.01
 
 # Difference of two costs that is not relevant. A step to the minimum that is 0.14 standard
 # deviations long lowers the cost by this much.
@@ -126,8 +128,8 @@ def _better_of_two(
     """The first fit, or its repetition from fits over segments if that costs less."""
     task = search.task
     begun = WholeFit(problem=first[0], solution=first[1], quality=fit_quality(*first))
-    stated = task.settings.segments is not None or task.method == "newton"
-    if stated or search.interrupted() or not _is_doubtful(task, begun):
+    stated = task.settings.segment_length is not None or task.method == "newton"
+    if stated or search.interrupted() or not is_doubtful(task, begun):
         return begun
 
     start, lengths = _start_from_segments(search, problem, null_space)
@@ -138,10 +140,14 @@ def _better_of_two(
     return _better(begun, again, lengths)
 
 
-def _is_doubtful(task: FitTask, fit: WholeFit) -> bool:
+def is_doubtful(task: FitTask, fit: WholeFit) -> bool:
     """Whether a fit may have ended in a local minimum, or before a minimum.
 
     Residuals that agree with the stated noise leave no lower minimum that matters.
+
+    Args:
+        task: The task of the fit.
+        fit: The fit.
     """
     quality = fit.quality
     untested = not fit.solution.success and not task.noise_is_stated
@@ -179,7 +185,7 @@ def _start_from_segments(
     for length in all_lengths:
         if search.interrupted():
             break
-        part = _segment_problem(problem, task, system, length)
+        part = problem_of_segments(problem, task, system, length)
         if part is None:
             continue
         part = part.pinned(theta[places], _of_parameters(null_space, places))
@@ -244,12 +250,19 @@ def _free_system(system: System) -> System | None:
     return found.released(system.nominal_initial_state)
 
 
-def _segment_problem(
+def problem_of_segments(
     problem: FitProblem, task: FitTask, system: System, length: float
 ) -> FitProblem | None:
-    """The problem of segments of a length [s]; None where a recording cannot be cut so.
+    """The problem of segments of a length; it shares workers and recordings with the whole ones.
 
-    It shares the workers and the recordings of the problem of the whole recordings.
+    Args:
+        problem: The problem of the whole recordings.
+        task: The task of the fit.
+        system: The system, without parameters that move the initial state.
+        length: The length [s].
+
+    Returns:
+        The problem; None where a recording cannot be cut so.
     """
     fit = system.experiment.fit.model_copy(update={"segments": length})
     experiment = system.experiment.model_copy(update={"fit": fit})
@@ -295,14 +308,16 @@ def _iterations(problem: FitProblem, part: FitProblem, count: int) -> int:
 def _fit_segments(
     search: FitSearch, part: FitProblem, theta: Array, length: float, iterations: int
 ) -> UnknownValues | None:
-    """Unknowns of a fit over segments of a length [s], with much data over some of them.
+    """Unknowns of a fit over some segments of a length [s].
 
     None where it diverges at its start, or is stopped there.
     """
-    subset = quick_subset(part)
-    some = part.of_segments(subset)
+    some = part.of_segments(restart_subset(part))
     settings = SearchSettings(
-        max_iterations=iterations, tolerance=SEGMENT_TOLERANCE, relinearise_at_end=False
+        max_iterations=iterations,
+        tolerance=SEGMENT_TOLERANCE,
+        relinearise_at_end=False,
+        rough_share=SEGMENT_ROUGH_SHARE,
     )
     phase = f"segments of {length:.2g} s"
     try:
@@ -341,8 +356,20 @@ def _repeated(
     It goes on beyond some iterations only if its cost is lower than that of the first fit by then.
     """
     try:
-        placed = search.with_initial_states(problem, start)
-        found = search.solve(problem, placed, "again all data", RESTART_ITERATIONS)
+        begin: UnknownValues | None = start
+        if search.task.noise_is_stated:
+            begin = search.improved_on_part(problem, start, first.solution.unknowns)
+        if begin is None:
+            return None
+
+        placed = search.with_initial_states(problem, begin)
+        found = search.solve(
+            problem,
+            placed,
+            "again all data",
+            RESTART_ITERATIONS,
+            cost_to_beat=first.solution.cost,
+        )
         solution = found[1]
         ends_early = solution.success or solution.iterations < RESTART_ITERATIONS
         if not ends_early and _cost(first, solution) < first.solution.cost:

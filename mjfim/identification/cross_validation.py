@@ -20,15 +20,19 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.batch_workers import LARGEST_SENT_BYTES, ProblemWork
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.left_out_parts import (
-    LeftOutPart,
-    affordable_part,
+from mjfim.identification.leave_out_fits import (
+    LeaveOutStep,
     fit_to_others,
+    leave_out_steps,
+    predicted_part,
+)
+from mjfim.identification.left_out_parts import (
+    affordable_part,
     left_out_parts,
     masks_of,
     with_initial_states,
 )
-from mjfim.optimize.levenberg_marquardt import InterruptedPassError, UnknownValues
+from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.progress import begin_stage
@@ -73,7 +77,7 @@ def predict(
 
 
 def predict_unfitted(
-    problem: FitProblem, at: UnknownValues, held_out: FitProblem | None, budget: Budget
+    problem: FitProblem, solution: Solution, held_out: FitProblem | None, budget: Budget
 ) -> tuple[Prediction, ...]:
     """Predict data that were not fitted.
 
@@ -82,7 +86,7 @@ def predict_unfitted(
 
     Args:
         problem: Problem of the fitted recordings.
-        at: Its solution.
+        solution: Its solution.
         held_out: Problem of held-out recordings; None without any.
         budget: When it is exhausted, only the predictions that were made before are returned.
 
@@ -90,9 +94,9 @@ def predict_unfitted(
         The predictions.
     """
     found = (
-        _cross_validate(problem, at, budget)
+        _cross_validate(problem, solution, budget)
         if held_out is None
-        else _predict_held_out(held_out, at, budget)
+        else _predict_held_out(held_out, solution.unknowns.theta, budget)
     )
     predictions: list[Prediction] = []
     with suppress(InterruptedPassError):
@@ -100,28 +104,40 @@ def predict_unfitted(
     return tuple(predictions)
 
 
-def _predict_held_out(
-    held_out: FitProblem, at: UnknownValues, budget: Budget
-) -> Iterator[Prediction]:
-    """Prediction of every held-out recording."""
+def _predict_held_out(held_out: FitProblem, theta: Array, budget: Budget) -> Iterator[Prediction]:
+    """Prediction of every held-out recording at theta: (p,)."""
     for i in range(len(held_out.recordings)):
         if budget.exhausted is not None:
             return
         begin_stage("predicting held-out recordings", i, len(held_out.recordings))
-        part = LeftOutPart(name=held_out.recordings[i].name, recordings=(i,))
-        yield _prediction(held_out, at.theta, part, True, budget)
+        name = held_out.recordings[i].name
+        masks = masks_of(held_out.masks, [i])
+        errors, outputs = _predicted(held_out, theta, masks, name, budget)
+        guess = held_out.system.parameters.guess
+        nominal_errors, nominal_outputs = _predicted(held_out, guess, masks, name, budget)
+        yield Prediction(
+            name=name,
+            identified=errors,
+            nominal=nominal_errors,
+            held_out=True,
+            identified_outputs=outputs[i],
+            nominal_outputs=nominal_outputs[i],
+        )
 
 
-def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> Iterator[Prediction]:
+def _cross_validate(
+    problem: FitProblem, solution: Solution, budget: Budget
+) -> Iterator[Prediction]:
     """Prediction of every part of the data by a fit to the others."""
     whole = problem
-    problem, at = affordable_part(problem, at)
+    problem, solution = affordable_part(problem, solution)
     parts = [
         replace(part, name=part.name + _note_of_subset(part.recordings, problem, whole))
         for part in left_out_parts(problem)
         if any(segment.recording in part.recordings for segment in problem.segments)
     ]
-    folds = [partial(_prediction_by_others, at=at, part=part) for part in parts]
+    steps = leave_out_steps(problem, solution, parts)
+    folds = [partial(_prediction_by_others, step=step) for step in steps]
     for prediction in of_folds(problem, folds, budget):
         if budget.exhausted is not None:
             return
@@ -156,24 +172,34 @@ def of_folds(problem: FitProblem, folds: Sequence[ProblemWork[T]], budget: Budge
 
 
 def _prediction_by_others(
-    problem: FitProblem, budget: Budget, *, at: UnknownValues, part: LeftOutPart
+    problem: FitProblem, budget: Budget, *, step: LeaveOutStep
 ) -> Prediction | None:
     """Prediction of one part of the data by a fit to the others.
+
+    The fitted recordings are in the estimate anyway, so that only errors are kept.
 
     Args:
         problem: Problem of all parts.
         budget: Ends the fit early.
-        at: Unknowns at the fit to all parts.
-        part: The part.
+        step: Step of the fit to all data to the fit without the part.
 
     Returns:
         The prediction; None where there are no other data, where the simulation diverges, and after
         a request to stop.
     """
-    others = fit_to_others(problem, part, at, budget)
+    others = fit_to_others(problem, step, budget)
     if others is None:
         return None
-    return _prediction(problem, others.theta, part, False, budget)
+
+    name, masks = step.part.name, step.part.masks(problem)
+    guess = problem.system.parameters.guess
+    predicted, at = predicted_part(problem, others, masks, budget)
+    return Prediction(
+        name=name,
+        identified=_errors_of(problem, predicted.masked(masks).errors_at(at), name),
+        nominal=_errors(problem, guess, masks, name, budget),
+        held_out=False,
+    )
 
 
 def _note_of_subset(recordings: Sequence[int], subset: FitProblem, whole: FitProblem) -> str:
@@ -183,35 +209,6 @@ def _note_of_subset(recordings: Sequence[int], subset: FitProblem, whole: FitPro
         for problem in (subset, whole)
     )
     return "" if tested == count else f" ({tested} of {count} segments)"
-
-
-def _prediction(
-    problem: FitProblem, theta: Array, part: LeftOutPart, held_out: bool, budget: Budget
-) -> Prediction:
-    """Errors of the model at theta: (p,), and of the nominal model, on a part of the data."""
-    name, masks = part.name, part.masks(problem)
-    guess = problem.system.parameters.guess
-
-    # The fitted recordings are in the estimate anyway.
-    if not held_out:
-        return Prediction(
-            name=name,
-            identified=_errors(problem, theta, masks, name, budget),
-            nominal=_errors(problem, guess, masks, name, budget),
-            held_out=False,
-        )
-
-    errors, outputs = _predicted(problem, theta, masks, name, budget)
-    nominal_errors, nominal_outputs = _predicted(problem, guess, masks, name, budget)
-    i = part.recordings[0]
-    return Prediction(
-        name=name,
-        identified=errors,
-        nominal=nominal_errors,
-        held_out=True,
-        identified_outputs=outputs[i],
-        nominal_outputs=nominal_outputs[i],
-    )
 
 
 def _errors(

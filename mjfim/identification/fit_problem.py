@@ -466,10 +466,30 @@ class FitProblem:
         for losses in self.of_batches(FitProblem.losses_of_batch, batches, at):
             if losses is None:
                 return np.inf
-            for loss in losses:
+            for _, loss in losses:
                 total += loss
 
         return 0.5 * total + self.prior_cost(at)
+
+    def segment_losses(self, at: UnknownValues) -> Array:
+        """Loss of the residuals of every segment.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (P,) losses; infinite in all segments of a batch in which a simulation diverges.
+        """
+        total = np.zeros(len(self.segments))
+        batches = list(self.simulation.batches(derivatives=False))
+        found = self.of_batches(FitProblem.losses_of_batch, batches, at)
+        for batch, losses in zip(batches, found, strict=True):
+            if losses is None:
+                total[list(batch.segments)] = np.inf
+                continue
+            for segment, loss in losses:
+                total[segment] += loss
+        return total
 
     def prior_cost(self, at: UnknownValues) -> float:
         """Half of the sum of the squared priors and pins.
@@ -547,7 +567,9 @@ class FitProblem:
             predicted.append(rows)
         return predicted
 
-    def losses_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[float] | None:
+    def losses_of_batch(
+        self, at: UnknownValues, batch: SegmentBatch
+    ) -> list[tuple[int, float]] | None:
         """Loss of the residuals of a batch, which the cost adds in this order.
 
         Args:
@@ -555,13 +577,13 @@ class FitProblem:
             batch: The batch.
 
         Returns:
-            The losses; None where a simulation diverges.
+            Index of a segment and loss of some of its rows; None where a simulation diverges.
         """
         losses = []
         for rows in self.simulation.rows_of_batch(at, batch):
             if rows is None:
                 return None
-            losses.append(self.loss.value(self.whitened.residual(rows)))
+            losses.append((rows.segment, self.loss.value(self.whitened.residual(rows))))
         return losses
 
     def squares_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[Array] | None:

@@ -34,7 +34,8 @@ def has_free_starts(system: System) -> bool:
         system: System with the table `[fit]`.
     """
     settings = system.experiment.fit
-    return settings.start == "measured" or settings.segments is not None or free_release(system)
+    is_cut = settings.segment_length is not None
+    return settings.start == "measured" or is_cut or free_release(system)
 
 
 def segments_of_fit(
@@ -57,7 +58,7 @@ def segments_of_fit(
     parameters = system.parameters
     if free_starts:
         _require_measured_starts(system)
-        length = system.experiment.fit.segments
+        length = system.experiment.fit.segment_length
         duration = min(float(recording.t[-1]) for recording in recordings)
         delay = _max_delay(parameters, duration)
         segments = cut_into_segments(system, recordings, length, delay)

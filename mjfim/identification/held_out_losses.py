@@ -7,7 +7,7 @@ scatter of the differences between blocks gives the standard error of their mean
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,15 +17,19 @@ from mjfim.arrays import Array, freeze
 from mjfim.budget import Budget
 from mjfim.identification.cross_validation import of_folds
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.leave_out_fits import (
+    LeaveOutStep,
+    fit_to_others,
+    leave_out_steps,
+    predicted_part,
+)
 from mjfim.identification.left_out_parts import (
     MAX_FOLDS,
     LeftOutPart,
     affordable_part,
-    fit_to_others,
     left_out_parts,
-    with_initial_states,
 )
-from mjfim.optimize.levenberg_marquardt import UnknownValues
+from mjfim.optimize.levenberg_marquardt import Solution
 
 # Number of blocks into which all data are divided. Errors of neighbouring samples are alike, those
 # of different blocks nearly independent.
@@ -143,13 +147,13 @@ def _standard_error(sums: Array, counts: Array) -> float:
 
 
 def held_out_losses(
-    problem: FitProblem, at: UnknownValues, sigma: Array, budget: Budget
+    problem: FitProblem, solution: Solution, sigma: Array, budget: Budget
 ) -> HeldOutLosses | None:
     """Predict every part of the data by a fit to the other parts.
 
     Args:
         problem: Problem of all data, with the noise by which the fits weight them.
-        at: Its solution.
+        solution: Its solution.
         sigma: (ny,) noise by which errors are divided before they are compared [y-unit]. It has to
             be the same for all models that are compared.
         budget: Ends the work early.
@@ -157,13 +161,12 @@ def held_out_losses(
     Returns:
         The losses; None after a request to stop, and where there are no parts that can be left out.
     """
-    problem, at = affordable_part(problem, at)
+    problem, solution = affordable_part(problem, solution)
     parts = list(_parts(problem))
     pieces = sum(len(part.recordings) for part in parts)
     blocks = -(-BLOCKS // max(pieces, 1))
-    folds = [
-        partial(_losses_of_part, at=at, part=part, blocks=blocks, sigma=sigma) for part in parts
-    ]
+    steps = leave_out_steps(problem, solution, parts)
+    folds = [partial(_losses_of_part, step=step, blocks=blocks, sigma=sigma) for step in steps]
     found = [losses for losses in of_folds(problem, folds, budget) if losses is not None]
     if budget.exhausted is not None or not found:
         return None
@@ -196,8 +199,7 @@ def _losses_of_part(
     problem: FitProblem,
     budget: Budget,
     *,
-    at: UnknownValues,
-    part: LeftOutPart,
+    step: LeaveOutStep,
     blocks: int,
     sigma: Array,
 ) -> HeldOutLosses | None:
@@ -206,29 +208,59 @@ def _losses_of_part(
     Args:
         problem: Problem of all parts.
         budget: Ends the fit early.
-        at: Unknowns at the fit to all parts.
-        part: The part.
+        step: Step of the fit to all data to the fit without the part.
         blocks: Number of blocks into which each recording of the part is divided.
         sigma: (ny,) noise by which errors are divided [y-unit].
 
     Returns:
         The losses; None after a request to stop, and where the others cannot be fitted.
     """
-    others = fit_to_others(problem, part, at, budget)
+    others = fit_to_others(problem, step, budget)
     if others is None:
         return None
 
-    masks = part.masks(problem)
-    predicted_problem, begun = with_initial_states(problem, others.theta, masks, budget)
-    predicted = predicted_problem.predict(begun)
+    masks = step.part.masks(problem)
+    predicted_problem, at = predicted_part(problem, others, masks, budget)
+    predicted = predicted_problem.predict(at)
     if budget.exhausted is not None:
         return None
 
+    losses, counts = losses_by_block(problem, predicted, masks, step.part.recordings, blocks, sigma)
+    return HeldOutLosses(
+        losses=losses,
+        counts=counts,
+        parts=np.zeros(len(counts), dtype=np.intp),
+        estimates=problem.theta(others.unknowns)[None],
+    )
+
+
+def losses_by_block(
+    problem: FitProblem,
+    predicted: Sequence[Array] | None,
+    masks: Sequence[np.ndarray],
+    recordings: Sequence[int],
+    blocks: int,
+    sigma: Array,
+) -> tuple[Array, Array]:
+    """Losses of predictions, summed over blocks of rows.
+
+    Args:
+        problem: Problem with the recordings.
+        predicted: (M, ny) predicted outputs of every recording [y-unit]; None where the simulation
+            diverges.
+        masks: (M, ny) for every recording, True for the predicted values.
+        recordings: Indices of the recordings.
+        blocks: Number of blocks into which each recording is divided.
+        sigma: (ny,) noise by which errors are divided [y-unit].
+
+    Returns:
+        (n,) sums of the loss, infinite where the simulation diverges, and (n,) numbers of values.
+    """
     losses: list[float] = []
     counts: list[float] = []
-    for i in part.recordings:
+    for i in recordings:
         rows = np.flatnonzero(masks[i].any(axis=1))
-        for block in np.array_split(rows, min(blocks, len(rows))):
+        for block in np.array_split(rows, min(blocks, len(rows)) or 1):
             counted = masks[i][block]
             counts.append(float(counted.sum()))
             if predicted is None:
@@ -236,10 +268,4 @@ def _losses_of_part(
                 continue
             error = (predicted[i][block] - problem.recordings[i].y[block]) / sigma
             losses.append(problem.loss.value(error[counted]))
-
-    return HeldOutLosses(
-        losses=np.array(losses),
-        counts=np.array(counts),
-        parts=np.zeros(len(counts), dtype=np.intp),
-        estimates=problem.theta(others)[None],
-    )
+    return np.array(losses), np.array(counts)

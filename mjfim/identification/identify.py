@@ -8,7 +8,7 @@ the paper's Newton-Raphson iteration, with the Fisher information as Hessian (Ga
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -19,21 +19,17 @@ from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError, explain_renamed_arguments, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.continuation import continued_fit
+from mjfim.identification.continuation import WholeFit, continued_fit, is_doubtful
 from mjfim.identification.extreme_values import describe_extreme_value
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.fit_workers import FitWorkers
+from mjfim.identification.horizons import choose_horizon, with_length
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.report import FitResult, estimate_from
-from mjfim.identification.searches import (
-    NEWTON,
-    FitSearch,
-    first_subset,
-    of_subset,
-    quick_subset,
-)
+from mjfim.identification.searches import NEWTON, FitSearch
 from mjfim.identification.sensitivity_rows import sensitivity_rows
+from mjfim.identification.subsets import first_subset, of_subset, quick_subset
 from mjfim.identification.task import FitTask, Method
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
@@ -56,9 +52,9 @@ from mjfim.records.events import FitEvent
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
 
-# Share of the segments, or of each one of few, on which the search for combinations without effect
-# begins.
-SHARE_THAT_DETERMINES = 0.2
+# Shares of the segments, or of each one of few, on which combinations without effect are searched
+# for before all of them.
+SHARES_THAT_DETERMINE = (0.2, 0.5)
 
 Callback = Callable[[FitEvent], None]
 
@@ -220,7 +216,7 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
     # A result that does not explain the data may be a local minimum. Fits over short segments then
     # give another start, and the better one of the two results is kept.
     fit = continued_fit(search, problem, first, null_space)
-    return FitResult(
+    result = FitResult(
         task=task,
         problem=fit.problem,
         solution=fit.solution,
@@ -229,6 +225,59 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
         held_out=held_out,
         subset=subset,
         restart=fit.restart,
+    )
+
+    # Where the model does not explain whole recordings, the length of the segments matters.
+    if not _chooses_length(task) or search.interrupted() or not is_doubtful(task, fit):
+        return result
+    return _over_chosen_length(search, problem, fit, result, workers)
+
+
+def _chooses_length(task: FitTask) -> bool:
+    """Whether the length of the segments is left to the fit."""
+    return task.settings.segments is None and task.method != "newton"
+
+
+def _over_chosen_length(
+    search: FitSearch,
+    problem: FitProblem,
+    fit: WholeFit,
+    result: FitResult,
+    workers: FitWorkers | None,
+) -> FitResult:
+    """The fit over the length of segments that predicts left-out data best.
+
+    Args:
+        search: The searches of the identification.
+        problem: Problem of the whole recordings, with the stated noise.
+        fit: The fit over whole recordings.
+        result: Its result.
+        workers: Workers that simulate parts of the data; None for this process.
+    """
+    choice = choose_horizon(search, problem, fit, result.null_space)
+    if choice is None:
+        return result
+    if choice.length is None or search.interrupted():
+        return replace(result, horizons=choice.study)
+
+    task = with_length(result.task, choice.length)
+    cut, held_out = _problems(task, workers)
+    cut = cut.pinned(task.start, result.null_space)
+    chosen = replace(search, task=task)
+    try:
+        begin = chosen.with_initial_states(cut, cut.begin(choice.theta))
+        weighted, solution = chosen.solve(cut, begin, f"segments of {choice.length:.2g} s")
+    except (InterruptedPassError, SimulationDivergedError):
+        return replace(result, horizons=choice.study)
+    return replace(
+        result,
+        task=task,
+        problem=weighted,
+        solution=solution,
+        quality=fit_quality(weighted, solution),
+        held_out=held_out,
+        subset=quick_subset(cut),
+        horizons=choice.study,
     )
 
 
@@ -405,19 +454,25 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
     determine as well, and one difference step is enough to see it, unless an effect is so weak that
     it may be round-off.
     """
-    count = len(problem.segments)
-    wanted = int(SHARE_THAT_DETERMINES * count)
-    part = (
-        problem.of_segments(spread_over_data(count, wanted))
-        if wanted
-        else problem.of_first_parts(SHARE_THAT_DETERMINES)
-    )
-    J, change = _stacked_sensitivity(task, part, with_error=False)
-    if not has_weak_column(J, task.system.parameters.magnitude):
+    for part in _parts_that_determine(problem):
+        J, change = _stacked_sensitivity(task, part, with_error=False)
+        if has_weak_column(J, task.system.parameters.magnitude):
+            continue
         quick = _null_space(task, J, change)
         if not quick.count and quick.smallest > CLEAR_SINGULAR_VALUE:
             return quick
     return _null_space(task, *_stacked_sensitivity(task, problem, with_error=True))
+
+
+def _parts_that_determine(problem: FitProblem) -> Iterator[FitProblem]:
+    """Parts of the data that may determine all parameters, small ones first."""
+    count = len(problem.segments)
+    for share in SHARES_THAT_DETERMINE:
+        wanted = int(share * count)
+        if wanted:
+            yield problem.of_segments(spread_over_data(count, wanted))
+        else:
+            yield problem.of_first_parts(share)
 
 
 def _stacked_sensitivity(

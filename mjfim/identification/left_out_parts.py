@@ -13,7 +13,12 @@ import numpy as np
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
+from mjfim.optimize.levenberg_marquardt import (
+    SearchSettings,
+    Solution,
+    UnknownValues,
+    minimise,
+)
 
 # Largest number of groups of recordings that are left out in turn.
 MAX_FOLDS = 5
@@ -88,54 +93,29 @@ def left_out_parts(problem: FitProblem) -> Iterator[LeftOutPart]:
         yield LeftOutPart(name=name, recordings=indices)
 
 
-def affordable_part(problem: FitProblem, at: UnknownValues) -> tuple[FitProblem, UnknownValues]:
+def affordable_part(problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
     """All segments of a problem; of much data, evenly spread ones, which are enough.
 
     Args:
         problem: Problem of all segments.
-        at: Its solution.
+        solution: Its solution.
 
     Returns:
-        The problem of the segments, and their unknowns.
+        The problem of the segments, and the solution with their unknowns and their linearisation.
     """
     count = len(problem.segments)
     if problem.sample_count <= MAX_SAMPLES or count == 1:
-        return problem, at
+        return problem, solution
 
     wanted = max(MAX_SAMPLES * count // problem.sample_count, 2)
     subset = evenly_spread_indices(count, wanted)
-    return problem.of_segments(subset), replace(at, private=at.private[subset])
-
-
-def fit_to_others(
-    problem: FitProblem, part: LeftOutPart, at: UnknownValues, budget: Budget
-) -> UnknownValues | None:
-    """Fit theta to all data but one part.
-
-    Args:
-        problem: Problem of all parts.
-        part: The part that is left out.
-        at: Unknowns at the fit to all parts.
-        budget: Ends the fit early.
-
-    Returns:
-        The unknowns of the others; None where there are no other data, where the simulation
-        diverges, and after a request to stop.
-    """
-    others = problem.masked([~mask for mask in part.masks(problem)])
-    segments = others.segments_with_values
-    if not len(segments):
-        return None
-
-    # The data that are left out may have led the estimate to a minimum that the others lack. The
-    # fit to the others then begins at the guess.
-    others = others.of_segments(segments)
-    guess = problem.system.parameters.guess
-    begins = [replace(at, private=at.private[segments]), others.begin(guess)]
-    found = minimise(others, min(begins, key=others.cost), SEARCH, budget)
-    if found is None or budget.exhausted is not None:
-        return None
-    return found.unknowns
+    unknowns = solution.unknowns
+    part = replace(
+        solution,
+        unknowns=replace(unknowns, private=unknowns.private[subset]),
+        condensed=solution.condensed.of_segments(subset),
+    )
+    return problem.of_segments(subset), part
 
 
 def with_initial_states(

@@ -41,6 +41,7 @@ from mjfim.records.estimate import (
     Prediction,
     Restart,
 )
+from mjfim.records.horizons import HorizonStudy
 from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
 
@@ -77,6 +78,7 @@ class FitResult:
         held_out: Problem of the held-out recordings; None without any.
         subset: Indices of segments that are quick to simulate, evenly spread over the data.
         restart: How the fit was repeated from fits over segments; None where it was not.
+        horizons: Lengths of segments that were compared; None where they were not.
     """
 
     task: FitTask
@@ -87,6 +89,7 @@ class FitResult:
     held_out: FitProblem | None
     subset: np.ndarray
     restart: Restart | None
+    horizons: HorizonStudy | None = None
 
     @property
     def theta(self) -> Array:
@@ -230,7 +233,7 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
     if budget.stop.requested:
         return ()
 
-    found = predict_unfitted(result.problem, result.solution.unknowns, result.held_out, budget)
+    found = predict_unfitted(result.problem, result.solution, result.held_out, budget)
     complete = () if budget.stop.requested else found
     if result.held_out is None:
         return complete
@@ -296,7 +299,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         combinations=tuple(str(group) for group in accuracy.groups),
         data=accuracy.data_information,
         std_sandwich=accuracy.sandwich,
-        interval=accuracy.interval,
+        interval=_covering(accuracy.interval, result),
         between_recordings=accuracy.between,
         sigma=dict(zip(system.outputs.names, sigma, strict=True)),
         reasons=findings.reasons,
@@ -315,7 +318,15 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         segments=_beginnings(problem),
         sizes=parameters.sizes(result.theta),
         restart=result.restart,
+        horizons=result.horizons,
     )
+
+
+def _covering(interval: Array, result: FitResult) -> Array:
+    """(p, 2) intervals that also hold what segments of other lengths tell differently."""
+    if result.horizons is None:
+        return interval
+    return result.horizons.widened(interval)
 
 
 def _trace(result: FitResult) -> Array:

@@ -62,11 +62,26 @@ class BlockDivision:
         Returns:
             (k,) index of the block of every row.
         """
-        index = rows.segment
-        first = self._offsets[index]
-        count = self._offsets[index + 1] - first
-        row_in_segment = rows.rows - self.segments[index].rows.start
-        return np.asarray(first + row_in_segment * count // self._rows_per_segment[index])
+        begin = self.segments[rows.segment].rows.start
+        return self._block_of_row(rows.segment, rows.rows - begin)
+
+    def containing(self, masks: Sequence[np.ndarray]) -> np.ndarray:
+        """(B,) True for the blocks that contain a marked value.
+
+        Args:
+            masks: (M, ny) for every recording, True for the marked values.
+        """
+        found = np.zeros(self.count, dtype=bool)
+        for index, segment in enumerate(self.segments):
+            rows = np.flatnonzero(masks[segment.recording][segment.rows].any(axis=1))
+            found[self._block_of_row(index, rows)] = True
+        return found
+
+    def _block_of_row(self, segment: int, rows: np.ndarray) -> np.ndarray:
+        """(k,) index of the block of some rows, which are counted from the begin of a segment."""
+        first = self._offsets[segment]
+        count = self._offsets[segment + 1] - first
+        return np.asarray(first + rows * count // self._rows_per_segment[segment])
 
     @cached_property
     def _rows_per_segment(self) -> np.ndarray:

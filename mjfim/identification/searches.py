@@ -8,13 +8,14 @@ from functools import partial
 
 import numpy as np
 
-from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.estimated_noise import EstimatedNoiseProblem
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.next_step import next_step_on_part, spread_over_data
+from mjfim.identification.next_step import next_step_on_part
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
+from mjfim.identification.subsets import first_subset, of_subset, quick_subset
 from mjfim.identification.task import FitTask
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.optimize.levenberg_marquardt import (
@@ -44,16 +45,7 @@ FINAL_TOLERANCE_OF_MUCH_DATA = 1e-2
 # amount of data is large.
 SAMPLES_OF_MUCH_DATA = SAMPLES_FOR_ONE_SIDED
 
-# Number of samples of a subset of segments that is quick to simulate, if there are more data.
-SUBSET_SAMPLES = 40_000
-
-# Largest share of the data on which the search begins, where that leaves enough samples and
-# segments.
-FIRST_SHARE = 0.25
-MIN_FIRST_SAMPLES = 5_000
-MIN_FIRST_SEGMENTS = 5
-
-# Length of a step [standard deviations] at which the search over these first data ends. They tell
+# Length of a step [standard deviations] at which the search over the first data ends. They tell
 # less than all data, so that their minimum is not needed to more digits.
 FIRST_TOLERANCE = 0.1
 
@@ -76,8 +68,9 @@ INITIAL_STATE_TOLERANCE = 0.1
 # is wrong, they cannot explain the data.
 INITIAL_STATE_ROUGH_SHARE = 0.01
 
-# Decrease of the cost, as a share of it, that a last step with the stated noise may still bring
-# where the noise is estimated afterwards.
+# Decrease of the cost, as a share of it, that a last step over the first data may still bring, and
+# that share where the stated noise is estimated afterwards.
+FIRST_ROUGH_SHARE = 1e-3
 ROUGH_SHARE = 0.1
 
 # Decrease of the cost, as a share of it, that a last step may bring in a fit that is only compared
@@ -104,55 +97,6 @@ MIN_NOISE_SHARE = 1e-3
 SIGMA_PER_MEDIAN = 1.4826
 
 Callback = Callable[[FitEvent], None]
-
-
-def quick_subset(problem: FitProblem) -> np.ndarray:
-    """Indices of segments that are quick to simulate, evenly spread over the data.
-
-    Args:
-        problem: Problem of all segments.
-
-    Returns:
-        The indices; with little data those of all segments.
-    """
-    count = len(problem.segments)
-    if problem.sample_count <= SUBSET_SAMPLES or count == 1:
-        return evenly_spread_indices(count, count)
-
-    wanted = max(int(SUBSET_SAMPLES * count / problem.sample_count), 1)
-    return evenly_spread_indices(count, wanted)
-
-
-def first_subset(problem: FitProblem) -> np.ndarray:
-    """Indices of the segments on which the search begins, evenly spread over the data.
-
-    Args:
-        problem: Problem of all segments.
-
-    Returns:
-        The indices; with little data those of all segments.
-    """
-    quick = quick_subset(problem)
-    wanted = int(FIRST_SHARE * len(problem.segments))
-    enough = FIRST_SHARE * problem.sample_count >= MIN_FIRST_SAMPLES
-    if not enough or wanted < MIN_FIRST_SEGMENTS:
-        return quick
-
-    # Recordings that repeat in turn, such as one of each joint, are not met in step.
-    return spread_over_data(len(problem.segments), min(wanted, len(quick)))
-
-
-def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
-    """Take the unknowns of some segments.
-
-    Args:
-        at: Unknowns of all segments.
-        subset: Indices of the segments.
-
-    Returns:
-        The unknowns of these segments.
-    """
-    return replace(at, private=at.private[subset])
 
 
 def _short_search(
@@ -213,15 +157,7 @@ class FitSearch:
         if is_whole and starts == 1:
             return placed
 
-        # Costs of several starts can be compared only if all searches come close to their minimum.
-        is_rough = starts == 1 and not self.task.noise_is_stated
-        settings = replace(
-            self._final_settings(problem),
-            tolerance=FIRST_TOLERANCE,
-            relinearise_at_end=False,
-            rough_share=ROUGH_SHARE if is_rough else 0.0,
-            next_step_length=None,
-        )
+        settings = self._settings_of_part(problem, part)
         found = [self._minimise(part, placed, settings, "part of the data")]
         found += self._from_random_starts(part, starts)
         best = min(found, key=lambda solution: solution.cost).unknowns
@@ -247,6 +183,52 @@ class FitSearch:
             return found_of_all
         return self.with_initial_states(first_parts, begin, INITIAL_STATE_ITERATIONS)
 
+    def improved_on_part(
+        self, problem: FitProblem, begin: UnknownValues, beaten: UnknownValues
+    ) -> UnknownValues | None:
+        """Improve a start on a part of the data, if it leads to a lower cost there than a solution.
+
+        Args:
+            problem: Problem of all segments, with the stated noise.
+            begin: Unknowns of all segments at the start.
+            beaten: Unknowns of all segments at the solution.
+
+        Returns:
+            The start with improved parameters, unchanged where no smaller part is searched; None
+            where the part costs more than at the solution, or diverges.
+
+        Raises:
+            InterruptedPassError: A request to stop ended the first pass over the part.
+        """
+        subset = first_subset(problem)
+        if len(subset) == len(problem.segments):
+            return begin
+
+        part = problem.of_segments(subset)
+        placed = self.with_initial_states(part, of_subset(begin, subset))
+        cost_to_beat = part.cost(of_subset(beaten, subset))
+        settings = replace(self._settings_of_part(problem, part), cost_to_beat=cost_to_beat)
+        found = self.minimise(part, placed, settings, "again part of the data")
+        if found is None or found.cost >= cost_to_beat:
+            return None
+        return replace(
+            begin, theta=found.unknowns.theta, per_recording=found.unknowns.per_recording
+        )
+
+    def _settings_of_part(self, problem: FitProblem, part: FitProblem) -> SearchSettings:
+        """Settings of a search over a part of the data, before the search over all of them."""
+        # Costs of several starts can be compared only if all searches come close to their minimum.
+        rough_share = 0.0
+        if self.task.settings.starts == 1:
+            rough_share = FIRST_ROUGH_SHARE if self.task.noise_is_stated else ROUGH_SHARE
+        return replace(
+            self._final_settings(problem),
+            tolerance=FIRST_TOLERANCE,
+            relinearise_at_end=False,
+            rough_share=rough_share,
+            next_step_length=None,
+        )
+
     def solve(
         self,
         problem: FitProblem,
@@ -255,6 +237,7 @@ class FitSearch:
         max_iterations: int | None = None,
         *,
         is_rough: bool = False,
+        cost_to_beat: float = np.inf,
     ) -> tuple[FitProblem, Solution]:
         """Search over all data.
 
@@ -268,6 +251,8 @@ class FitSearch:
             max_iterations: Largest number of iterations, if it is below that of the settings.
             is_rough: True for a fit whose predictions alone count, which hardly change any more
                 long before the search converges.
+            cost_to_beat: Cost with the stated noise above which a minimum is of no use, so that
+                the search for it ends early.
 
         Returns:
             The problem with the noise that was used, and its solution.
@@ -281,6 +266,7 @@ class FitSearch:
                 settings, tolerance=FIRST_TOLERANCE, rough_share=COMPARED_ROUGH_SHARE
             )
         if self.task.noise_is_stated:
+            settings = replace(settings, cost_to_beat=cost_to_beat)
             return problem, self._minimise(problem, begin, settings, phase)
         if self.task.settings.loss != "linear":
             return self._solve_in_turn_with_noise(problem, begin, max_iterations, phase)
@@ -391,7 +377,9 @@ class FitSearch:
         iterations = self.task.settings.max_iterations
         if max_iterations is not None:
             iterations = min(iterations, max_iterations)
-        settings = SearchSettings(max_iterations=iterations, tolerance=FINAL_TOLERANCE)
+        settings = SearchSettings(
+            max_iterations=iterations, tolerance=FINAL_TOLERANCE, in_true_deviations=True
+        )
         samples = problem.sample_count * 2 * len(self.task.system.parameters)
         if samples < SAMPLES_OF_MUCH_DATA:
             return settings

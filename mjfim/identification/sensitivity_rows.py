@@ -30,7 +30,7 @@ def sensitivity_rows(
     Args:
         problem: The problem.
         at: The unknowns.
-        with_error: False for changes of zero, at half of the cost.
+        with_error: False for changes of zero and one-sided differences, at a quarter of the cost.
 
     Returns:
         (k, p) rows and (k, p) changes of every segment [standard deviations / theta-unit], k at
@@ -39,8 +39,7 @@ def sensitivity_rows(
     Raises:
         SimulationDivergedError: A perturbed simulation diverges.
     """
-    work = sensitivities_of_batch if with_error else sensitivities_without_error
-    condensed = _condensed_sensitivity(problem, at, work)
+    condensed = _condensed_sensitivity(problem, at, with_error)
     n = problem.simulation.private_count if problem.layout.free_starts else 0
 
     found = []
@@ -58,16 +57,18 @@ def sensitivity_rows(
 
 
 def _condensed_sensitivity(
-    problem: FitProblem, at: UnknownValues, work: BatchWork[dict[int, Array]]
+    problem: FitProblem, at: UnknownValues, with_error: bool
 ) -> dict[int, Array]:
     """Triangle of the whitened sensitivity and its change with a longer step, by segment.
 
-    Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes. The work condenses
-    those of a batch.
+    Its (k, 2 (n+p)) rows hold the derivatives and, next to them, their changes.
     """
+    work: BatchWork[dict[int, Array]] = sensitivities_without_error
+    if with_error:
+        work = sensitivities_of_batch
     batches = list(
         problem.simulation.batches(
-            derivatives=True, central=True, step=SENSITIVITY_STEP, by_all_parameters=True
+            derivatives=True, central=with_error, step=SENSITIVITY_STEP, by_all_parameters=True
         )
     )
     condensed: dict[int, Array] = {}

@@ -44,6 +44,16 @@ PRIVATE_RANK_COUNT_TOLERANCE = 1e-8
 # the rank.
 COMMON_RANK_COUNT_TOLERANCE = 1e-12
 
+# Largest and smallest number of stretches of rows whose gradients show how autocorrelated residuals
+# are.
+MAX_STRETCHES = 40
+MIN_STRETCHES = 10
+
+# Ratio of the true to the formal standard deviation that counts as larger than 1, and the largest
+# one that is believed.
+MIN_TRUE_DEVIATION = 2.0
+MAX_TRUE_DEVIATION = 10.0
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Step:
@@ -197,6 +207,33 @@ class Condensed:
         common_rows[:, -1] += common_rows[:, :-1] @ moves[0, n:, 0]
         return replace(self, blocks=blocks, private_rows=private_rows, common_rows=common_rows)
 
+    def of_segments(self, indices: np.ndarray) -> Condensed:
+        """The linearised residuals of some segments only, and the rows of the common unknowns.
+
+        Args:
+            indices: Indices of the segments.
+        """
+        number = np.full(self.segment_count, -1)
+        number[indices] = np.arange(len(indices))
+        number_of_block = number[self.segment_of_block]
+        is_kept = number_of_block >= 0
+        return replace(
+            self,
+            blocks=self.blocks[is_kept],
+            segment_of_block=number_of_block[is_kept],
+            private_rows=self.private_rows[indices],
+        )
+
+    def without_blocks(self, left_out: np.ndarray) -> Condensed:
+        """The linearised residuals without some blocks; all segments are kept.
+
+        Args:
+            left_out: (B,) True for the blocks that are left out.
+        """
+        return replace(
+            self, blocks=self.blocks[~left_out], segment_of_block=self.segment_of_block[~left_out]
+        )
+
     @property
     def rank(self) -> int:
         """Number of unknowns, private and common, that the rows determine."""
@@ -267,13 +304,8 @@ class Condensed:
         c = self.common_count
         weight = np.sqrt(damping) * scale
 
-        # Eliminate the private unknowns: a triangle of all rows and of their damping.
-        R = np.array(self.triangles)
-        if n:
-            least = MIN_PRIVATE_DAMPING * np.maximum(scale[:n], SMALLEST_NORM)
-            damping_rows = np.zeros((self.segment_count, n, R.shape[2]))
-            damping_rows[:, np.arange(n), np.arange(n)] = np.maximum(weight[:n], least)
-            R = triangle(np.concatenate([R, damping_rows], axis=1))
+        # Eliminate the private unknowns.
+        R = self._damped_triangles(weight[:n], scale[:n])
 
         # Bounded problem in the common unknowns alone.
         segment_rows = R[:, n:, n:].reshape(-1, c + 1)
@@ -281,13 +313,50 @@ class Condensed:
         rows = triangle(np.concatenate([segment_rows, self.common_rows, damping_rows]))
         common = _bounded_least_squares(rows[:, :-1], -rows[:, -1], lower, upper)
 
-        # The private unknowns follow by substitution.
-        private: Array = np.zeros((self.segment_count, n))
-        if n:
-            rhs = R[:, :n, -1] + R[:, :n, n:-1] @ common
-            private = np.asarray(-np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0])
+        return self._evaluated(common, self._substituted(R, common))
 
-        return self._evaluated(common, private)
+    def private_step(self, common: Array) -> Array:
+        """Step of the private unknowns to their minimum, for a given step of the common ones.
+
+        Args:
+            common: (c,) step of the common unknowns.
+
+        Returns:
+            (P, n) steps.
+        """
+        n = self.private_count
+        R = self._damped_triangles(np.zeros(n), self.column_norms[:n])
+        return self._substituted(R, common)
+
+    def _damped_triangles(self, weight: Array, scale: Array) -> Array:
+        """(P, m, m) triangles of all rows of each segment and of the damping of private unknowns.
+
+        Args:
+            weight: (n,) damping of each private unknown.
+            scale: (n,) scale of each private unknown.
+        """
+        n = self.private_count
+        R = np.array(self.triangles)
+        if not n:
+            return R
+
+        least = MIN_PRIVATE_DAMPING * np.maximum(scale, SMALLEST_NORM)
+        damping_rows = np.zeros((self.segment_count, n, R.shape[2]))
+        damping_rows[:, np.arange(n), np.arange(n)] = np.maximum(weight, least)
+        return triangle(np.concatenate([R, damping_rows], axis=1))
+
+    def _substituted(self, R: Array, common: Array) -> Array:
+        """(P, n) steps of the private unknowns that follow from a step of the common ones.
+
+        Args:
+            R: (P, m, m) damped triangles of the segments.
+            common: (c,) step of the common unknowns.
+        """
+        n = self.private_count
+        if not n:
+            return np.zeros((self.segment_count, 0))
+        rhs = R[:, :n, -1] + R[:, :n, n:-1] @ common
+        return np.asarray(-np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0])
 
     def _evaluated(self, common: Array, private: Array) -> Step:
         """A step with its lengths and the decrease that the linearisation predicts.
@@ -344,6 +413,37 @@ class Condensed:
         """
         J, _ = self._reduced_blocks
         return np.asarray(np.swapaxes(J, 1, 2) @ J)
+
+    @property
+    def true_deviation(self) -> float:
+        """How many times larger the standard deviations are than the formal ones.
+
+        The scatter of the gradients of long stretches of rows shows it (sandwich covariance; White,
+        1982). Autocorrelated residuals tell as much as fewer white ones. It is the ratio of the
+        common unknown for which it is smallest; 1 where it is not clearly larger, and at most
+        `MAX_TRUE_DEVIATION`, because it depends on the point of the linearisation.
+        """
+        stretches = min(len(self.blocks), MAX_STRETCHES)
+        if stretches < MIN_STRETCHES or not self.common_count:
+            return 1.0
+
+        # The gradient is zero at the minimum only, so that its mean does not count as scatter.
+        number = np.arange(len(self.blocks)) * stretches // len(self.blocks)
+        gradients = np.zeros((stretches, self.common_count))
+        np.add.at(gradients, number, self.block_scores)
+        centred = gradients - gradients.mean(axis=0)
+        scatter = centred.T @ centred * (stretches / (stretches - 1))
+
+        scaled, scale = scaled_to_unit_diagonal(self.information())
+        inverse = np.linalg.pinv(scaled, rcond=COMMON_RANK_COUNT_TOLERANCE, hermitian=True)
+        formal = np.diag(inverse)
+        sandwich = np.diag(inverse @ (scatter / np.outer(scale, scale)) @ inverse)
+        is_known = formal > 0.0
+        if not is_known.any():
+            return 1.0
+
+        ratio = float(np.sqrt(np.min(sandwich[is_known] / formal[is_known])))
+        return min(ratio, MAX_TRUE_DEVIATION) if ratio > MIN_TRUE_DEVIATION else 1.0
 
     @property
     def reduced_private_rows(self) -> Array:

@@ -52,12 +52,18 @@ ABSOLUTE_STAGNATION = 1e-2
 # Share of the predicted decrease below which an iteration counts as stagnant.
 PREDICTED_STAGNATION = 0.1
 
-# Number of consecutive stagnant iterations after which the search ends.
+# Number of consecutive stagnant iterations after which the search ends, and that number where the
+# true accuracy is much worse than the formal one.
 MAX_STAGNANT_ITERATIONS = 3
+MAX_ROUGH_ITERATIONS = 2
 
 # Length of a step [standard deviations] that the roughness of a simulation can explain. Where a
 # predicted step is shorter and does not lower the cost, the search has converged.
 SHORT_STEP = 0.3
+
+# This length where the true accuracy is much worse than the formal one [true standard deviations]:
+# the model does not explain the data, and the residuals are rough besides.
+SHORT_ROUGH_STEP = 0.5
 
 # Length of the step before the first one [standard deviations], which is assumed. The first step of
 # a search counts as the last one only if it is so short that a quadratic decrease of this step
@@ -70,6 +76,15 @@ COMPLETE_STEP = 1.1
 # Difference of the ratio of the actual to the predicted decrease from 1, below which the cost falls
 # as the linearisation predicts.
 LINEAR_RATIO_TOLERANCE = 0.1
+
+# Decrease of the cost, relative to the cost, below which a search is near enough to its minimum for
+# its residuals to show how much they are autocorrelated.
+NEAR_DECREASE = 1e-2
+
+# A search has no chance to beat a cost if it would stay above it with this multiple of the decrease
+# that is left by its linearisation. The first iterations may be far from a linear range.
+FUTILE_FACTOR = 3.0
+MIN_ITERATIONS_TO_BEAT = 3
 
 # Private unknowns have converged when their steps are below this multiple of the tolerance.
 PRIVATE_TOLERANCE = 10.0
@@ -232,6 +247,11 @@ class SearchSettings:
         next_step_length: Estimates the length of the next step [standard deviations] at the end
             of a complete one, at less cost than a linearisation of all data. A search that has it
             begins with hardly any damping, since it begins near the minimum. None without it.
+        in_true_deviations: True to measure lengths in standard deviations that allow for
+            autocorrelated residuals, because what is far below the true accuracy need not be
+            searched for. False for formal standard deviations.
+        cost_to_beat: Cost above which a minimum is of no use. The search ends where its linearised
+            cost stays clearly above it.
     """
 
     max_iterations: int = 60
@@ -240,6 +260,8 @@ class SearchSettings:
     relinearise_at_end: bool = True
     rough_share: float = 0.0
     next_step_length: NextStepLength | None = None
+    in_true_deviations: bool = False
+    cost_to_beat: float = np.inf
 
 
 Callback = Callable[[IterationReport], None]
@@ -329,6 +351,8 @@ class _Search:
         self.damping_growth = 2.0
         self.stagnant_iterations = 0
         self.previous_length = ASSUMED_LENGTH
+        self.unit = 1.0
+        self.unit_is_known = not settings.in_true_deviations
         self.iterates: list[UnknownValues] = []
 
     def run(self, start: UnknownValues, cost: float, condensed: Condensed) -> Solution:
@@ -365,6 +389,9 @@ class _Search:
         if isinstance(trial, Solution):
             return trial
 
+        if self.cost - trial.cost < NEAR_DECREASE * self.cost:
+            self._find_unit()
+
         # The search ends where the cost no longer falls, even if the linearisation predicts a
         # decrease.
         predicted = self._predicted_step()
@@ -374,6 +401,7 @@ class _Search:
             return self._without_progress(predicted)
 
         converged = self._converged(trial, predicted)
+        futile = self._is_futile(trial, predicted)
         self.previous_length = trial.step.common_length
         self.unknowns = trial.unknowns
         self.cost = trial.cost
@@ -385,6 +413,8 @@ class _Search:
         if trial.fraction == 1.0 and self._is_near(predicted):
             self.condensed = self.condensed.after(trial.step)
             return self._solution("near the minimum", success=True)
+        if futile:
+            return self._solution("stopped: another minimum costs less", success=False)
         if self._needs_no_relinearisation(trial, predicted):
             self.condensed = self.condensed.after(trial.step)
             return self._solution(
@@ -462,26 +492,42 @@ class _Search:
         """
         return self._step(WEAK_DAMPING if self.settings.damped else 0.0)
 
+    def _find_unit(self) -> None:
+        """Find the unit of lengths by the residuals, if it is not known yet."""
+        if not self.unit_is_known:
+            self.unit = self.condensed.true_deviation
+            self.unit_is_known = True
+
+    @property
+    def _tolerance(self) -> float:
+        """Length of a step [formal standard deviations] below which the search has converged."""
+        return self.settings.tolerance * self.unit
+
     def _is_small(self, step: Step) -> bool:
         """Whether a step is below the tolerance."""
-        tolerance = self.settings.tolerance
+        tolerance = self._tolerance
         return (
             step.common_length < tolerance and step.private_length < PRIVATE_TOLERANCE * tolerance
         )
 
     def _stagnates(self, trial: _Trial, predicted: Step) -> bool:
         """Count consecutive iterations that hardly lower the cost; True after too many of them."""
-        negligible = min(
-            RELATIVE_STAGNATION * self.cost,
-            ABSOLUTE_STAGNATION,
-            PREDICTED_STAGNATION * predicted.predicted_decrease,
-        )
+        negligible = min(RELATIVE_STAGNATION * self.cost, ABSOLUTE_STAGNATION)
+
+        # A search that converges slowly, but as predicted, goes on, unless what it can gain is far
+        # below the true accuracy.
+        most = MAX_STAGNANT_ITERATIONS
+        if self.unit > 1.0:
+            negligible *= self.unit**2
+            most = MAX_ROUGH_ITERATIONS
+        else:
+            negligible = min(negligible, PREDICTED_STAGNATION * predicted.predicted_decrease)
         if self.cost - trial.cost <= negligible:
             self.stagnant_iterations += 1
         else:
             self.stagnant_iterations = 0
 
-        return self.stagnant_iterations == MAX_STAGNANT_ITERATIONS
+        return self.stagnant_iterations == most
 
     def _converged(self, trial: _Trial, predicted: Step) -> bool:
         """Whether the step that was taken is the last one."""
@@ -512,9 +558,9 @@ class _Search:
 
         complete = (
             predicted.common_length < COMPLETE_STEP * length
-            and predicted.private_length < SHORT_STEP
+            and predicted.private_length < SHORT_STEP * self.unit
         )
-        return complete and length < SHORT_STEP and next_length < self.settings.tolerance
+        return complete and length < SHORT_STEP * self.unit and next_length < self._tolerance
 
     def _is_near(self, predicted: Step) -> bool:
         """Whether a search that need not converge has come near the minimum.
@@ -522,6 +568,16 @@ class _Search:
         The minimum of the linearised cost was not much lower than the cost.
         """
         return predicted.predicted_decrease < self.settings.rough_share * self.cost
+
+    def _is_futile(self, trial: _Trial, predicted: Step) -> bool:
+        """Whether the minimum will cost more than what is to be beaten.
+
+        The linearised cost may miss its own minimum by some times what is left of the decrease.
+        """
+        if self.iteration < MIN_ITERATIONS_TO_BEAT:
+            return False
+        left = max(trial.cost - (self.cost - predicted.predicted_decrease), 0.0)
+        return trial.cost - FUTILE_FACTOR * left > self.settings.cost_to_beat
 
     def _needs_no_relinearisation(self, trial: _Trial, predicted: Step) -> bool:
         """Whether the linearisation, although it is one long step old, still holds at its end.
@@ -536,7 +592,7 @@ class _Search:
         complete = predicted.common_length < COMPLETE_STEP * trial.step.common_length
         if not (as_predicted and complete):
             return False
-        return estimate(self.condensed, trial.step, trial.unknowns) < self.settings.tolerance
+        return estimate(self.condensed, trial.step, trial.unknowns) < self._tolerance
 
     def _keep(self, at: UnknownValues) -> None:
         """Keep an iterate, with the private unknowns of the first segment only."""
@@ -588,7 +644,9 @@ class _Search:
 
     def _without_progress(self, predicted: Step) -> Solution:
         """Solution where no step lowers the cost: converged if the predicted step is short."""
-        if predicted.common_length < SHORT_STEP and predicted.private_length < SHORT_STEP:
+        self._find_unit()
+        short = SHORT_ROUGH_STEP * self.unit if self.unit > 1.0 else SHORT_STEP
+        if predicted.common_length < short and predicted.private_length < short:
             return self._solution("converged: the residual stopped falling", success=True)
 
         solution = self._solution(

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array, freeze
 from mjfim.records.combinations import join_names
+from mjfim.records.horizons import HorizonStudy
 from mjfim.records.labels import Labels
 from mjfim.records.recording import Recording
 from mjfim.records.selection import Selection
@@ -86,6 +87,8 @@ class Estimate(ShownRecord):
             whole vector or tensor of an entry [theta-unit].
         selection: How the model was extended by terms that it lacked; None where that was not
             asked for.
+        horizons: Lengths of segments that were compared, because the model does not explain whole
+            recordings; None where they were not.
     """
 
     parameters: tuple[str, ...]
@@ -131,6 +134,7 @@ class Estimate(ShownRecord):
     segments: tuple[Array, ...] = ()
     sizes: Array = field(default_factory=lambda: np.zeros(0))
     selection: Selection | None = None
+    horizons: HorizonStudy | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -231,6 +235,7 @@ class Estimate(ShownRecord):
             "combinations": list(self.combinations),
             "restart": None if self.restart is None else self.restart.summary(),
             "selection": None if self.selection is None else self.selection.summary(),
+            "horizons": None if self.horizons is None else self.horizons.summary(),
         }
 
 

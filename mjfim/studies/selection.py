@@ -22,6 +22,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction, held_out_losses
+from mjfim.identification.horizons import with_length
 from mjfim.identification.identify import Callback, fit_task, refit_task
 from mjfim.identification.missing_terms import find_missing_terms
 from mjfim.identification.report import FitResult, estimate_from
@@ -202,10 +203,13 @@ class _Selector:
         model, ending = self._grown(first, first, steps)
         model = self._pruned(model, first, steps)
 
-        # The chosen model is fitted like any other, with all attempts against local minima.
+        # The chosen model is fitted like any other, with all attempts against local minima, and
+        # over the length of segments that suits it.
         result = model.result
         if model.terms and not self._is_stopped():
             final = replace(result.task, start=result.theta, held_out=self.held_out)
+            if task.settings.segments is None:
+                final = with_length(final, None)
             result = fit_task(self._search(final), self.workers)
 
         # The report compares the estimate with the guess, not with where the last search began.
@@ -411,7 +415,7 @@ class _Selector:
         """Losses of the predictions of left-out data; None after a request to stop."""
         sigma = first.problem.noise.sigma
         try:
-            return held_out_losses(result.problem, result.solution.unknowns, sigma, self.budget)
+            return held_out_losses(result.problem, result.solution, sigma, self.budget)
         except InterruptedPassError:
             return None
 

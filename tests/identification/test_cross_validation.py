@@ -11,7 +11,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import cross_validation, left_out_parts
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import identify_system
+from mjfim.identification.identify import identify_system, least_squares
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.recording import Recording
 from tests.support.dense_residuals import dense_residuals
@@ -78,12 +78,12 @@ def test_predictions_of_some_segments_say_how_many(
     experiment = base.replace(horizon=1.0, fit={"segments": 0.25, "start": "measured"})
     task = DesignTask.resolve(experiment, threads=1)
     problem = FitProblem.of(task.system, [recorded(task, seed) for seed in range(2)])
-    at = problem.begin(task.theta)
-    everything = cross_validation.predict_unfitted(problem, at, None, Budget())
+    solution = least_squares(problem, task.theta)
+    everything = cross_validation.predict_unfitted(problem, solution, None, Budget())
     assert [found.name for found in everything] == ["simulated"] * 2
 
     monkeypatch.setattr(left_out_parts, "MAX_SAMPLES", problem.sample_count // 2)
-    some = cross_validation.predict_unfitted(problem, at, None, Budget())
+    some = cross_validation.predict_unfitted(problem, solution, None, Budget())
     assert [found.name for found in some] == ["simulated (2 of 4 segments)"] * 2
 
 

@@ -21,12 +21,13 @@ from mjfim.identification import (
     cross_validation,
     fit_workers,
     left_out_parts,
-    searches,
     segment_simulation,
+    subsets,
 )
 from mjfim.identification.fit_orders import BatchOrder
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
+from mjfim.identification.identify import least_squares
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.parallel import dispatch
@@ -220,7 +221,7 @@ def test_a_request_to_stop_in_any_pass_leaves_an_estimate(
     after: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(searches, "SUBSET_SAMPLES", 60)
+    monkeypatch.setattr(subsets, "SUBSET_SAMPLES", 60)
     found = stopped_fit(experiment, recordings, after)
 
     assert np.isfinite(found.theta).all()
@@ -271,9 +272,11 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
     named = [replace(recording, name=f"log {i}") for i, recording in enumerate(recordings)]
     problem = problem_of(experiment, named, WHOLE)
     plant = problem.system.plant
-    at = problem.begin(problem.system.parameters.guess)
+    solution = least_squares(
+        problem, problem.system.parameters.guess, SearchSettings(max_iterations=2)
+    )
     begin = plant.engine_steps
-    alone = cross_validation.predict_unfitted(problem, at, None, Budget())
+    alone = cross_validation.predict_unfitted(problem, solution, None, Budget())
     steps = plant.engine_steps
 
     orders: list[str] = []
@@ -281,9 +284,9 @@ def test_each_part_is_predicted_from_the_others_as_in_one_process(
         monkeypatch.setattr(fit_workers, name, noted(getattr(fit_workers, name), name, orders))
     with LosingThreads() as threads:
         divided = problem.on_workers(FitWorkers(threads))
-        found = cross_validation.predict_unfitted(divided, at, None, Budget())
+        found = cross_validation.predict_unfitted(divided, solution, None, Budget())
 
-    assert set(orders) == {"_work_on_whole" if largest else "_work_on_batch"}
+    assert ("_work_on_whole" in orders) == (largest > 0)
     assert [part.name for part in found] == [part.name for part in alone]
     assert [part.name for part in found][:2] == (
         ["log 0", "log 1"] if samples > 100 else ["log 0", "log 2"]

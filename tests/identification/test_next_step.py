@@ -12,7 +12,7 @@ import mjfim
 from mjfim.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import next_step, searches
+from mjfim.identification import next_step, searches, subsets
 from mjfim.identification.estimated_noise import EstimatedNoiseProblem
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import _first_fit
@@ -131,7 +131,7 @@ def test_the_test_of_estimated_noise_is_weighted_as_the_linearisation(
 def test_the_search_for_estimated_noise_has_a_test_that_is_weighted_so(
     task: FitTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(searches, "SUBSET_SAMPLES", 100)
+    monkeypatch.setattr(subsets, "SUBSET_SAMPLES", 100)
     monkeypatch.setattr(searches, "SAMPLES_OF_MUCH_DATA", 100)
     searched = []
 
@@ -164,8 +164,8 @@ def test_the_search_for_estimated_noise_has_a_test_that_is_weighted_so(
 def test_a_search_that_is_stopped_reports_on_the_segments_that_it_has_seen(
     task: FitTask, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(searches, "MIN_FIRST_SAMPLES", 10)
-    monkeypatch.setattr(searches, "MIN_FIRST_SEGMENTS", 2)
+    monkeypatch.setattr(subsets, "MIN_FIRST_SAMPLES", 10)
+    monkeypatch.setattr(subsets, "MIN_FIRST_SEGMENTS", 2)
     stop = StopToken()
 
     def callback(event: FitEvent) -> None:
@@ -174,7 +174,7 @@ def test_a_search_that_is_stopped_reports_on_the_segments_that_it_has_seen(
             stop.request()
 
     problem = task.problem()
-    seen = searches.first_subset(problem)
+    seen = subsets.first_subset(problem)
     assert len(seen) < len(problem.segments)
     search = FitSearch(task=task, budget=Budget(stop=stop), callback=callback)
     begin = problem.begin(task.start)
@@ -288,7 +288,7 @@ def test_few_segments_are_not_tested(task: FitTask, monkeypatch: pytest.MonkeyPa
 def test_much_data_give_the_same_estimate(task: FitTask, monkeypatch: pytest.MonkeyPatch) -> None:
     """The search begins on a part of the data, and ends after few linearisations of all of it."""
     exact = mjfim.identify(task.system.experiment, task.recordings, threads=1)
-    monkeypatch.setattr(searches, "SUBSET_SAMPLES", 100)
+    monkeypatch.setattr(subsets, "SUBSET_SAMPLES", 100)
     monkeypatch.setattr(searches, "SAMPLES_OF_MUCH_DATA", 100)
     found = mjfim.identify(task.system.experiment, task.recordings, threads=1)
     assert found.success

@@ -15,8 +15,9 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import searches, segment_simulation
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.searches import FitSearch, first_subset
+from mjfim.identification.searches import FitSearch
 from mjfim.identification.segment_simulation import SegmentBatch
+from mjfim.identification.subsets import first_subset
 from mjfim.identification.task import FitTask
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (

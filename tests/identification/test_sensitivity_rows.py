@@ -51,7 +51,7 @@ def test_the_recordings_of_the_batch_that_diverges_are_named(
     assert str(caught.value).startswith(" or ".join(sorted(set(last))) + ": the simulation")
 
 
-def test_rows_without_error_are_those_of_the_finer_step() -> None:
+def test_rows_without_error_are_those_of_one_sided_differences() -> None:
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
     design = DesignTask.resolve(experiment, threads=1)
     recordings = [simulate_system(design.system, design.initial, seed) for seed in range(2)]
@@ -61,9 +61,14 @@ def test_rows_without_error_are_those_of_the_finer_step() -> None:
     full = sensitivity_rows(problem, at)
     between = problem.system.plant.engine_steps
     fast = sensitivity_rows(problem, at, with_error=False)
-    assert problem.system.plant.engine_steps - between == (between - steps) // 2
+
+    # One-sided differences take one rollout for each parameter and one at the unknowns.
+    count = 1 + len(problem.system.parameters)
+    two_sided = 1 + 2 * len(problem.system.parameters)
+    steps_of_both = between - steps
+    assert problem.system.plant.engine_steps - between == steps_of_both * count // (2 * two_sided)
     for (J, change), (other, none) in zip(full, fast, strict=True):
-        np.testing.assert_allclose(other.T @ other, J.T @ J, rtol=1e-9)
+        np.testing.assert_allclose(other.T @ other, J.T @ J, rtol=1e-5)
         assert (none == 0.0).all()
         assert (change != 0.0).any()
 

@@ -409,3 +409,62 @@ def test_the_linearisation_after_a_step_has_its_residuals(shape: tuple[int, int,
         of_private = moved.reduced_private_rows
         scores += np.einsum("pkc,pk->pc", of_private[..., :-1], of_private[..., -1])
         np.testing.assert_allclose(after, scores, rtol=1e-6, atol=1e-7 * scale)
+
+
+def test_without_some_blocks_and_segments_the_rows_of_the_others_count() -> None:
+    dense = problem(5)
+    free = np.full(dense.c, np.inf)
+    left_out = np.zeros(len(dense.blocks), dtype=bool)
+    left_out[[1, 3]] = True
+    step = dense.condensed.without_blocks(left_out).step(
+        0.0, np.ones(dense.n + dense.c), -free, free
+    )
+
+    # Zero rows in place of the blocks that are left out.
+    first = np.cumsum([0, *(len(block) for block in dense.blocks)])
+    kept = np.ones(len(dense.J), dtype=bool)
+    for block in np.flatnonzero(left_out):
+        kept[first[block] : first[block + 1]] = False
+    exact = lstsq(dense.J[kept], -dense.r[kept])[0]
+    np.testing.assert_allclose(step.common, exact[dense.P * dense.n :], rtol=1e-7)
+
+    some = np.array([2, 0])
+    part = dense.condensed.of_segments(some)
+    assert part.segment_count == 2
+    np.testing.assert_allclose(
+        np.abs(part.triangles[0]), np.abs(dense.condensed.triangles[2]), rtol=1e-9, atol=1e-9
+    )
+
+
+def test_private_unknowns_follow_a_given_step_of_the_common_ones() -> None:
+    dense = problem(6)
+    common = np.random.default_rng(0).standard_normal(dense.c) / dense.condensed.column_norms[2:]
+    private = dense.condensed.private_step(common)
+    exact = lstsq(dense.starts, -(dense.r + dense.shared @ common))[0]
+    np.testing.assert_allclose(private.ravel(), exact, rtol=1e-6)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_the_true_deviation_is_that_of_autocorrelated_residuals(correlation: float) -> None:
+    """Residuals of a first-order autoregressive process, and two smooth regressors."""
+    rng = np.random.default_rng(1)
+    count, rows = 400, 20
+    e = rng.standard_normal(count * rows)
+    for k in range(1, len(e)):
+        e[k] = correlation * e[k - 1] + np.sqrt(1.0 - correlation**2) * e[k]
+    t = np.linspace(0.0, 1.0, len(e))
+    J = np.column_stack([np.ones_like(t), t])
+    r = e - J @ lstsq(J, e)[0]
+    blocks = np.stack(
+        [condense(np.column_stack([J, r])[i : i + rows]) for i in range(0, len(t), rows)]
+    )
+    found = Condensed(
+        blocks=blocks,
+        segment_of_block=np.zeros(count, dtype=int),
+        private_rows=np.zeros((1, 0, 3)),
+        common_rows=np.zeros((0, 3)),
+    ).true_deviation
+
+    # The variance of a mean is (1 + rho) / (1 - rho) times that of white noise.
+    expected = np.sqrt((1.0 + correlation) / (1.0 - correlation))
+    assert found == pytest.approx(expected if correlation else 1.0, rel=0.25)

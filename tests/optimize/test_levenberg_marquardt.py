@@ -492,3 +492,58 @@ def test_a_rough_search_ends_where_a_step_hardly_lowers_the_cost() -> None:
     # The last step is taken, and the one before it promised more.
     assert rough.cost == p.cost(rough.unknowns)
     assert exact.cost <= rough.cost < 1.1 * exact.cost
+
+
+def curve(t: Array, y: Array) -> Rows:
+    """Residuals of an exponential curve at times t."""
+
+    def rows(theta: Array, private: Array) -> Array:
+        return theta[0] * np.exp(-theta[1] * t) - y
+
+    return rows
+
+
+def drifting(seed: int) -> Analytic:
+    """An exponential curve whose residuals drift slowly, in forty segments."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 4.0, 800)
+    drift = np.cumsum(rng.standard_normal(800)) * 0.3
+    y = 100.0 * np.exp(-0.7 * t) + drift
+    parts = [curve(t[i : i + 20], y[i : i + 20]) for i in range(0, 800, 20)]
+    return problem(*parts, lower=[-FREE, -FREE])
+
+
+def test_lengths_in_true_deviations_end_a_search_earlier_where_residuals_drift() -> None:
+    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    formal = drifting(0)
+    true = drifting(0)
+    exact = minimise(formal, start, SearchSettings(tolerance=1e-3))
+    found = minimise(true, start, SearchSettings(tolerance=1e-3, in_true_deviations=True))
+    assert exact is not None and found is not None and exact.success and found.success
+    assert len(true.seen) < len(formal.seen)
+
+    # The difference is a small share of the formal standard deviations, and smaller of the true.
+    H = exact.condensed.information()
+    missed = found.unknowns.theta - exact.unknowns.theta
+    assert np.sqrt(missed @ H @ missed) < 1e-3 * found.condensed.true_deviation
+    assert found.condensed.true_deviation > 3.0
+
+
+def test_a_search_ends_where_it_cannot_beat_a_cost() -> None:
+    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    whole = drifting(0)
+    exact = minimise(whole, start, SHARP)
+    assert exact is not None
+
+    # A cost that lies below the minimum cannot be beaten; one that lies above it is.
+    ended = drifting(0)
+    settings = SearchSettings(tolerance=1e-9, cost_to_beat=0.5 * exact.cost)
+    found = minimise(ended, start, settings)
+    assert found is not None and not found.success
+    assert found.status == "stopped: another minimum costs less"
+    assert len(ended.seen) < len(whole.seen)
+    beaten = minimise(
+        drifting(0), start, SearchSettings(tolerance=1e-9, cost_to_beat=2 * exact.cost)
+    )
+    assert beaten is not None and beaten.success
+    assert beaten.cost == pytest.approx(exact.cost)

@@ -20,6 +20,7 @@ from mjfim.records.check import Check, ParameterCheck, SelfTest
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors, Whiteness
+from mjfim.records.horizons import HorizonStudy
 from mjfim.records.labels import Labels
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
 from mjfim.records.selection import Decision, Selection, SelectionStep
@@ -284,6 +285,26 @@ def selection_figure(size: Size) -> Figure:
     return plots.selection_figure(dataclasses.replace(estimate(size), selection=selection))
 
 
+def horizons_figure(size: Size) -> Figure:
+    """Figure of four lengths of segments, on which some parameters depend."""
+    found = estimate(size)
+    scales = np.array([1.2, 1.1, 1.0, 0.9])[:, None]
+    apart = np.zeros((4, size.parameters), dtype=bool)
+    apart[0, ::2] = True
+    study = HorizonStudy(
+        lengths=np.array([0.12, 0.48, 1.9, 4.0]),
+        errors=np.array([[1.0, 1.2, 2.0, 9.0], [1.1, 1.2, 1.8, 5.0], [1.1, 1.2, 1.5, 3.0]] * 2)[:4],
+        chosen=2,
+        is_whole=True,
+        parameters=size.labels.parameters,
+        units=size.labels.parameter_units,
+        theta=scales * found.theta,
+        half_widths=np.abs(0.05 * scales * found.theta),
+        is_apart=apart,
+    )
+    return plots.horizons_figure(dataclasses.replace(found, horizons=study))
+
+
 FIGURES: dict[str, Callable[[Size], Figure]] = {
     "campaign_figure": campaign_figure,
     "check_figure": lambda size: plots.check_figure(check(size)),
@@ -294,6 +315,7 @@ FIGURES: dict[str, Callable[[Size], Figure]] = {
     "fit": lambda size: plots.fit(estimate(size), 0, size.labels, np.full(size.joints, 0.05)),
     "held_out": lambda size: plots.held_out(estimate(size), 0, size.labels),
     "histogram": lambda size: plots.histogram(make_study(size.parameters), 0, size.labels),
+    "horizons_figure": horizons_figure,
     "limits": lambda size: plots.limits(design(size), size.labels),
     "parameter_intervals": lambda size: plots.parameter_intervals(estimate(size), size.labels),
     "parameter_trace": lambda size: plots.parameter_trace(estimate(size), size.labels),

@@ -3,6 +3,7 @@ from .check import check_figure
 from .compare import compare_figure
 from .convergence import convergence
 from .design import sensitivity_phase, trajectories
+from .horizons import horizons_figure
 from .limit_usage import limits
 from .monte_carlo import histogram, study_overview
 from .pairs import check_pairs, estimate_pairs
@@ -24,6 +25,7 @@ __all__ = [
     "fit",
     "held_out",
     "histogram",
+    "horizons_figure",
     "limits",
     "parameter_intervals",
     "parameter_trace",

@@ -105,6 +105,8 @@ def _(estimate: Estimate) -> Pictures:
     }
     if estimate.selection is not None:
         pictures["selection"] = partial(plots.selection_figure, estimate)
+    if estimate.horizons is not None:
+        pictures["horizons"] = partial(plots.horizons_figure, estimate)
     if len(estimate.trace) > 1:
         pictures["trace"] = partial(plots.parameter_trace, estimate, labels)
     if has_pairs(estimate.std):

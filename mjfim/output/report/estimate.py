@@ -26,10 +26,12 @@ from mjfim.output.report.curves import (
     rows_of_bars,
     thinned,
 )
+from mjfim.output.report.horizons import horizons_section
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
 from mjfim.output.report.residual_curves import Residuals
 from mjfim.output.report.selection import selection_section
 from mjfim.output.summaries.estimate import FITTED_MARK, FITTED_NOTE, describe_estimate
+from mjfim.output.summaries.horizons import describe_horizons
 from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.summary_parts import Listing, Part, Quantity, Summary
@@ -79,6 +81,8 @@ def estimate_page(estimate: Estimate) -> Page:
     sections = [Section(title="Parameters", parts=list(_parameter_parts(estimate, summary)))]
     if estimate.selection is not None:
         sections.append(selection_section(estimate.selection))
+    if estimate.horizons is not None:
+        sections.append(horizons_section(estimate.horizons))
     if estimate.predictions:
         found: list[Part | PlotGroup] = [summary.table("predictions")]
         found += [summary.table("prediction details"), _prediction_plots(estimate, labels)]
@@ -142,9 +146,13 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
         note += f" Nominal values of 0 have no relative difference: {first_ones(absent)}."
     if panels:
         yield PlotGroup(title="", panels=panels, keys=keys if shares else (), note=note)
-    about_terms = [] if estimate.selection is None else describe_selection(estimate.selection)
+    in_sections: list[Part] = []
+    if estimate.selection is not None:
+        in_sections += describe_selection(estimate.selection)
+    if estimate.horizons is not None:
+        in_sections += describe_horizons(estimate.horizons)
     for part in summary.parts:
-        if part in about_terms:
+        if part in in_sections:
             continue
         if part is not table and getattr(part, "key", "") not in elsewhere:
             yield part

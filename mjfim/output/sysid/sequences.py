@@ -241,7 +241,7 @@ def _check_expressible(system: System) -> None:
             "states, biases and delays from the unknowns"
         )
 
-    if experiment.fit.segments is not None or experiment.fit.start != "stated":
+    if experiment.fit.segment_length is not None or experiment.fit.start != "stated":
         raise ExperimentError(
             f"{experiment.source}: fit: sysid simulates from the stated initial state only; remove "
             "`segments` and `start`"

@@ -1,0 +1,234 @@
+"""Fits without one part of the data, which begin at the fit to all of them.
+
+Such a fit ends close to the fit to all data. The linearisation there consists of blocks of rows.
+Those of the part can be left out, and one Gauss-Newton step leads to the other fit without a
+linearisation of its own (approximate cross-validation; Giordano et al., A Swiss Army infinitesimal
+jackknife, 2019). One simulation of the other data shows whether this step was good enough; where
+it was not, the search goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.budget import Budget
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.left_out_parts import SEARCH, LeftOutPart, with_initial_states
+from mjfim.optimize.condensed_least_squares import Condensed
+from mjfim.optimize.levenberg_marquardt import WEAK_DAMPING, Solution, UnknownValues, minimise
+
+# Share of the predicted decrease of the cost that a step to the fit without a part may miss. The
+# errors of predictions hardly change with what is left of it.
+ALLOWED_SHARE = 0.1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LeaveOutStep:
+    """Step of a fit to the fit without one part of the data.
+
+    Attributes:
+        part: The part.
+        begin: Unknowns of all segments at the fit to all data.
+        end: Unknowns of all segments at the end of the step. Initial states of segments in the part
+            are those that fit the part best at the new theta.
+        predicted_decrease: Decrease of the cost of the other data that the linearisation predicts.
+        cost: Cost of the other data at the begin; None where it has to be simulated.
+        cost_at_guess: Cost of the other data at the guess; None where it has to be simulated.
+    """
+
+    part: LeftOutPart
+    begin: UnknownValues
+    end: UnknownValues
+    predicted_decrease: float
+    cost: float | None = None
+    cost_at_guess: float | None = None
+
+
+def leave_out_steps(
+    problem: FitProblem, solution: Solution, parts: Sequence[LeftOutPart]
+) -> list[LeaveOutStep]:
+    """Make the steps of a fit to the fits without each of some parts of the data.
+
+    Args:
+        problem: Problem of all data.
+        solution: Its solution, with the linearisation there.
+        parts: Parts that are left out in turn.
+
+    Returns:
+        The steps, in the order of the parts.
+    """
+    guess = problem.begin(problem.system.parameters.guess)
+    losses = _SegmentLosses.simulated(problem, solution.unknowns)
+    losses_at_guess = _SegmentLosses.simulated(problem, guess)
+
+    steps = []
+    for part in parts:
+        step = _step_without(problem, solution, part)
+        others = _other_segments(problem, part)
+        if others is not None:
+            step = replace(
+                step, cost=losses.cost_of(others), cost_at_guess=losses_at_guess.cost_of(others)
+            )
+        steps.append(step)
+    return steps
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OtherFit:
+    """Fit to all data but one part.
+
+    Attributes:
+        unknowns: Unknowns of all segments. Where `has_initial_states` is false, the private ones
+            are those of the fit to all data.
+        has_initial_states: Whether the private unknowns of the part belong to the new theta.
+    """
+
+    unknowns: UnknownValues
+    has_initial_states: bool
+
+
+def fit_to_others(problem: FitProblem, step: LeaveOutStep, budget: Budget) -> OtherFit | None:
+    """Fit theta to all data but one part.
+
+    Args:
+        problem: Problem of all parts.
+        step: Step of the fit to all data to the fit without the part.
+        budget: Ends the fit early.
+
+    Returns:
+        The fit; None where there are no other data, where the simulation diverges, and after a
+        request to stop.
+    """
+    others = problem.masked([~mask for mask in step.part.masks(problem)])
+    segments = others.segments_with_values
+    if not len(segments):
+        return None
+
+    others = others.of_segments(segments)
+    begin, end = _of_segments(step.begin, segments), _of_segments(step.end, segments)
+    cost = others.cost(begin) if step.cost is None else step.cost
+    cost_at_end = others.cost(end)
+    if budget.exhausted is not None:
+        return None
+
+    # The data that are left out may have led the estimate to a minimum that the others lack. The
+    # fit to the others then begins at the guess.
+    guess = others.begin(problem.system.parameters.guess)
+    cost_at_guess = others.cost(guess) if step.cost_at_guess is None else step.cost_at_guess
+
+    # The step is the fit if it lowers the cost nearly as far as the linearisation predicts.
+    missed = cost_at_end - (cost - step.predicted_decrease)
+    allowed = max(ALLOWED_SHARE * step.predicted_decrease, SEARCH.rough_share * cost)
+    if missed <= allowed and cost_at_end <= cost_at_guess:
+        return OtherFit(unknowns=step.end, has_initial_states=not len(problem.layout.per_recording))
+
+    starts = [(cost_at_end, end), (cost, begin), (cost_at_guess, guess)]
+    found = minimise(others, min(starts, key=lambda start: start[0])[1], SEARCH, budget)
+    if found is None or budget.exhausted is not None:
+        return None
+    return OtherFit(
+        unknowns=replace(found.unknowns, private=step.begin.private), has_initial_states=False
+    )
+
+
+def predicted_part(
+    problem: FitProblem, fit: OtherFit, masks: Sequence[np.ndarray], budget: Budget
+) -> tuple[FitProblem, UnknownValues]:
+    """The segments of a part, and their unknowns at a fit to the other data.
+
+    Args:
+        problem: Problem of all parts.
+        fit: The fit to the others.
+        masks: (M, ny) for every recording, True for the values of the part.
+        budget: Ends the search for initial states early.
+    """
+    if not fit.has_initial_states:
+        return with_initial_states(problem, fit.unknowns.theta, masks, budget)
+
+    segments = problem.masked(masks).segments_with_values
+    return problem.of_segments(segments), _of_segments(fit.unknowns, segments)
+
+
+def _of_segments(at: UnknownValues, segments: np.ndarray) -> UnknownValues:
+    """The unknowns of some segments."""
+    return replace(at, private=at.private[segments])
+
+
+def _step_without(problem: FitProblem, solution: Solution, part: LeftOutPart) -> LeaveOutStep:
+    """Step to the fit without a part, whose costs are not known yet."""
+    at = solution.unknowns
+    condensed = solution.condensed
+    masks = part.masks(problem)
+    others = condensed.without_blocks(problem.blocks.containing(masks))
+
+    # Bounds hold as in every step of the search.
+    values = problem.common_values(at)
+    step = others.step(
+        WEAK_DAMPING, condensed.column_norms, problem.lower - values, problem.upper - values
+    )
+    is_left_out = ~np.isin(
+        np.arange(len(problem.segments)),
+        problem.masked([~mask for mask in masks]).segments_with_values,
+    )
+    end = problem.moved(at, step, 1.0)
+    return LeaveOutStep(
+        part=part,
+        begin=at,
+        end=_with_states_of_part(at, end, condensed, step.common, is_left_out),
+        predicted_decrease=step.predicted_decrease,
+    )
+
+
+def _with_states_of_part(
+    begin: UnknownValues, end: UnknownValues, condensed: Condensed, common: Array, part: np.ndarray
+) -> UnknownValues:
+    """The end of a step, at which initial states of the segments in a part fit that part.
+
+    Args:
+        begin: Unknowns at the begin of the step.
+        end: Unknowns at its end.
+        condensed: Linearisation of all data at the begin.
+        common: (c,) step of the common unknowns.
+        part: (P,) True for the segments of the part.
+    """
+    private = np.array(end.private)
+    private[part] = begin.private[part] + condensed.private_step(common)[part]
+    return replace(end, private=private)
+
+
+def _other_segments(problem: FitProblem, part: LeftOutPart) -> np.ndarray | None:
+    """Indices of the segments outside of a part; None where a segment is partly inside."""
+    masks = part.masks(problem)
+    inside = problem.masked(masks).segments_with_values
+    others = problem.masked([~mask for mask in masks]).segments_with_values
+    return None if np.isin(inside, others).any() else others
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SegmentLosses:
+    """Losses of every segment at some unknowns.
+
+    Attributes:
+        problem: Problem of all segments.
+        at: The unknowns.
+        losses: (P,) losses; infinite where the simulation diverges.
+    """
+
+    problem: FitProblem
+    at: UnknownValues
+    losses: Array
+
+    @classmethod
+    def simulated(cls, problem: FitProblem, at: UnknownValues) -> _SegmentLosses:
+        """Simulate all segments."""
+        return cls(problem=problem, at=at, losses=problem.segment_losses(at))
+
+    def cost_of(self, segments: np.ndarray) -> float:
+        """Cost of some segments, with the priors."""
+        part = self.problem.of_segments(segments)
+        priors = part.prior_cost(_of_segments(self.at, segments))
+        return 0.5 * float(self.losses[segments].sum()) + priors

@@ -1,0 +1,136 @@
+"""The length of the segments is chosen by prediction where a model does not explain the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.held_out_losses import HeldOutLosses
+from mjfim.identification.horizons import _chosen
+from mjfim.records.horizons import HorizonStudy
+from mjfim.records.recording import Recording
+from tests.support.paths import ROOT
+
+CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
+
+
+def stated(**tables: object) -> mjfim.Experiment:
+    """The cart-pendulum under a multisine."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    fit = {"bootstrap": 0, **tables}
+    return base.replace(horizon=3.0, initial={"control": CONTROL}, fit=fit)
+
+
+def recorded(friction: float, count: int) -> list[Recording]:
+    """Recordings of a robot whose cart has dry friction, which the model lacks."""
+    parameters = {"f": {"target": "joint/slide:frictionloss", "guess": friction, "scale": 1.0}}
+    experiment = stated() if friction == 0.0 else stated().replace(parameters=parameters)
+    task = DesignTask.resolve(experiment, threads=1)
+    return [simulate_system(task.system, task.initial, seed) for seed in range(count)]
+
+
+def made_study(**changes: object) -> HorizonStudy:
+    """A study of two lengths and two parameters, of which the first depends on the length."""
+    values = {
+        "lengths": np.array([0.5, 4.0]),
+        "errors": np.array([[1.0, 8.0], [1.2, 6.0]]),
+        "chosen": 1,
+        "is_whole": True,
+        "parameters": ("mass", "damping"),
+        "units": ("kg", "N s/m"),
+        "theta": np.array([[83.0, 10.0], [94.0, 11.0]]),
+        "half_widths": np.array([[1.0, 2.0], [2.0, 2.0]]),
+        "is_apart": np.array([[True, False], [False, False]]),
+        **changes,
+    }
+    return HorizonStudy(**values)  # type: ignore[arg-type]
+
+
+def test_nothing_is_compared_where_the_model_explains_the_recordings() -> None:
+    found = mjfim.identify(stated(), recorded(0.0, 2))
+    assert not found.misfit
+    assert found.horizons is None
+    assert all(len(begins) == 1 for begins in found.segments)
+
+
+@pytest.mark.slow
+def test_lengths_are_compared_where_the_model_lacks_a_term(tmp_path: Path) -> None:
+    logs = recorded(0.6, 3)
+    found = mjfim.identify(stated(), logs)
+    assert found.misfit
+    study = found.horizons
+    assert study is not None
+    assert study.errors.shape == (len(study.lengths), len(study.lengths))
+    assert (np.diff(study.lengths) > 0.0).all()
+    assert study.lengths[-1] == pytest.approx(3.0)
+
+    # What friction does adds up, so that no fit predicts a long time as well as a short one.
+    assert (study.errors[:, -1] > 1.2 * study.errors[:, 0]).all()
+    assert "adds up with time" in study.about_growth
+
+    # The interval holds the estimates of other lengths that chance does not explain.
+    for i, j in zip(*np.nonzero(study.is_apart), strict=True):
+        low, high = found.interval[j]
+        assert low <= study.theta[i, j] <= high
+
+    # A stated length is not questioned, and is that of the segments.
+    for segments, count in (("whole", 1), (1.0, 3)):
+        again = mjfim.identify(stated(segments=segments), logs)
+        assert again.horizons is None
+        assert [len(begins) for begins in again.segments] == [count] * 3
+
+    found.save(tmp_path)
+    loaded = mjfim.Estimate.load(tmp_path).horizons
+    assert loaded is not None
+    np.testing.assert_array_equal(loaded.errors, study.errors)
+    assert str(loaded) == str(study)
+
+
+def losses(values: list[float]) -> HeldOutLosses:
+    """Losses of twenty blocks of one value each."""
+    return HeldOutLosses(
+        losses=np.array(values),
+        counts=np.ones(len(values)),
+        parts=np.arange(len(values)),
+        estimates=np.zeros((1, 1)),
+    )
+
+
+def test_the_longest_length_is_chosen_unless_it_predicts_clearly_worse() -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.random(20)
+    best, same, worse = noise + 1.0, noise + 1.0 + rng.normal(0.0, 0.05, 20), noise + 1.5
+    assert _chosen([losses(each.tolist()) for each in (best, same, best)]) == 2
+    assert _chosen([losses(each.tolist()) for each in (best, same, worse)]) == 1
+    assert _chosen([losses(each.tolist()) for each in (best, worse, worse)]) == 0
+
+    # A difference of half a percent is clear here, but not relevant.
+    assert _chosen([losses(each.tolist()) for each in (best, 1.005 * best)]) == 1
+
+
+def test_a_dependence_on_the_length_is_a_finding_that_the_interval_covers() -> None:
+    study = made_study()
+    assert study.dependent == ("mass",)
+    (finding,) = study.findings
+    assert finding.startswith(
+        "mass depends on the length: 83 kg with segments of 0.5 s and 94 kg with whole recordings"
+    )
+    assert "whole recordings were chosen" in study.about_choice
+    assert "adds up with time" in study.about_growth
+    interval = study.widened(np.array([[92.0, 96.0], [9.0, 13.0]]))
+    np.testing.assert_array_equal(interval, [[83.0, 96.0], [9.0, 13.0]])
+
+    # Without a dependence, nothing is widened and nothing is found.
+    plain = made_study(is_apart=np.zeros((2, 2), dtype=bool))
+    assert plain.findings == ()
+    np.testing.assert_array_equal(plain.widened(interval), interval)
+
+
+def test_an_error_that_does_not_grow_is_not_said_to_add_up() -> None:
+    flat = made_study(errors=np.array([[3.0, 3.2], [3.1, 3.3]]))
+    assert "does not add up" in flat.about_growth
