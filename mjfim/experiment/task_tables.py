@@ -394,6 +394,13 @@ class FitSpec(Section):
             "fit predicts left-out data best."
         ),
     )
+    hold: tuple[str, ...] = Field(
+        default=(),
+        description=(
+            "Names of parameters that keep their guess, because the recordings hardly determine "
+            "them."
+        ),
+    )
     start: Literal["stated", "measured"] = Field(
         default="stated",
         description=(

@@ -117,7 +117,11 @@ class FitProblem:
             raise RecordingError("the recordings contain no measured value after t = 0")
 
         layout = UnknownLayout.of(
-            parameters, len(aligned), free_starts=free_starts, bounded=not data_only
+            parameters,
+            len(aligned),
+            free_starts=free_starts,
+            bounded=not data_only,
+            held=settings.hold,
         )
         simulation = SegmentSimulation(
             system=system,

@@ -456,7 +456,8 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
     """
     for part in _parts_that_determine(problem):
         J, change = _stacked_sensitivity(task, part, with_error=False)
-        if has_weak_column(J, task.system.parameters.magnitude):
+        free = ~np.isin(task.system.parameters.names, task.settings.hold)
+        if has_weak_column(J[:, free], task.system.parameters.magnitude[free]):
             continue
         quick = _null_space(task, J, change)
         if not quick.count and quick.smallest > CLEAR_SINGULAR_VALUE:
@@ -495,14 +496,22 @@ def _stacked_sensitivity(
 
 
 def _null_space(task: FitTask, J: Array, change: Array) -> NullSpace:
-    """Directions of theta without effect on (n, p) rows, whose error is `change`."""
+    """Directions of theta without effect on (n, p) rows, whose error is `change`.
+
+    Parameters that are held are in none of them.
+    """
     parameters = task.system.parameters
-    count = len(parameters)
-    return find_null_space(
-        J,
-        change,
-        parameters.magnitude,
-        parameters.scale,
+    free = np.flatnonzero(~np.isin(parameters.names, task.settings.hold))
+    count = len(free)
+    found = find_null_space(
+        J[:, free],
+        change[:, free],
+        parameters.magnitude[free],
+        parameters.scale[free],
         np.arange(count),
         np.zeros((count, count)),
     )
+    directions = np.zeros((len(parameters), found.count))
+    directions[free] = found.directions
+    silent = tuple(free[list(found.silent)].tolist())
+    return replace(found, directions=directions, silent=silent)

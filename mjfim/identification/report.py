@@ -12,7 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget
-from mjfim.errors import listed
+from mjfim.errors import first_ones, listed
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.identification.accuracy import Accuracy, accuracy_of
@@ -52,6 +52,9 @@ IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
 # at the bound.
 BOUND_TOLERANCE = 1e-6
 
+
+# Largest number of poorly known parameters that have a warning each.
+MAX_SEPARATE_WARNINGS = 4
 
 # A recording is remarked on if at least this share of the changes of its control lies inside
 # engine steps of the model.
@@ -159,7 +162,7 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
         result.null_space,
         quality.correlation_rows(problem.row_count),
     )
-    at_bound, outside = _at_bounds(task.system.parameters, result.theta)
+    at_bound, outside = _at_bounds(task.system.parameters, result.theta, task.settings.hold)
 
     findings = _Findings(
         result=result,
@@ -246,8 +249,13 @@ def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
     )
 
 
-def _at_bounds(parameters: ParameterSet, theta: Array) -> tuple[tuple[str, ...], bool]:
-    """Names of the parameters at a bound or beyond it, and whether any is beyond."""
+def _at_bounds(
+    parameters: ParameterSet, theta: Array, held: Sequence[str]
+) -> tuple[tuple[str, ...], bool]:
+    """Names of the parameters at a bound or beyond it, and whether any is beyond.
+
+    Those that are held are where the user wants them.
+    """
     tolerance = BOUND_TOLERANCE * parameters.magnitude
     below = theta < parameters.lower - tolerance
     above = theta > parameters.upper + tolerance
@@ -255,7 +263,7 @@ def _at_bounds(parameters: ParameterSet, theta: Array) -> tuple[tuple[str, ...],
     distance_below = theta - parameters.lower
     distance_above = parameters.upper - theta
     at_bound = np.flatnonzero(np.minimum(distance_below, distance_above) < tolerance)
-    names = tuple(parameters.names[j] for j in at_bound)
+    names = tuple(parameters.names[j] for j in at_bound if parameters.names[j] not in held)
     return names, bool((below | above).any())
 
 
@@ -319,6 +327,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         sizes=parameters.sizes(result.theta),
         restart=result.restart,
         horizons=result.horizons,
+        held=result.task.settings.hold,
     )
 
 
@@ -393,14 +402,37 @@ def _warnings(findings: _Findings) -> Iterator[str]:
         yield f"the model may lack {term}"
 
     yield from _implausible_estimates(result.task.system.parameters, result.theta)
-    for name, remark in findings.accuracy.poorly_known:
-        yield f"sloppy: {name} {remark}"
+    yield from _warnings_of_poorly_known(findings.accuracy.poorly_known)
+    yield from _warnings_of_data(findings)
 
+
+def _warnings_of_poorly_known(found: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """Warnings about parameters that are poorly known: a sentence each, or one about many."""
+    if len(found) <= MAX_SEPARATE_WARNINGS:
+        for name, remark in found:
+            yield f"sloppy: {name} {remark}"
+        return
+
+    name, remark = found[0]
+    yield (
+        f"sloppy: {len(found)} parameters are poorly known: {listed([name for name, _ in found])}. "
+        f"For example, {name} {remark}. More varied motions, priors, or `--select`, which pools or "
+        "holds such parameters, may help"
+    )
+
+
+def _warnings_of_data(findings: _Findings) -> Iterator[str]:
+    """Remarks about poor data, each with the recordings for which it holds."""
+    result = findings.result
     channels = result.task.system.channels
-    data = zip(result.task.recordings, findings.quality.predicted, strict=True)
-    for recording, predicted in data:
+    names: dict[str, list[str]] = {}
+    for recording, predicted in zip(
+        result.task.recordings, findings.quality.predicted, strict=True
+    ):
         for remark in plausibility_remarks(channels, recording, predicted):
-            yield f"poor data in {Path(recording.name).name}: {remark}"
+            names.setdefault(remark, []).append(Path(recording.name).name)
+    for remark, recordings in names.items():
+        yield f"poor data in {first_ones(recordings)}: {remark}"
 
 
 def _warnings_of_rate(result: FitResult) -> Iterator[str]:

@@ -115,6 +115,7 @@ class FitTask:
                 "outputs; remove `correlated`"
             )
 
+        _require_held(system, settings.hold)
         refuse_same_data(recordings, held_out)
         require_memory_for_recordings(system, [*recordings, *held_out], fit=True)
         return cls(
@@ -147,6 +148,28 @@ class FitTask:
             RecordingError: A recording cannot be used.
         """
         return FitProblem.of(self.system, self.held_out) if self.held_out else None
+
+
+def _require_held(system: System, names: Sequence[str]) -> None:
+    """Raise ExperimentError where a parameter that is to be held cannot be.
+
+    A parameter with a value for each recording, or a deviation of the initial state, is not held.
+    """
+    parameters = system.parameters
+    source = system.experiment.source
+    for name in names:
+        if name not in parameters.names:
+            raise ExperimentError(
+                f"{source}: fit.hold: {unknown('parameter', name, parameters.names)}"
+            )
+        if parameters.recording_specific[parameters.names.index(name)]:
+            raise ExperimentError(
+                f"{source}: fit.hold: {name} differs from recording to recording; remove it from "
+                "the table of nuisance parameters instead"
+            )
+
+    if len(set(names)) == len(parameters):
+        raise ExperimentError(f"{source}: fit.hold: all parameters are held; leave one out")
 
 
 def _start(system: System, method: Method, start: Array | None) -> Array:

@@ -7,6 +7,7 @@ unknowns of the segments.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,7 +45,12 @@ class UnknownLayout:
 
     @staticmethod
     def of(
-        parameters: ParameterSet, recordings: int, *, free_starts: bool, bounded: bool
+        parameters: ParameterSet,
+        recordings: int,
+        *,
+        free_starts: bool,
+        bounded: bool,
+        held: Collection[str] = (),
     ) -> UnknownLayout:
         """The layout of the unknowns of a fit.
 
@@ -53,12 +59,14 @@ class UnknownLayout:
             recordings: Number of recordings.
             free_starts: Whether initial states are measured and then free.
             bounded: Whether the parameters have bounds.
+            held: Names of parameters that are no unknowns.
 
         Returns:
             The layout.
         """
         is_per_recording = parameters.recording_specific & ~parameters.initial_deviations
-        shared = np.flatnonzero(~parameters.recording_specific)
+        is_held = np.isin(parameters.names, list(held))
+        shared = np.flatnonzero(~parameters.recording_specific & ~is_held)
         per_recording = np.flatnonzero(is_per_recording)
 
         columns = np.concatenate([shared, np.tile(per_recording, recordings)])

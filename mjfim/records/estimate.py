@@ -87,6 +87,7 @@ class Estimate(ShownRecord):
             whole vector or tensor of an entry [theta-unit].
         selection: How the model was extended by terms that it lacked; None where that was not
             asked for.
+        held: Names of the parameters that kept their guess, whose standard deviation is 0.
         horizons: Lengths of segments that were compared, because the model does not explain whole
             recordings; None where they were not.
     """
@@ -135,6 +136,7 @@ class Estimate(ShownRecord):
     sizes: Array = field(default_factory=lambda: np.zeros(0))
     selection: Selection | None = None
     horizons: HorizonStudy | None = None
+    held: tuple[str, ...] = ()
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -235,6 +237,7 @@ class Estimate(ShownRecord):
             "combinations": list(self.combinations),
             "restart": None if self.restart is None else self.restart.summary(),
             "selection": None if self.selection is None else self.selection.summary(),
+            "held": list(self.held),
             "horizons": None if self.horizons is None else self.horizons.summary(),
         }
 

@@ -111,7 +111,9 @@ def _estimate_table(estimate: Estimate) -> SummaryTable:
     for j, name in enumerate(estimate.parameters):
         low, high = estimate.interval[j]
         uncertainty: tuple[Cell, ...] = (NOT_ALONE, "-", "-", "-")
-        if np.isfinite(estimate.std[j]):
+        if name in estimate.held:
+            uncertainty = ("held", "-", "-", "-")
+        elif np.isfinite(estimate.std[j]):
             uncertainty = (
                 Quantity(value=float(estimate.std[j]), digits=2),
                 Quantity(value=float(0.25 * (high - low)), digits=2),

@@ -1,0 +1,63 @@
+"""Parameters that keep their guess: `fit.hold`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
+from mjfim.output.presentation import describe
+from mjfim.output.report.build import page_of
+from tests.support.paths import ROOT
+
+
+def stated(hold: tuple[str, ...]) -> mjfim.Experiment:
+    """The cart-pendulum, one parameter of which is held at its true value."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    return base.replace(
+        horizon=2.0, parameters={"c": {"guess": 1.0}}, fit={"bootstrap": 0, "hold": hold}
+    )
+
+
+def test_a_held_parameter_keeps_its_guess_and_the_others_are_fitted(tmp_path: Path) -> None:
+    task = DesignTask.resolve(stated(("c",)), threads=1)
+    recording = simulate_system(task.system, task.initial, 0)
+    found = identify_system(task.system, [recording])
+    free = mjfim.identify(stated(()), [recording], threads=1)
+    assert found.success
+    assert found.held == ("c",)
+    j = found.parameters.index("c")
+    assert found.theta[j] == 1.0
+    assert found.std[j] == 0.0
+    assert (found.interval[j] == 1.0).all()
+
+    # What is known about one parameter makes the others more accurate, and does not bias them.
+    others = [k for k in range(3) if k != j]
+    assert (found.std[others] < free.std[others]).all()
+    true = task.parameters.true
+    assert (np.abs(found.theta - true)[others] < 4.0 * found.std[others]).all()
+
+    # The summary and the report say so, and the record is saved.
+    assert "held" in describe(found).table("estimates").rows[j].cells
+    found.save(tmp_path)
+    assert mjfim.Estimate.load(tmp_path).held == ("c",)
+    assert page_of(found).sections
+
+
+@pytest.mark.parametrize(
+    ("hold", "message"),
+    [
+        (("d",), r"fit\.hold: unknown parameter 'd'"),
+        (("m", "l", "c"), r"fit\.hold: all parameters are held"),
+    ],
+)
+def test_what_cannot_be_held_is_refused(hold: tuple[str, ...], message: str) -> None:
+    task = DesignTask.resolve(stated(()), threads=1)
+    recording = simulate_system(task.system, task.initial, 0)
+    with pytest.raises(mjfim.MjfimError, match=message):
+        mjfim.identify(stated(hold), [recording], threads=1)
