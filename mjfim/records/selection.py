@@ -14,6 +14,9 @@ class Decision(Enum):
     ADDED = "added"
     REJECTED = "rejected"
     REMOVED = "removed"
+    POOLED = "pooled"
+    HELD = "held"
+    KEPT = "kept apart"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +43,23 @@ class SelectedTerm:
     def table(self) -> dict[str, object]:
         """The table of the parameter in an experiment file."""
         return {"target": self.path, "scale": self.scale}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PooledParameter:
+    """One parameter in place of several that the recordings hardly determine.
+
+    Attributes:
+        name: Name of the parameter.
+        members: Names of the parameters in whose place it is.
+        scales: Value of each member over that of the parameter.
+        table: The table of the parameter in an experiment file.
+    """
+
+    name: str
+    members: tuple[str, ...]
+    scales: tuple[float, ...]
+    table: dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
