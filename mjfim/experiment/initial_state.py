@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -11,6 +13,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.system_tables import Initial
 from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.terms.extension import StateLayout
 
 # A quaternion whose norm is below this number states no rotation.
 NO_ROTATION = 1e-6
@@ -40,15 +43,17 @@ def keyframe(model: Any, key: str, name: str | None) -> Any:
     return model.key(name)
 
 
-def initial_state(stated: Initial, model: Any, key: Any) -> Array:
+def initial_state(stated: Initial, model: Any, key: Any, layout: StateLayout | None) -> Array:
     """The state in which an experiment starts.
 
-    It is that of a keyframe, the stated numbers, or the reference state of the model.
+    It is that of a keyframe, the stated numbers, or the reference state of the model. Numbers may
+    be stated for the MJCF alone: coordinates that physical terms add are then at rest.
 
     Args:
         stated: The table `[initial]` of the experiment.
         model: MjModel.
         key: The keyframe that the table names, or None.
+        layout: Where the state of the MJCF is in that of the model; None without terms.
 
     Returns:
         (ns,) state (qpos, qvel, act) with unit quaternions.
@@ -56,24 +61,68 @@ def initial_state(stated: Initial, model: Any, key: Any) -> Array:
     Raises:
         ExperimentError: Stated numbers have the wrong length, or a quaternion is zero.
     """
-    parts = {"qpos": model.qpos0, "qvel": np.zeros(model.nv), "act": np.zeros(model.na)}
     if key is not None:
-        parts = {"qpos": key.qpos, "qvel": key.qvel, "act": key.act}
+        qpos, qvel, act = np.array(key.qpos), np.array(key.qvel), np.array(key.act)
+    else:
+        sizes = _Sizes(model, layout)
+        qpos = sizes.positions(stated.qpos)
+        qvel = sizes.velocities(stated.qvel)
+        act = sizes.activations(stated.act, qpos)
 
-    tables = {"qpos": stated.qpos, "qvel": stated.qvel, "act": stated.act}
-    for name, numbers in tables.items():
-        if numbers is None:
-            continue
-        if len(numbers) != len(parts[name]):
-            raise ExperimentError(
-                f"initial.{name}: {len(numbers)} numbers; this model needs {len(parts[name])}"
-            )
-        parts[name] = np.asarray(numbers, dtype=np.float64)
-
-    qpos = np.array(parts["qpos"], dtype=np.float64)
     _require_rotations(model, qpos)
     mujoco.mj_normalizeQuat(model, qpos)
-    return np.concatenate([qpos, parts["qvel"], parts["act"]])
+    return np.concatenate([qpos, qvel, act])
+
+
+@dataclass(frozen=True, eq=False)
+class _Sizes:
+    """Sizes of the stated parts of a state: those of the model, or of the MJCF without terms.
+
+    Attributes:
+        model: MjModel.
+        layout: Where the state of the MJCF is in that of the model; None without terms.
+    """
+
+    model: Any
+    layout: StateLayout | None
+
+    def positions(self, stated: Sequence[float] | None) -> Array:
+        """(nq,) positions."""
+        if stated is None:
+            return np.array(self.model.qpos0, dtype=np.float64)
+        numbers = np.array(stated, dtype=np.float64)
+        if self.layout is not None and len(numbers) == len(self.layout.qpos):
+            return self.layout.positions(numbers)
+        return self._whole("qpos", numbers, self.model.nq)
+
+    def velocities(self, stated: Sequence[float] | None) -> Array:
+        """(nv,) velocities."""
+        if stated is None:
+            return np.zeros(self.model.nv)
+        numbers = np.array(stated, dtype=np.float64)
+        if self.layout is not None and len(numbers) == len(self.layout.qvel):
+            return self.layout.velocities(numbers)
+        return self._whole("qvel", numbers, self.model.nv)
+
+    def activations(self, stated: Sequence[float] | None, qpos: Array) -> Array:
+        """(na,) activations at the positions qpos: (nq,)."""
+        if self.layout is None:
+            numbers = np.zeros(self.model.na) if stated is None else np.array(stated)
+            return self._whole("act", numbers, self.model.na)
+
+        count = len(self.layout.act)
+        numbers = np.zeros(count) if stated is None else np.array(stated)
+        if len(numbers) == count:
+            return self.layout.activations(numbers, qpos, None)
+        return self._whole("act", numbers, self.model.na)
+
+    def _whole(self, name: str, numbers: Array, count: int) -> Array:
+        """The numbers, of which there must be as many as the model has; ExperimentError if not."""
+        if len(numbers) != count:
+            raise ExperimentError(
+                f"initial.{name}: {len(numbers)} numbers; this model needs {count}"
+            )
+        return np.asarray(numbers, dtype=np.float64)
 
 
 def _require_rotations(model: Any, qpos: Array) -> None:

@@ -6,23 +6,24 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system_tables import Nuisance, ParameterSpec
+from mjfim.experiment.system_tables import Nuisance, ParameterSpec, TargetSpec
 from mjfim.model.coordinates import output_label, split_unit, unknown_coordinate
 from mjfim.model.elements import identifier, names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameters import Parameter, ParameterSet, Target
-from mjfim.model.paths import resolve, unit_of
+from mjfim.model.paths import ParameterPath, resolve, term_quantity, unit_of
 from mjfim.model.physical_bounds import physical_bounds
 from mjfim.model.targets import (
     InertiaField,
     InitialStateField,
     OutputBiasField,
     OutputDelayField,
-    TargetField,
 )
 from mjfim.model.variants import MocapPlacement
 
@@ -52,8 +53,11 @@ class MeasurementSizes:
     period: float
     sigma: Array
 
-    def magnitude(self, field: TargetField, model: Any) -> float:
-        """Size with which a change of a field is compared [unit of the field]."""
+    def magnitude(self, target: Target, model: Any) -> float:
+        """Size with which a change of a target is compared [unit of the target]."""
+        field = target.field
+        if target.term is not None:
+            return target.term.size
         if isinstance(field, OutputBiasField):
             return float(self.sigma[field.output])
         if isinstance(field, OutputDelayField):
@@ -104,7 +108,7 @@ def resolve_parameters(
         raise ExperimentError(
             "parameters: all are nuisance parameters; at least one must be of interest"
         )
-    return ParameterSet.build(resolved, source.model, mocap)
+    return ParameterSet.build(resolved, source.model, mocap, source.terms.values())
 
 
 def _single_parameter(
@@ -124,26 +128,18 @@ def _single_parameter(
     unit = spec.unit
 
     try:
-        targets = tuple(
-            Target(
-                path=stated.path,
-                field=resolve(model, stated.path, outputs, source.decoration),
-                scale=stated.scale,
-                offset=stated.offset,
-            )
-            for stated in spec.all_targets
-        )
+        targets = tuple(_target(stated, source, outputs) for stated in spec.all_targets)
         if targets:
             first = targets[0]
             if guess is None:
                 guess = (first.field.read(model) - first.offset) / first.scale
-            magnitude = sizes.magnitude(first.field, model) / abs(first.scale)
+            magnitude = sizes.magnitude(first, model) / abs(first.scale)
     except ExperimentError as error:
         raise ExperimentError(f"parameters.{name}: {error}") from None
 
     # A parameter whose factor is not 1 may have another unit than its target.
     if targets and not unit and targets[0].scale == 1.0:
-        unit = unit_of(model, targets[0].path)
+        unit = unit_of(model, targets[0].path, source.terms)
 
     if guess is None:
         raise ExperimentError(f"parameters.{name}.guess: a function needs a guess")
@@ -152,8 +148,9 @@ def _single_parameter(
     for key, value in (("guess", guess), ("true", spec.true)):
         if spec.bounds is None and value is not None and not bounds[0] <= value <= bounds[1]:
             raise ExperimentError(
-                f"parameters.{name}.{key}: {value:g} makes {targets[0].path} negative, which "
-                "is not physical; state another value, or `bounds` that contain it"
+                f"parameters.{name}.{key}: {value:g} makes {targets[0].path} "
+                f"{_fault_beyond(bounds)}, which is not physical; state another value, or "
+                "`bounds` that contain it"
             )
     if not bounds[0] <= guess <= bounds[1]:
         raise ExperimentError(
@@ -177,6 +174,24 @@ def _single_parameter(
         wanted=spec.wanted,
         per_recording=spec.per_recording,
     )
+
+
+def _target(stated: TargetSpec, source: ModelSource, outputs: Sequence[str]) -> Target:
+    """A number that a parameter sets."""
+    path = ParameterPath.parse(stated.path)
+    return Target(
+        path=stated.path,
+        field=resolve(source.model, stated.path, outputs, source.decoration, source.terms),
+        scale=stated.scale,
+        offset=stated.offset,
+        term=term_quantity(path, source.terms) if path.kind == "term" else None,
+    )
+
+
+def _fault_beyond(bounds: tuple[float, float]) -> str:
+    """What is wrong with a value beyond the physical bounds of a parameter."""
+    is_sign = 0.0 in bounds and np.isinf(bounds).any()
+    return "negative" if is_sign else f"leave its range {list(bounds)}"
 
 
 def _scale(name: str, spec: ParameterSpec, guess: float, magnitude: float) -> float:

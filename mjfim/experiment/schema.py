@@ -14,7 +14,14 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.experiment_file import read_tables
 from mjfim.experiment.messages import explain, valid_keys
-from mjfim.experiment.system_tables import Correlated, Initial, NoiseSpec, Nuisance, ParameterSpec
+from mjfim.experiment.system_tables import (
+    Correlated,
+    Initial,
+    NoiseSpec,
+    Nuisance,
+    ParameterSpec,
+    TermSpec,
+)
 from mjfim.experiment.task_tables import Boundary, Cost, Descent, FitSpec, Limits, Robust
 from mjfim.model.packed_files import PackedFiles
 from mjfim.recordings.spec import Hertz, PositiveWithUnit, RecordingSpec, Seconds, Section
@@ -59,6 +66,13 @@ class Experiment(Section):
     )
     initial: Initial = Field(
         default=Initial(), description="Initial state and initial control of the experiment."
+    )
+    terms: dict[str, TermSpec] = Field(
+        default_factory=dict,
+        description=(
+            "Physical terms that are added to the model, such as Stribeck friction of a joint or "
+            "the lag of an actuator, by name, one table each. Default: none."
+        ),
     )
     parameters: dict[str, ParameterSpec] = Field(
         min_length=1,

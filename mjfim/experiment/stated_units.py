@@ -119,7 +119,8 @@ def _numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumb
     yield from _noise_numbers(experiment, source)
     yield from _nuisance_numbers(experiment, source)
     for name, spec in experiment.parameters.items():
-        yield from _parameter_numbers(name, spec, source.model)
+        yield from _parameter_numbers(name, spec, source)
+    yield from _term_numbers(experiment, source)
 
     about = experiment.cost.control_about
     yield from _by_name("cost.control_about", about, _control_units(source))
@@ -173,12 +174,17 @@ def _flat(value: Any) -> Iterator[Any]:
 
 def _initial_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
     """Numbers of the table `initial`."""
-    model, stated = source.model, experiment.initial
+    stated = experiment.initial
     ranges = _joint_ranges(source)
 
-    # Addresses of velocities follow those of the positions.
-    for name, numbers, first in (("qpos", stated.qpos, 0), ("qvel", stated.qvel, model.nq)):
-        units = {c.address - first: (c.unit, c.name) for c in source.coordinates.state}
+    # Addresses of velocities follow those of the positions. Numbers may be stated for the MJCF
+    # alone, without the joints that physical terms add.
+    for name, numbers in (("qpos", stated.qpos), ("qvel", stated.qvel)):
+        size = {"qpos": "nq", "qvel": "nv"}[name]
+        is_plain = len(numbers or ()) == getattr(source.stated.model, size)
+        of = source.stated if is_plain else source
+        first = 0 if name == "qpos" else of.model.nq
+        units = {c.address - first: (c.unit, c.name) for c in of.coordinates.state}
         for i, value in enumerate(numbers or ()):
             unit, column = units.get(i, ("", ""))
             yield StatedNumber(
@@ -246,9 +252,19 @@ def _nuisance_numbers(experiment: Experiment, source: ModelSource) -> Iterator[S
     yield from _by_name("nuisance.bias", stated.bias, _output_units(source))
 
 
-def _parameter_numbers(name: str, spec: ParameterSpec, model: Any) -> Iterator[StatedNumber]:
+def _term_numbers(experiment: Experiment, source: ModelSource) -> Iterator[StatedNumber]:
+    """Numbers of the table `terms`."""
+    for name, spec in experiment.terms.items():
+        for field, value in spec.values.items():
+            unit = _unit_of_path(source, f"term/{name}:{field}")
+            yield StatedNumber(key=f"terms.{name}.values.{field}", value=value, units=(unit,))
+
+
+def _parameter_numbers(
+    name: str, spec: ParameterSpec, source: ModelSource
+) -> Iterator[StatedNumber]:
     """Numbers of one parameter."""
-    units = (_parameter_unit(spec, model),)
+    units = (_parameter_unit(spec, source),)
     low, high = spec.bounds or (None, None)
     values = {
         "guess": (spec.guess,),
@@ -264,16 +280,16 @@ def _parameter_numbers(name: str, spec: ParameterSpec, model: Any) -> Iterator[S
                 yield StatedNumber(key=f"parameters.{name}.{key}", value=value, units=units)
 
     for target in spec.targets:
-        unit = _unit_of_path(model, target.path)
+        unit = _unit_of_path(source, target.path)
         key = f"parameters.{name}.targets.offset"
         yield StatedNumber(key=key, value=target.offset, units=(unit,))
 
 
-def _parameter_unit(spec: ParameterSpec, model: Any) -> str:
+def _parameter_unit(spec: ParameterSpec, source: ModelSource) -> str:
     """Unit of a parameter; empty where it follows neither from its target nor from the file."""
     targets = spec.all_targets
     if targets and abs(targets[0].scale) == 1.0:
-        return _unit_of_path(model, targets[0].path)
+        return _unit_of_path(source, targets[0].path)
 
     # The parameter has a unit of its own; only numbers in SI units fit to what was converted.
     try:
@@ -283,10 +299,10 @@ def _parameter_unit(spec: ParameterSpec, model: Any) -> str:
     return spec.unit if is_si else ""
 
 
-def _unit_of_path(model: Any, path: str) -> str:
+def _unit_of_path(source: ModelSource, path: str) -> str:
     """Unit of the number that a path names; empty for a wrong path, which is refused elsewhere."""
     try:
-        return unit_of(model, path)
+        return unit_of(source.model, path, source.terms)
     except ExperimentError:
         return ""
 

@@ -22,6 +22,7 @@ from mjfim.experiment.packing import model_of
 from mjfim.experiment.parameters import MeasurementSizes, resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import require_units
+from mjfim.experiment.terms import terms_of
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.loading import ModelSource
@@ -43,7 +44,7 @@ class System:
 
     Attributes:
         experiment: The experiment as the user states it.
-        source: The user's model, parsed once.
+        source: The user's model, parsed once, with the terms of the experiment.
         stated_grid: The time grid that the experiment states.
         parameters: The p unknown parameters.
         outputs: The ny measured outputs.
@@ -78,7 +79,7 @@ class System:
         Args:
             experiment: The experiment as the user states it.
             threads: Threads for the engine; default: one per core.
-            source: The model of the experiment, if it is parsed already.
+            source: The model of the experiment, if it is parsed already, with or without its terms.
 
         Raises:
             ExperimentError: A name, a file or a number in the experiment is wrong; the message
@@ -99,6 +100,7 @@ class System:
         if source is None:
             source = model_of(experiment)
         _require_supported(source)
+        source = source.extended(terms_of(experiment, source.stated))
         require_units(experiment, source)
         model = source.model
 
@@ -114,7 +116,7 @@ class System:
             stride_of_key=strides,
         )
         key = keyframe(model, "initial.keyframe", experiment.initial.keyframe)
-        start = initial_state(experiment.initial, model, key)
+        start = initial_state(experiment.initial, model, key, source.layout)
         mocap = MocapPlacement.of(model, key)
         sigma = np.sqrt(np.diag(noise.covariance))
         sizes = MeasurementSizes(period=1.0 / experiment.rate, sigma=sigma)
@@ -294,7 +296,7 @@ class System:
 
     @property
     def model(self) -> Any:
-        """The user's compiled model (MjModel), untouched by parameters."""
+        """The user's compiled model with its terms (MjModel), untouched by parameters."""
         return self.source.model
 
     @property

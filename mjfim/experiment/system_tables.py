@@ -25,6 +25,17 @@ from mjfim.recordings.spec import (
 
 Matrix = tuple[tuple[Finite, ...], ...]
 
+# Kinds of physical terms, those of `mjfim.model.terms.library`.
+TermKind = Literal[
+    "stribeck",
+    "lugre",
+    "asymmetric_friction",
+    "back_emf",
+    "actuator_lag",
+    "tilt",
+    "payload",
+]
+
 # Largest number of harmonics of a multisine.
 MAX_HARMONICS = 10_000
 
@@ -124,6 +135,25 @@ class Initial(Section):
         if self.keyframe is not None and (self.qpos or self.qvel or self.act):
             raise ValueError("give either keyframe or qpos/qvel/act, not both")
         return self
+
+
+class TermSpec(Section):
+    """A physical term that is added to the model when it is loaded, see the library of terms."""
+
+    kind: TermKind = Field(description="Kind of the term, a name of the library of terms.")
+    joint: str | None = Field(default=None, description="Name of the joint on which it acts.")
+    actuator: str | None = Field(
+        default=None, description="Name of the actuator whose action it changes."
+    )
+    body: str | None = Field(default=None, description="Name of the body to which it is fixed.")
+    values: dict[str, FiniteWithUnit] = Field(
+        default_factory=dict,
+        description=(
+            "Values of its fields where no parameter sets them [unit of the field]. A parameter "
+            "names a field by the path `term/<name>:<field>`, and its guess defaults to this "
+            "value. Default: no effect, or the smallest one that the model can show."
+        ),
+    )
 
 
 class TargetSpec(Section):

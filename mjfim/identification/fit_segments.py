@@ -10,6 +10,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.identification.known_activations import KnownActivations
 from mjfim.identification.segments import (
     Segment,
     cut_into_segments,
@@ -62,11 +63,18 @@ def segments_of_fit(
         duration = min(float(recording.t[-1]) for recording in recordings)
         delay = _max_delay(parameters, duration)
         segments = cut_into_segments(system, recordings, length, delay)
-        return segments, np.eye(system.space.nx)
+        return segments, _free_directions(system)
 
     by_theta = parameters.initial_state_derivative(system.space.nx)
     directions = by_theta[:, parameters.initial_deviations]
     return whole_recordings(system, recordings), directions
+
+
+def _free_directions(system: System) -> Array:
+    """(nx, n) directions of a free initial state: all but the activations of physical terms."""
+    space = system.space
+    known = [2 * space.nv + address for address in KnownActivations.of(system).addresses]
+    return np.delete(np.eye(space.nx), known, axis=1)
 
 
 def _require_measured_starts(system: System) -> None:

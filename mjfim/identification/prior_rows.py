@@ -70,7 +70,8 @@ class PriorRows:
         # A weak prior on a free initial state, for components that no output determines.
         if layout.free_starts:
             rows = np.zeros((count, n, m))
-            sigma = FREE_START_SIGMA * system.plant.sizes.state
+            sizes = np.abs(self.simulation.start_directions).T @ system.plant.sizes.state
+            sigma = FREE_START_SIGMA * sizes
             rows[:, diagonal, diagonal] = 1.0 / sigma
             rows[:, :, -1] = at.private / sigma
             return rows

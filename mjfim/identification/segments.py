@@ -16,6 +16,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording
+from mjfim.identification.known_activations import KnownActivations
 from mjfim.plant.outputs import outputs_by_state
 
 # Number of measured rows before and after a time to which a polynomial is fitted, to find the state
@@ -183,8 +184,8 @@ def measured_initial_states(
     """States at some samples according to the measured values.
 
     Positions and velocities come from a polynomial fit to the rows nearby: a line for measured
-    velocities, a parabola for positions. Components that were not measured are those of the model
-    at the guess.
+    velocities, a parabola for positions. Activations of physical terms follow from the control and
+    the velocity. Other components that were not measured are those of the model at the guess.
 
     Args:
         system: System that was recorded.
@@ -195,7 +196,8 @@ def measured_initial_states(
         (n, ns) states.
     """
     space = system.space
-    states = _nominal_states(system, recording, begins)
+    known = KnownActivations.of(system)
+    states = _nominal_states(system, recording, begins, known)
     output_of = _measured_states(system, recording)
 
     quaternion_components = {a for q, _ in space.quaternions for a in range(q, q + 4)}
@@ -223,6 +225,9 @@ def measured_initial_states(
             if all(a in output_of for a in components):
                 nearest = _nearest_values(recording, [output_of[a] for a in components], t0)
                 states[k, q : q + 4] = nearest / np.linalg.norm(nearest)
+
+    _, qvel, act = space.split(states)
+    act[:, known.addresses] = known.at(recording, begins, qvel)
     return states
 
 
@@ -253,7 +258,9 @@ def _nearest_values(recording: AlignedRecording, columns: Sequence[int], t0: flo
     return np.asarray(recording.y[nearest, list(columns)])
 
 
-def _nominal_states(system: System, recording: AlignedRecording, begins: np.ndarray) -> Array:
+def _nominal_states(
+    system: System, recording: AlignedRecording, begins: np.ndarray, known: KnownActivations
+) -> Array:
     """(n, ns) states of the model at the guess, simulated from the stated initial state.
 
     Where the model diverges, all of them are the initial state.
@@ -263,7 +270,8 @@ def _nominal_states(system: System, recording: AlignedRecording, begins: np.ndar
 
     # No simulation is needed where the whole state is measured, or where all segments begin at the
     # first sample.
-    measured = set(_measured_states(system, recording))
+    first = system.space.nq + system.space.nv
+    measured = {*_measured_states(system, recording), *(first + a for a in known.addresses)}
     if measured.issuperset(range(len(start))) or not begins.any():
         return states
 

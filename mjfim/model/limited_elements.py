@@ -253,13 +253,15 @@ def _add_controls(
 
 
 def _add_actuators(found: LimitedElements, model: Any, time: float) -> None:
-    """Enter the forces of the actuators.
+    """Enter the forces of the actuators that have a control.
 
     The range of an actuator with several forces limits their norm.
     """
     sizes = actuator_force_sizes(model, time)
     forces = found.by_kind["force"]
     for i, name in enumerate(actuator_names(model)):
+        if not model.actuator_ctrlnum[i]:
+            continue
         first, count = int(model.actuator_outadr[i]), int(model.actuator_outnum[i])
         forces[name] = LimitedElement(
             index=first,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import mujoco
 
@@ -17,6 +18,8 @@ from mjfim.model.expanded_size import check_expanded_size
 from mjfim.model.finite_numbers import check_compiled_numbers, check_file_numbers
 from mjfim.model.model_files import files_of_model
 from mjfim.model.mujoco_log import collected_warnings, tell_once
+from mjfim.model.terms.extension import StateLayout, extended_spec
+from mjfim.model.terms.term import Term
 
 
 def load_spec(path: Path) -> Any:
@@ -147,8 +150,10 @@ class ModelSource:
 
     Attributes:
         path: The MJCF file.
-        spec: The parsed model (MjSpec), never changed.
-        model: The user's compiled model (MjModel), never changed.
+        spec: The parsed model with its terms (MjSpec), never changed.
+        model: The compiled model with its terms (MjModel), never changed.
+        terms: The physical terms by which the file is extended, by name.
+        layout: Where the state of the file is in that of the model; None without terms.
     """
 
     def __init__(self, path: Path, spec: Any = None, files: Any = None) -> None:
@@ -168,13 +173,62 @@ class ModelSource:
         self.spec = self._loaded(path, files) if spec is None else spec
         self.model = compile_spec(self.spec, path, tells=True, files=files)
         check_compiled_numbers(self.model, path)
+        self.terms: dict[str, Term] = {}
+        self.layout: StateLayout | None = None
         self._files = files
+
+        # The model without terms where this one has some, and its extensions that are in use. An
+        # extension refers to the stated model, which must not refer to it in turn.
+        self._stated: ModelSource | None = None
+        self._extended: WeakValueDictionary[tuple[Term, ...], ModelSource] = WeakValueDictionary()
 
         # Several threads of a worker process may use the same model. The edit of a spec may ask for
         # another compiled model.
         self._lock = threading.RLock()
         self._compiled: dict[frozenset[str] | None, Any] = {}
         self._edited: dict[tuple[frozenset[str] | None, bytes], Any] = {}
+
+    @property
+    def stated(self) -> ModelSource:
+        """The model of the file, without terms."""
+        return self if self._stated is None else self._stated
+
+    def extended(self, terms: Sequence[Term]) -> ModelSource:
+        """The model of the file with physical terms, compiled once as long as it is in use.
+
+        Args:
+            terms: The terms, resolved against `stated.model`.
+
+        Returns:
+            The extended model; `stated` without terms.
+
+        Raises:
+            ModelError: MuJoCo cannot compile the extended model.
+        """
+        stated, key = self.stated, tuple(terms)
+        if not key:
+            return stated
+
+        with stated._lock:
+            found = stated._extended.get(key)
+            if found is None:
+                found = stated._with_terms(key)
+                stated._extended[key] = found
+            return found
+
+    def _with_terms(self, terms: tuple[Term, ...]) -> ModelSource:
+        """This model with physical terms."""
+        spec, layout = extended_spec(
+            self.spec,
+            self.model,
+            terms,
+            lambda edited: compile_spec(edited, self.path, files=self._files),
+        )
+        source = ModelSource(self.path, spec, self._files)
+        source.terms = {term.name: term for term in terms}
+        source.layout = layout
+        source._stated = self
+        return source
 
     @staticmethod
     def _loaded(path: Path, files: Any) -> Any:

@@ -20,7 +20,7 @@ from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.spec_writer import write_element
-from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField
+from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TermField
 from mjfim.model.variants import PlantModel
 
 if TYPE_CHECKING:
@@ -169,6 +169,7 @@ class ParameterWriter:
         """
         p = self._parameters
         whole: dict[tuple[str, int], Array] = {}
+        terms = {term.name: term.values for term in p.whole_terms}
 
         for parameter, value in zip(p.parameters, theta, strict=True):
             for target in parameter.targets:
@@ -182,6 +183,12 @@ class ParameterWriter:
                 elif isinstance(field, RotationField):
                     key = (field.array, field.row)
                     whole.setdefault(key, np.zeros(3))[field.component] = number
+                elif isinstance(field, TermField):
+                    terms[field.term.name][field.field] = number
+
+        # A term may also depend on numbers that parameters have set just now.
+        for term in p.whole_terms:
+            term.write(model, terms[term.name])
         return whole
 
     def _write_orientation(self, model: Any, array: str, row: int, vector: Array) -> None:

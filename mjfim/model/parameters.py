@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -24,7 +24,9 @@ from mjfim.model.targets import (
     RotationField,
     SpecField,
     TargetField,
+    TermField,
 )
+from mjfim.model.terms.term import Term, TermQuantity
 from mjfim.model.variants import MocapPlacement
 
 # Fields of a body that change its inertial frame, so that the body must not be compiled as
@@ -55,12 +57,21 @@ class Target:
         field: The field that the path leads to.
         scale: Factor of the parameter.
         offset: Constant that is added [unit of the number].
+        term: Field of a physical term that the path names; None for other paths.
     """
 
     path: str
     field: TargetField
     scale: float = 1.0
     offset: float = 0.0
+    term: TermQuantity | None = None
+
+    @property
+    def plain_paths(self) -> tuple[str, ...]:
+        """Paths of the numbers of the model; those of a physical term are in its elements."""
+        if self.term is None:
+            return (self.path,)
+        return tuple(path for path, _ in self.term.numbers)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +119,7 @@ def moved_bodies(parameters: Sequence[Parameter]) -> set[str]:
     These bodies must not be compiled as "simple".
     """
     targets = [target for parameter in parameters for target in parameter.targets]
-    paths = [ParameterPath.parse(target.path) for target in targets]
+    paths = [ParameterPath.parse(text) for target in targets for text in target.plain_paths]
     return {
         path.name
         for path in paths
@@ -125,17 +136,20 @@ class ParameterSet:
         nominal: Values in the model of quantities that are written as a whole: (10,) coordinates of
             an inertia by (parametrisation, body), (4,) quaternions by (array, row).
         mocap: Where mocap bodies start; None where they start as compiled.
+        whole_terms: Physical terms of the model that are written as a whole.
     """
 
     parameters: tuple[Parameter, ...]
     nominal: dict[tuple[str, int], Array] = field(default_factory=dict)
     mocap: MocapPlacement | None = None
+    whole_terms: tuple[Term, ...] = ()
 
     @staticmethod
     def build(
         parameters: Sequence[Parameter],
         model: Any,
         mocap: MocapPlacement | None = None,
+        terms: Iterable[Term] = (),
     ) -> ParameterSet:
         """Check that parameters can be varied together, and read their nominal values.
 
@@ -143,6 +157,7 @@ class ParameterSet:
             parameters: The parameters, in the order of theta.
             model: The compiled model (`mujoco.MjModel`).
             mocap: Where mocap bodies start; None where they start as compiled.
+            terms: Physical terms by which the model is extended.
 
         Raises:
             ExperimentError: Two parameters contradict each other, or a keyframe contradicts one;
@@ -151,7 +166,8 @@ class ParameterSet:
         compatible = _in_one_parametrisation(parameters)
         _require_one_owner(compatible)
         _require_movable(compatible, model, mocap)
-        return ParameterSet(compatible, _nominal_values(compatible, model), mocap)
+        whole = tuple(term for term in terms if term.is_written_as_a_whole)
+        return ParameterSet(compatible, _nominal_values(compatible, model), mocap, whole)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -281,7 +297,7 @@ class ParameterSet:
     @cached_property
     def changes_model(self) -> np.ndarray:
         """(p,) True where a parameter changes the model."""
-        inside = (ModelField, InertiaField, RotationField, SpecField)
+        inside = (ModelField, InertiaField, RotationField, SpecField, TermField)
         return np.asarray(self._is_function | self._has_field(inside))
 
     @cached_property

@@ -6,8 +6,9 @@ The names of the fields are MuJoCo's.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import mujoco
@@ -32,7 +33,9 @@ from mjfim.model.targets import (
     RotationField,
     SpecField,
     TargetField,
+    TermField,
 )
+from mjfim.model.terms.term import Term, TermQuantity
 from mjfim.model.units import ANGLE, FIELD_UNITS, LENGTH, gain_unit, joint_field_unit
 
 # A parameter path: the kind, the name (absent for options and the delay), the field, and
@@ -107,7 +110,10 @@ INITIAL_STATE_FIELDS = ("qpos", "qvel", "act")
 OUTPUT_FIELDS = ("bias", "delay")
 
 # All kinds of paths.
-KINDS = (*MODEL_ARRAYS, "initial", "output")
+KINDS = (*MODEL_ARRAYS, "term", "initial", "output")
+
+# A model without terms.
+NO_TERMS: Mapping[str, Term] = MappingProxyType({})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +123,7 @@ class ParameterPath:
     Attributes:
         text: The path.
         kind: Kind of the element: `body`, `joint`, `actuator`, `geom`, `site`, `tendon`, `option`,
-            `initial`, `output`.
+            `term`, `initial`, `output`.
         name: Name of the element; empty where the path has none.
         field: Field of the element.
         index: Index of the component; None where the path has none.
@@ -186,7 +192,11 @@ def fields_of(kind: str) -> list[str]:
 
 
 def resolve(
-    model: Any, text: str, outputs: Sequence[str] = (), decoration: Collection[str] = frozenset()
+    model: Any,
+    text: str,
+    outputs: Sequence[str] = (),
+    decoration: Collection[str] = frozenset(),
+    terms: Mapping[str, Term] = NO_TERMS,
 ) -> TargetField:
     """The field that a parameter path leads to.
 
@@ -196,6 +206,7 @@ def resolve(
         outputs: Names of the measured columns, which `output/<name>:bias` may name.
         decoration: Names of geoms that neither collide nor give their body its inertia, whose place
             and size can be changed without a compile.
+        terms: Physical terms by which the model is extended, which `term/<name>:...` may name.
 
     Raises:
         ExperimentError: The path names nothing in the model; the message lists the valid kinds,
@@ -204,6 +215,8 @@ def resolve(
     path = ParameterPath.parse(text)
     if path.kind not in KINDS:
         raise path.error(unknown("kind", path.kind, KINDS))
+    if path.kind == "term":
+        return _term_field(model, path, terms)
     if path.field not in fields_of(path.kind):
         raise path.error(unknown(f"{path.kind} field", path.field, fields_of(path.kind)))
     if path.part and path.kind != "initial":
@@ -221,18 +234,21 @@ def resolve(
     return _element_field(model, path, decoration)
 
 
-def unit_of(model: Any, text: str) -> str:
+def unit_of(model: Any, text: str, terms: Mapping[str, Term] = NO_TERMS) -> str:
     """Unit of the number that a valid path names.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
         text: The path.
+        terms: Physical terms by which the model is extended.
 
     Returns:
         The unit; empty where the number has none, or where it is not evident from the model
         (entries of gains, tendons).
     """
     path = ParameterPath.parse(text)
+    if path.kind == "term":
+        return term_quantity(path, terms).unit
 
     if path.field in INERTIAL_FIELDS:
         parametrisation, first, _ = INERTIAL_FIELDS[path.field]
@@ -253,6 +269,43 @@ def unit_of(model: Any, text: str) -> str:
     if path.field in SERVO_FIELDS:
         return gain_unit(model, identifier(model, "actuator", path.name), path.field)
     return FIELD_UNITS.get(path.field, "")
+
+
+def term_quantity(path: ParameterPath, terms: Mapping[str, Term]) -> TermQuantity:
+    """The field of a physical term that a path names.
+
+    Args:
+        path: A path of the kind `term`.
+        terms: Physical terms by which the model is extended.
+
+    Raises:
+        ExperimentError: There is no such term, or it has no such field.
+    """
+    if path.name not in terms:
+        raise path.error(unknown("term", path.name, list(terms)))
+    if path.part or path.index is not None:
+        raise path.error("a field of a term is a single number; write it without an index")
+    try:
+        return terms[path.name].quantity(path.field)
+    except ExperimentError as error:
+        raise path.error(str(error)) from None
+
+
+def _term_field(model: Any, path: ParameterPath, terms: Mapping[str, Term]) -> TargetField:
+    """A field of a physical term: a number of the extended model, or one with the whole term."""
+    quantity, term = term_quantity(path, terms), terms[path.name]
+    if term.is_written_as_a_whole:
+        return TermField(term, path.field)
+
+    (first, factor), *others = quantity.numbers
+    field = resolve(model, first)
+    followers = []
+    for text, other_factor in others:
+        other = resolve(model, text)
+        assert isinstance(other, ModelField)
+        followers.append((other.array, other.rows[0], other.column or 0, other_factor))
+    assert isinstance(field, ModelField)
+    return replace(field, factor=factor * field.factor, followers=tuple(followers))
 
 
 def _option_field(model: Any, path: ParameterPath) -> ModelField:

@@ -20,7 +20,7 @@ NOT_NEGATIVE = {
 
 
 def physical_bounds(targets: Iterable[Target]) -> tuple[float, float]:
-    """Range of a parameter in which none of its targets is negative that cannot be.
+    """Range of a parameter in which all of its targets are physical.
 
     Args:
         targets: Numbers inside the model that the parameter sets, each to `scale * parameter +
@@ -31,19 +31,29 @@ def physical_bounds(targets: Iterable[Target]) -> tuple[float, float]:
     """
     low, high = -np.inf, np.inf
     for target in targets:
-        path = ParameterPath.parse(target.path)
-        if path.field not in NOT_NEGATIVE.get(path.kind, ()):
-            continue
-
-        # A coefficient of higher order may be negative while the whole force brakes: dry friction
-        # that decreases with the speed has one.
-        if path.kind == "joint" and path.component > 0:
-            continue
-
-        # The target is zero at this value of the parameter.
-        zero = -target.offset / target.scale + 0.0
-        if target.scale > 0.0:
-            low = max(low, zero)
-        else:
-            high = min(high, zero)
+        # Values of the parameter at which the target is at its bounds.
+        ends = [
+            (bound - target.offset) / target.scale + 0.0 if np.isfinite(bound) else bound
+            for bound in _bounds_of(target)
+        ]
+        if target.scale < 0.0:
+            infinite = [-end if np.isinf(end) else end for end in ends]
+            ends = infinite[::-1]
+        low, high = max(low, ends[0]), min(high, ends[1])
     return low, high
+
+
+def _bounds_of(target: Target) -> tuple[float, float]:
+    """Smallest and largest physical value of a target [unit of the number]."""
+    if target.term is not None:
+        return target.term.bounds
+
+    path = ParameterPath.parse(target.path)
+    if path.field not in NOT_NEGATIVE.get(path.kind, ()):
+        return -np.inf, np.inf
+
+    # A coefficient of higher order may be negative while the whole force brakes: dry friction that
+    # decreases with the speed has one.
+    if path.kind == "joint" and path.component > 0:
+        return -np.inf, np.inf
+    return 0.0, np.inf

@@ -16,6 +16,9 @@ from mjfim.arrays import Array
 # Share of its size by which a slow coordinate moves in one sample. Slower motions count as rest.
 LEAST_MOVE_PER_SAMPLE = 0.01
 
+# Column of the stiffness of a bristle in the dynamics of a `dcmotor`.
+BRISTLE_STIFFNESS_COLUMN = 5
+
 
 def model_length(model: Any) -> float:
     """Length of the largest moving tree of a model [m].
@@ -93,7 +96,8 @@ def control_sizes(model: Any, time: float) -> Array:
     for actuator in range(model.nactuator):
         control = int(model.actuator_ctrladr[actuator])
         count = int(model.actuator_ctrlnum[actuator])
-        sizes[control : control + count] = _control_size(model, actuator, control, time)
+        if count:
+            sizes[control : control + count] = _control_size(model, actuator, control, time)
     return sizes
 
 
@@ -132,6 +136,30 @@ def actuator_force_sizes(model: Any, time: float) -> Array:
     return sizes
 
 
+def bristle_sizes(model: Any, time: float) -> dict[int, float]:
+    """Natural deflections of the bristles of friction in `dcmotor` actuators without control.
+
+    A bristle bends under a natural force, or by the way of one engine step before it slides.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        time: Natural time of the motion [s].
+
+    Returns:
+        The larger of both deflections, by its address in the activations [m or rad].
+    """
+    dcmotor = int(mujoco.mjtDyn.mjDYN_DCMOTOR)
+    found = {}
+    for actuator in np.flatnonzero(model.actuator_dyntype == dcmotor).tolist():
+        stiffness = float(model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
+        has_control = bool(model.actuator_ctrlnum[actuator])
+        if stiffness > 0.0 and not has_control and int(model.actuator_actnum[actuator]) == 1:
+            under_force = _actuator_force_size(model, actuator, time) / stiffness
+            way = _transmission_size(model, actuator) / time * float(model.opt.timestep)
+            found[int(model.actuator_actadr[actuator])] = max(under_force, way)
+    return found
+
+
 def _control_size(model: Any, actuator: int, control: int, time: float) -> float:
     """Natural size of a control of one actuator, see `control_sizes`."""
     stated = _largest_finite(model.actuator_ctrlrange[control])
@@ -154,7 +182,7 @@ def _control_size(model: Any, actuator: int, control: int, time: float) -> float
 def _actuator_force_size(model: Any, actuator: int, time: float) -> float:
     """Natural size of the force of one actuator, see `actuator_force_sizes`."""
     stated = _largest_finite(model.actuator_forcerange[actuator])
-    if stated > 0.0:
+    if stated > 0.0 and model.actuator_ctrlnum[actuator]:
         return stated
 
     output = int(model.actuator_outadr[actuator])

@@ -6,6 +6,7 @@ A field is a number inside a model, of the initial state, or of the measurement:
 - `InertiaField`: one of the ten inertial parameters of a body;
 - `RotationField`: a component of the orientation of a body or site;
 - `SpecField`: a number of the MJCF from which the compiler derives others;
+- `TermField`: a field of a physical term on which several numbers depend;
 - `InitialStateField`: a deviation of the initial state;
 - `OutputBiasField`, `OutputDelayField`: the measurement itself.
 
@@ -25,6 +26,7 @@ from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, body_inertia
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, position_sizes
+from mjfim.model.terms.term import Term
 
 # Array of MjModel -> array that says whether the frame of the element coincides with that of its
 # body. MuJoCo skips the position of such elements, so the flag is cleared when the position is
@@ -219,6 +221,27 @@ class SpecField:
 
 
 @dataclass(frozen=True)
+class TermField:
+    """A field of a physical term, which is written together with its other fields.
+
+    Attributes:
+        term: The term.
+        field: Name of the field.
+    """
+
+    term: Term
+    field: str
+
+    def read(self, model: Any) -> float:
+        """Value where no parameter sets it; the model is not asked, which holds other numbers."""
+        return self.term.value(self.field)
+
+    def magnitude(self, model: Any) -> float:
+        """Natural size of the field."""
+        return self.term.quantity(self.field).size
+
+
+@dataclass(frozen=True)
 class InitialStateField(DeviationField):
     """Deviation of one component of the initial state.
 
@@ -260,6 +283,7 @@ TargetField = (
     | InertiaField
     | RotationField
     | SpecField
+    | TermField
     | InitialStateField
     | OutputBiasField
     | OutputDelayField

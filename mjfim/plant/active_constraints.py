@@ -50,7 +50,9 @@ def clamped_actuators(model: Any, data: Any) -> list[int]:
     Returns:
         Ids of the actuators.
     """
-    limited = np.flatnonzero(model.actuator_forcelimited).tolist()
+    # Passive devices have a force range that does not bound their friction.
+    driven = np.asarray(model.actuator_ctrlnum) > 0
+    limited = np.flatnonzero(driven & (np.asarray(model.actuator_forcelimited) > 0)).tolist()
     return [actuator for actuator in limited if _is_clamped(model, data, actuator)]
 
 

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, control_sizes, position_sizes, translations
+from mjfim.model.sizes import (
+    LEAST_MOVE_PER_SAMPLE,
+    bristle_sizes,
+    control_sizes,
+    position_sizes,
+    translations,
+)
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Trajectory
 
@@ -47,8 +53,11 @@ class StateSizes:
         """
         control = control_sizes(model, dt / LEAST_MOVE_PER_SAMPLE)
 
-        # An activation follows the first control of its actuator.
+        # An activation follows the first control of its actuator. The bristle of a dry friction is
+        # bent by a natural force.
         activation = np.ones(space.na)
+        for address, size in bristle_sizes(model, dt / LEAST_MOVE_PER_SAMPLE).items():
+            activation[address] = size
         for actuator in range(model.nactuator):
             first, count = (
                 int(model.actuator_actadr[actuator]),

@@ -84,8 +84,7 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
         if not _moves(u):
             continue
 
-        # The ranges are in the order of the controls only if every actuator has one control.
-        if model.nactuator == model.nu and model.actuator_ctrllimited[i]:
+        if model.actuator_ctrllimited[i]:
             yield from _range_remarks(name, u, model.actuator_ctrlrange[i])
 
         rough, correlation = _rough_share(u), _lag_one_correlation(u)

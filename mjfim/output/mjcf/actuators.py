@@ -45,6 +45,15 @@ SHORTCUTS: dict[str, dict[str, tuple[tuple[Entry, ...], ...]]] = {
         "area": ((("gainprm", 0, 1.0),),),
         "bias": tuple((("biasprm", i, 1.0),) for i in range(3)),
     },
+    "dcmotor": {
+        "resistance": ((("gainprm", 0, 1.0),),),
+        "motorconst": ((("gainprm", 1, 1.0),),),
+        "cogging": tuple((("biasprm", i, 1.0),) for i in range(3)),
+        "lugre": (
+            *((("dynprm", i, 1.0),) for i in (5, 6)),
+            *((("biasprm", i, 1.0),) for i in (3, 4, 5)),
+        ),
+    },
     "adhesion": {"gain": ((("gainprm", 0, 1.0),),)},
     "muscle": {
         "timeconst": tuple((("dynprm", i, 1.0),) for i in range(2)),

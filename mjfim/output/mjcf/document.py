@@ -6,9 +6,10 @@ of an included file stands in the place of its `<include>`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -79,17 +80,24 @@ class MjcfDocument:
             the first; elements of an included file have the parent of its `<include>`.
     """
 
-    def __init__(self, text: bytes, path: Path | None = None) -> None:
+    def __init__(
+        self,
+        text: bytes,
+        path: Path | None = None,
+        included: Mapping[Path, bytes] = MappingProxyType({}),
+    ) -> None:
         """Parse an MJCF, and the files that it includes.
 
         Args:
             text: The MJCF in UTF-8.
             path: Its file. Without it, the included files are not read.
+            included: Texts of included files that are not as on the disk, by their paths.
 
         Raises:
             ModelError: A text is no well-formed XML, or the main file is no MJCF. The message is a
                 clause, without the name of the file.
         """
+        self._included = included
         self.files: list[SourceFile] = []
         self.tags: list[Tag] = []
         self._places: list[tuple[XmlText, int]] = []
@@ -125,9 +133,18 @@ class MjcfDocument:
         if found is None or found.resolve() in known:
             return
         is_beside = not (main.parent / name).is_file()
-        text = XmlText(found.read_bytes())
+        content = self._included.get(found)
+        text = XmlText(found.read_bytes() if content is None else content)
         file = SourceFile(path=found, text=text, include=include, is_beside=is_beside)
         self._add(file, follows=True)
+
+    def edited(self) -> MjcfDocument:
+        """Parse the texts with all edits so far, which may then be edited further."""
+        included = {file.path: file.text.edited() for file in self.files[1:]}
+        document = MjcfDocument(self.files[MAIN].text.edited(), self.files[MAIN].path, included)
+        for before, after in zip(self.files, document.files, strict=True):
+            after.text.is_changed = before.text.is_edited
+        return document
 
     def tags_of(self, file: SourceFile) -> list[int]:
         """Indices of the start tags of one file.
@@ -182,6 +199,26 @@ class MjcfDocument:
         text, own = self._places[parent]
         text.insert_child(own, name, attributes)
 
+    def append_child(
+        self,
+        parent: int,
+        name: str,
+        attributes: dict[str, str],
+        children: Sequence[tuple[str, dict[str, str]]] = (),
+        comment: str = "",
+    ) -> None:
+        """Add an element as the last child of another one. See `XmlText.append_child`.
+
+        Args:
+            parent: Index of the tag of the enclosing element.
+            name: Name of the new element.
+            attributes: Values by name of the attribute.
+            children: Names and attributes of empty elements inside the new one.
+            comment: Comment above the new element; empty for none.
+        """
+        text, own = self._places[parent]
+        text.append_child(own, name, attributes, children, comment)
+
     def element(self, kind: str, name: str) -> int:
         """Find a named element.
 
@@ -212,6 +249,14 @@ class MjcfDocument:
             Indices of their start tags, in the order of the text.
         """
         return [i for i, tag in enumerate(self.tags) if tag.name == name and tag.parent == 0]
+
+    def is_in_main_file(self, tag: int) -> bool:
+        """Whether an element stands in the main file and not in an included one.
+
+        Args:
+            tag: Index of the tag.
+        """
+        return self._places[tag][0] is self.files[MAIN].text
 
     def written_numbers(self, tag: int, attribute: str) -> list[str]:
         """Return the numbers of an attribute in the spelling of the text.

@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ModelError
 from mjfim.model.elements import element_name
 from mjfim.model.parameters import ParameterSet, Target
-from mjfim.model.paths import MODEL_ARRAYS, POLYNOMIAL_ARRAYS, ParameterPath
+from mjfim.model.paths import MODEL_ARRAYS, POLYNOMIAL_ARRAYS, ParameterPath, resolve
 from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TargetField
 from mjfim.output.mjcf.actuators import ARRAYS, attribute_changes
 from mjfim.output.mjcf.document import MjcfDocument, all_digits, nearly_equal
@@ -92,20 +92,26 @@ class ParameterEdits:
                 raise ModelError(f"parameters.{parameter.name} is a Python function of the MjSpec")
 
             for target in parameter.targets:
-                kind, name, field = _parts(target)
-                as_matrix = isinstance(target.field, InertiaField)
+                for path, target_field in self._numbers_of(target):
+                    as_matrix = isinstance(target_field, InertiaField)
 
-                # All parameters of one body's inertia are written together.
-                if as_matrix or (kind == "body" and field in INERTIAL_FIELDS):
-                    bodies[name] = bodies.get(name, False) or as_matrix
-                else:
-                    written = target.scale * float(value) + target.offset
-                    self._write_field(kind, name, field, target.field, written)
+                    # All parameters of one body's inertia are written together.
+                    if as_matrix or (path.kind == "body" and path.field in INERTIAL_FIELDS):
+                        bodies[path.name] = bodies.get(path.name, False) or as_matrix
+                    else:
+                        written = target.scale * float(value) + target.offset
+                        self._write_field(path.kind, path.name, path.field, target_field, written)
 
         for name, as_matrix in bodies.items():
             write_inertial(self.document, name, self._old, self._wanted, as_matrix=as_matrix)
         if self._new_option:
             self.document.insert_child(0, "option", self._new_option)
+
+    def _numbers_of(self, target: Target) -> Iterator[tuple[ParameterPath, TargetField]]:
+        """The numbers of the model that a target determines, with their paths."""
+        for text in target.plain_paths:
+            path = ParameterPath.parse(text)
+            yield path, target.field if target.term is None else resolve(self._old, text)
 
     def write_derived(self, compiled: Any) -> list[str]:
         """State numbers that the compiler would derive from the changed ones with another result.
@@ -315,9 +321,3 @@ def _derived_rows(model: Any) -> Iterator[tuple[str, str, str, int, int]]:
             )
             for index, row in enumerate(rows):
                 yield kind, field, array, int(row), index
-
-
-def _parts(target: Target) -> tuple[str, str, str]:
-    """Return kind, name and field of a parameter's path."""
-    path = ParameterPath.parse(target.path)
-    return path.kind, path.name, path.field

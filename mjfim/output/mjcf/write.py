@@ -21,13 +21,14 @@ from mjfim.errors import ModelError, first_ones, listed
 from mjfim.experiment.system import System
 from mjfim.model.loading import compile_spec, load_written_model
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.paths import MODEL_ARRAYS
+from mjfim.model.paths import MODEL_ARRAYS, resolve
 from mjfim.model.spec_writer import state_derived_values, write_element
 from mjfim.model.variants import unconstrained
 from mjfim.output.mjcf.asset_paths import relocate_assets
 from mjfim.output.mjcf.document import MjcfDocument
 from mjfim.output.mjcf.edited_files import EditedFiles
 from mjfim.output.mjcf.edits import ParameterEdits
+from mjfim.output.mjcf.terms import with_terms
 
 # Prefixes of the arrays of MjModel that determine the motion.
 COMPARED = (
@@ -125,7 +126,7 @@ def _write_edited(path: Path, system: System, theta: Array, wanted: Any) -> list
     values.
     """
     source = system.model_path.resolve()
-    document = MjcfDocument(source.read_bytes(), source)
+    document = with_terms(MjcfDocument(source.read_bytes(), source), system.source)
     relocate_assets(document, system.source.spec, source.parent, path.resolve().parent)
 
     edits = ParameterEdits(document, system.source.spec, system.model, wanted)
@@ -272,4 +273,7 @@ def write_spec(
 
         for target in parameter.targets:
             written = target.scale * float(value) + target.offset
-            write_element(spec, compiled, wanted, target.path, written)
+            for path in target.plain_paths:
+                if target.term is not None:
+                    written = resolve(wanted, path).read(wanted)
+                write_element(spec, compiled, wanted, path, written)

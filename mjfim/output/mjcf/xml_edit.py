@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 from xml.parsers import expat
@@ -22,6 +23,9 @@ SPACE = re.compile(rb"\s*")
 
 # End of an element without content.
 EMPTY_END = re.compile(rb"\s*/>")
+
+# Indentation of a child.
+STEP = b"  "
 
 # Quotes inside a value, as entities, so that a value may stand in either kind of quotes.
 QUOTES = {'"': "&quot;", "'": "&apos;"}
@@ -52,6 +56,7 @@ class XmlText:
 
     Attributes:
         tags: All start tags in the order of the text; the root is the first.
+        is_changed: Whether the text differs from that of its file before any pending edit.
     """
 
     def __init__(self, text: bytes) -> None:
@@ -65,6 +70,7 @@ class XmlText:
                 The message is a clause that completes a sentence.
         """
         self._text = text
+        self.is_changed = False
         self.tags: list[Tag] = []
         self._end_tags: dict[int, int] = {}
         self._parse()
@@ -74,6 +80,7 @@ class XmlText:
         self._successors: dict[tuple[int, str], str] = {}
         self._names: dict[int, str] = {}
         self._children: dict[int, list[bytes]] = {}
+        self._last_children: dict[int, list[tuple[int, bytes]]] = {}
 
     def _parse(self) -> None:
         """Find all start tags, and the position of each element's end tag."""
@@ -107,8 +114,10 @@ class XmlText:
 
     @property
     def is_edited(self) -> bool:
-        """Whether the text has pending edits."""
-        return bool(self._values or self._names or self._children)
+        """Whether the text differs from that of its file, by pending edits or before them."""
+        return self.is_changed or bool(
+            self._values or self._names or self._children or self._last_children
+        )
 
     def attribute(self, tag: int, name: str) -> str | None:
         """Return the value of an attribute after the edits so far.
@@ -168,8 +177,35 @@ class XmlText:
             name: Name of the new element.
             attributes: Values by name of the attribute.
         """
-        written = b"".join(b" " + _attribute_text(key, value) for key, value in attributes.items())
-        self._children.setdefault(parent, []).append(b"<" + name.encode() + written + b"/>")
+        self._children.setdefault(parent, []).append(b"<%s/>" % _start_tag(name, attributes))
+
+    def append_child(
+        self,
+        parent: int,
+        name: str,
+        attributes: dict[str, str],
+        children: Sequence[tuple[str, dict[str, str]]] = (),
+        comment: str = "",
+    ) -> None:
+        """Add an element as the last child of another one.
+
+        It gets the indentation of the present last child.
+
+        Args:
+            parent: Index of the tag of the enclosing element.
+            name: Name of the new element.
+            attributes: Values by name of the attribute.
+            children: Names and attributes of empty elements inside the new one.
+            comment: Comment above the new element; empty for none.
+        """
+        lines = [(0, f"<!-- {comment} -->".encode())] if comment else []
+        if children:
+            lines.append((0, b"<%s>" % _start_tag(name, attributes)))
+            lines += [(1, b"<%s/>" % _start_tag(*child)) for child in children]
+            lines.append((0, b"</%s>" % name.encode()))
+        else:
+            lines.append((0, b"<%s/>" % _start_tag(name, attributes)))
+        self._last_children.setdefault(parent, []).extend(lines)
 
     def edited(self) -> bytes:
         """Return the text with all edits applied.
@@ -183,6 +219,8 @@ class XmlText:
         changes: list[TextChange] = []
         for tag in {*self._values, *self._names, *self._children}:
             changes += self._changes_of_tag(tag)
+        for tag in self._last_children:
+            changes.append(self._appended(tag))
 
         # From the end to the beginning, so that positions of later changes stay valid.
         text = self._text
@@ -259,6 +297,28 @@ class XmlText:
         inserted = b"".join(lead + child for child in self._children[tag])
         return [(content, content, inserted)]
 
+    def _appended(self, tag: int) -> TextChange:
+        """Return the insertion of last children before the end tag of an element."""
+        start, end = self.tags[tag].start, self._end_tags[tag]
+        if not self._text.startswith(b"</", end):
+            raise ModelError(f"the empty element <{self.tags[tag].name}/> would need content")
+
+        # The new lines are indented like the last child, or by two blanks more than the element.
+        children = [each for each in self.tags if each.parent == tag]
+        lead = self._lead(children[-1].start) if children else self._lead(start) + STEP
+        lines = [lead + STEP * depth + line for depth, line in self._last_children[tag]]
+        place = len(self._text[:end].rstrip())
+        closing = b"" if place < end else self._lead(start)
+        return place, place, b"".join(lines) + closing
+
+    def _lead(self, position: int) -> bytes:
+        """Return the line break and the white space before a position at the begin of a line."""
+        space = self._text[len(self._text[:position].rstrip()) : position]
+        line_break = max(space.rfind(b"\n"), 0)
+        if line_break > 0 and space[line_break - 1 : line_break] == b"\r":
+            line_break -= 1
+        return space[line_break:]
+
     def _last_line_break(self, position: int) -> bytes:
         """Return the line break and the indentation in the white space at a position."""
         found = SPACE.match(self._text, position)
@@ -273,6 +333,12 @@ class XmlText:
 def _escaped(value: str) -> bytes:
     """Return the bytes of an attribute's value between its quotes."""
     return escape(value, QUOTES).encode("utf-8", "surrogateescape")
+
+
+def _start_tag(name: str, attributes: dict[str, str]) -> bytes:
+    """Return the bytes between the brackets of a start tag."""
+    written = [b" " + _attribute_text(key, value) for key, value in attributes.items()]
+    return name.encode() + b"".join(written)
 
 
 def _attribute_text(name: str, value: str | None) -> bytes:

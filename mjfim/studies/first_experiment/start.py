@@ -300,7 +300,7 @@ def _driven_dofs(model: Any) -> list[int]:
     joints = {
         int(model.actuator_trnid[i, 0])
         for i in range(model.nactuator)
-        if mujoco.mjtTrn(int(model.actuator_trntype[i])) in AT_JOINT
+        if mujoco.mjtTrn(int(model.actuator_trntype[i])) in AT_JOINT and model.actuator_ctrlnum[i]
     }
     return [int(model.jnt_dofadr[j]) for j in sorted(joints) if joint_dofs(model, j) == 1]
 

@@ -1,0 +1,103 @@
+"""Activations of physical terms at the begin of a segment, which the recording shows.
+
+The lag of an actuator follows from the recorded control, and the bristle of a friction from the
+measured velocity. They are no unknowns of a segment: what remains of their error dies out within
+a few samples and acts like a small kick, which the free initial velocity contains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array
+from mjfim.experiment.system import System
+from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.model.servos import actuator_gear
+from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN
+from mjfim.model.terms.extension import FILTERS
+
+# Columns of the friction of a `dcmotor` in its bias: Coulomb, static, Stribeck speed.
+FRICTION_COLUMNS = slice(3, 6)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownActivations:
+    """Activations that physical terms have added to a model.
+
+    Attributes:
+        model: The model at the guess (`mujoco.MjModel`).
+        actuators: Actuators with such an activation, and its address among the activations.
+    """
+
+    model: Any
+    actuators: tuple[tuple[int, int], ...]
+
+    @staticmethod
+    def of(system: System) -> KnownActivations:
+        """Activations of the terms of a system."""
+        layout = system.source.layout
+        if layout is None:
+            return KnownActivations(model=system.model, actuators=())
+
+        model = system.plant.model(system.parameters.guess)
+        stated = set(layout.act.tolist())
+        found = [
+            (actuator, int(model.actuator_actadr[actuator]))
+            for actuator in np.flatnonzero(model.actuator_actnum).tolist()
+            if int(model.actuator_actadr[actuator]) not in stated
+        ]
+        return KnownActivations(model=model, actuators=tuple(found))
+
+    @property
+    def addresses(self) -> list[int]:
+        """Their addresses among the activations."""
+        return [address for _, address in self.actuators]
+
+    def at(self, recording: AlignedRecording, begins: np.ndarray, qvel: Array) -> Array:
+        """The activations at some samples of a recording.
+
+        Args:
+            recording: The recording.
+            begins: (n,) samples.
+            qvel: (n, nv) velocities at these samples [m/s or rad/s].
+
+        Returns:
+            (n, k) activations in the order of `addresses`.
+        """
+        columns = [
+            self._filtered(actuator, recording, begins)
+            if int(self.model.actuator_dyntype[actuator]) in FILTERS
+            else self._bent(actuator, qvel)
+            for actuator, _ in self.actuators
+        ]
+        return np.stack(columns, axis=1) if columns else np.zeros((len(begins), 0))
+
+    def _filtered(self, actuator: int, recording: AlignedRecording, begins: np.ndarray) -> Array:
+        """(n,) controls after the lag of an actuator, which is at rest at the first row."""
+        control = int(self.model.actuator_ctrladr[actuator])
+        u = recording.ctrl[:, control]
+        if self.model.actuator_ctrllimited[control]:
+            u = np.clip(u, *self.model.actuator_ctrlrange[control])
+
+        # a_{k+1} = a_k + s (u_k - a_k), with a_0 = u_0.
+        time_constant = max(float(self.model.actuator_dynprm[actuator, 0]), mujoco.mjMINVAL)
+        share = -np.expm1(-recording.dt / time_constant)
+        held = np.array([(1.0 - share) * u[0]])
+        after, _ = scipy.signal.lfilter([share], [1.0, share - 1.0], u, zi=held)
+        return np.asarray(np.concatenate([u[:1], after])[begins])
+
+    def _bent(self, actuator: int, qvel: Array) -> Array:
+        """(n,) deflections of a bristle in steady sliding at velocities qvel: (n, nv)."""
+        joint = int(self.model.actuator_trnid[actuator, 0])
+        speed = actuator_gear(self.model, actuator) * qvel[:, int(self.model.jnt_dofadr[joint])]
+
+        stiffness = float(self.model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
+        coulomb, static, stribeck = self.model.actuator_biasprm[actuator, FRICTION_COLUMNS]
+        ratio = speed / max(float(stribeck), mujoco.mjMINVAL)
+        friction = coulomb + (static - coulomb) * np.exp(-(ratio**2))
+        return np.asarray(np.sign(speed) * friction / stiffness)

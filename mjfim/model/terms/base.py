@@ -1,0 +1,203 @@
+"""Terms of a base that is not level, and of a payload."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy
+
+from mjfim.errors import ExperimentError
+from mjfim.model.sizes import model_length
+from mjfim.model.terms.changes import ChangedElement, MjcfChange, NewElement
+from mjfim.model.terms.term import (
+    FieldDescription,
+    Term,
+    TermQuantity,
+    TermTable,
+    named_element,
+    require_free_name,
+    resolved_values,
+)
+
+# Axes of the world, and of the frame of a body.
+AXES = ("x", "y", "z")
+
+# Name of the body that does not move.
+WORLD = "world"
+
+ATKESON_1986 = (
+    "C. G. Atkeson, C. H. An and J. M. Hollerbach, Estimation of inertial parameters of "
+    "manipulator loads and links, International Journal of Robotics Research 5, 1986"
+)
+SWEVERS_2007 = (
+    "J. Swevers, W. Verdonck and J. De Schutter, Dynamic model identification for industrial "
+    "robots, IEEE Control Systems Magazine 27, 2007"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tilt(Term):
+    """Rotation of gravity in the frame of the world, which keeps its size.
+
+    Attributes:
+        gravity: Gravity of the stated model [m/s²].
+    """
+
+    kind = "tilt"
+    description = (
+        "A base that is not level: gravity is turned by a rotation vector in the axes of the "
+        "world, and keeps its size."
+    )
+    equation = "gravity = R(x, y, z) · gravity of the model"
+    elements = "option/gravity"
+    acts_on = ""
+    fields = tuple(
+        FieldDescription(name=axis, description=f"rotation about the world's {axis}", unit="rad")
+        for axis in AXES
+    )
+    sources = (SWEVERS_2007,)
+
+    gravity: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, table: TermTable, model: Any, period: float) -> Tilt:
+        """Resolve the term."""
+        if table.element:
+            key = table.element[0][0]
+            raise ExperimentError(f"{key}: a term of kind {cls.kind!r} acts on the base; remove it")
+        if not np.any(model.opt.gravity):
+            raise ExperimentError("kind: the model has no gravity that could be turned")
+
+        values = resolved_values(cls.kind, table, dict.fromkeys(AXES, 0.0))
+        numbers = tuple((f"option:gravity[{i}]", 1.0) for i in range(3))
+        quantities = tuple(
+            (
+                axis,
+                TermQuantity(
+                    value=values[axis],
+                    unit="rad",
+                    size=1.0,
+                    bounds=(-np.pi, np.pi),
+                    numbers=numbers,
+                ),
+            )
+            for axis in AXES
+        )
+        x, y, z = (float(number) for number in model.opt.gravity)
+        return cls(name=table.name, gravity=(x, y, z), quantities=quantities)
+
+    @property
+    def is_written_as_a_whole(self) -> bool:
+        """All components of gravity depend on all components of the rotation."""
+        return True
+
+    def write(self, model: Any, values: Mapping[str, float]) -> None:
+        """Turn gravity."""
+        model.opt.gravity[:] = self._turned(values)
+
+    def edit(self, spec: Any) -> None:
+        """Turn gravity in an MjSpec."""
+        spec.option.gravity = self._turned(dict.fromkeys(AXES, 0.0) | self._values)
+
+    def changes(self) -> tuple[MjcfChange, ...]:
+        """Gravity in the text; none where it is not turned yet."""
+        if not any(self._values.values()):
+            return ()
+        gravity = tuple(self._turned(self._values).tolist())
+        return (ChangedElement(kind="option", name="", attributes=(("gravity", gravity),)),)
+
+    @property
+    def _values(self) -> dict[str, float]:
+        """Values of the fields in the model."""
+        return {axis: self.value(axis) for axis in AXES}
+
+    def _turned(self, values: Mapping[str, float]) -> np.ndarray:
+        """(3,) gravity after the rotation [m/s²]."""
+        vector = [values[axis] for axis in AXES]
+        turn = scipy.spatial.transform.Rotation.from_rotvec(vector)
+        return np.asarray(turn.apply(self.gravity))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload(Term):
+    """A point mass that is fixed to a body.
+
+    Attributes:
+        body: Name of the body.
+    """
+
+    kind = "payload"
+    description = "A point mass that is fixed to a body, such as a load in a gripper."
+    equation = "mass at the point (x, y, z) of the body's frame"
+    elements = "body without joints, with an inertial of that mass"
+    acts_on = "body"
+    fields = (
+        FieldDescription(name="mass", description="mass of the load", unit="kg"),
+        *(
+            FieldDescription(name=axis, description=f"{axis} in the frame of the body", unit="m")
+            for axis in AXES
+        ),
+    )
+    sources = (ATKESON_1986,)
+
+    body: str
+
+    @classmethod
+    def of(cls, table: TermTable, model: Any, period: float) -> Payload:
+        """Resolve the term for a body that moves."""
+        name, number = named_element(table, "body", model, cls.kind)
+        require_free_name(model, "body", table.name)
+        if name == WORLD or int(model.body_weldid[number]) == 0:
+            raise ExperimentError(f"body: {name!r} does not move, so that a load has no effect")
+
+        values = resolved_values(cls.kind, table, dict.fromkeys(("mass", *AXES), 0.0))
+        mass = TermQuantity(
+            value=values["mass"],
+            unit="kg",
+            size=float(model.body_subtreemass[model.body_rootid[number]]),
+            bounds=(0.0, np.inf),
+            numbers=((f"body/{table.name}:mass", 1.0),),
+        )
+        length = model_length(model)
+        places = (
+            (
+                axis,
+                TermQuantity(
+                    value=values[axis],
+                    unit="m",
+                    size=length,
+                    numbers=((f"body/{table.name}:pos[{i}]", 1.0),),
+                ),
+            )
+            for i, axis in enumerate(AXES)
+        )
+        return cls(name=table.name, body=name, quantities=(("mass", mass), *places))
+
+    def edit(self, spec: Any) -> None:
+        """Add the body of the load."""
+        load = spec.body(self.body).add_body(name=self.name)
+        load.pos = [self.value(axis) for axis in AXES]
+        load.mass = self.value("mass")
+        load.ipos = np.zeros(3)
+        load.inertia = np.zeros(3)
+        load.explicitinertial = True
+
+    def changes(self) -> tuple[MjcfChange, ...]:
+        """The body in the text."""
+        inertial = (
+            ("pos", (0.0, 0.0, 0.0)),
+            ("mass", (self.value("mass"),)),
+            ("diaginertia", (0.0, 0.0, 0.0)),
+        )
+        place = tuple(self.value(axis) for axis in AXES)
+        load = NewElement(
+            parent_kind="body",
+            parent=self.body,
+            tag="body",
+            attributes=(("name", self.name), ("pos", place)),
+            children=(("inertial", inertial),),
+        )
+        return (load,)
