@@ -165,7 +165,8 @@ class _NoiseTable:
 
 def columns_of_keys(coordinates: ModelCoordinates) -> dict[str, list[str]]:
     """Columns for which each key of the table `noise` is valid."""
-    found: dict[str, list[str]] = {"state": [component.name for component in coordinates.state]}
+    stated = [component.name for component in coordinates.state if not component.is_added]
+    found: dict[str, list[str]] = {"state": stated}
     for component in coordinates.state:
         found[component.name] = [component.name]
         for group in component.groups:

@@ -32,6 +32,8 @@ TermKind = Literal[
     "asymmetric_friction",
     "back_emf",
     "actuator_lag",
+    "joint_elasticity",
+    "backlash",
     "tilt",
     "payload",
 ]
@@ -146,6 +148,13 @@ class TermSpec(Section):
         default=None, description="Name of the actuator whose action it changes."
     )
     body: str | None = Field(default=None, description="Name of the body to which it is fixed.")
+    encoder: Literal["motor", "link"] = Field(
+        default="motor",
+        description=(
+            "Side of an elastic joint or of one with backlash on which its sensors are: with "
+            "`motor`, the joint of the model is the motor, with `link` it is the link."
+        ),
+    )
     values: dict[str, FiniteWithUnit] = Field(
         default_factory=dict,
         description=(

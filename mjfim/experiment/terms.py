@@ -29,5 +29,6 @@ def _table(name: str, spec: TermSpec) -> TermTable:
     return TermTable(
         name=name,
         element=tuple((key, element) for key, element in elements if element is not None),
+        encoder=spec.encoder,
         values=tuple((field, float(value)) for field, value in spec.values.items()),
     )

@@ -379,8 +379,10 @@ def measured_trajectory(
     rows = int(np.searchsorted(recording.t - recording.t[0], last, side="right"))
     recording = recording.first_rows(max(rows, 2))
 
-    qpos = np.empty((len(recording.t), model.nq))
-    for q in range(model.nq):
+    # Joints that physical terms have added show a robot that is not deflected.
+    qpos = np.tile(model.qpos0, (len(recording.t), 1))
+    layout = system.source.layout
+    for q in range(model.nq) if layout is None else layout.qpos.tolist():
         name = system.outputs.names[measured[q]] if q in measured else ""
         if name not in recording.outputs:
             return None

@@ -15,8 +15,8 @@ Activations are called `act:<actuator>`. Components of sensors have MuJoCo's ind
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -100,6 +100,8 @@ class StateComponent:
         unit: Its unit; empty for components of quaternions.
         sigma_factor: Its standard deviation over the stated one of a group; 1/2 for components of
             quaternions.
+        is_added: Whether it belongs to a joint that a physical term has added, which is measured
+            only where it is named.
     """
 
     name: str
@@ -107,6 +109,7 @@ class StateComponent:
     address: int
     unit: str
     sigma_factor: float = 1.0
+    is_added: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,13 +169,19 @@ class ModelCoordinates:
     deviations: tuple[TangentComponent, ...]
 
     @classmethod
-    def of(cls, model: Any) -> ModelCoordinates:
-        """Look up the coordinates of a compiled model (`mujoco.MjModel`)."""
+    def of(cls, model: Any, added: Collection[int] = ()) -> ModelCoordinates:
+        """Look up the coordinates of a compiled model.
+
+        Args:
+            model: The compiled model (`mujoco.MjModel`).
+            added: Addresses in the state (qpos, qvel) that physical terms have added.
+        """
+        components = state_components(model)
         return cls(
             controls=control_names(model),
             scalar_joints=scalar_joints(model),
             unnamed_joints=unnamed_count(model, "joint"),
-            state=state_components(model),
+            state=tuple(replace(each, is_added=each.address in added) for each in components),
             sensors=sensor_components(model),
             deviations=tangent_components(model)[: 2 * model.nv],
         )

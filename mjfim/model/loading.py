@@ -243,7 +243,8 @@ class ModelSource:
     @cached_property
     def coordinates(self) -> ModelCoordinates:
         """The coordinates of the model by name."""
-        return ModelCoordinates.of(self.model)
+        added = () if self.layout is None else self.layout.added
+        return ModelCoordinates.of(self.model, added)
 
     @cached_property
     def decoration(self) -> frozenset[str]:

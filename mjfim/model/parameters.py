@@ -21,6 +21,7 @@ from mjfim.model.targets import (
     ModelField,
     OutputBiasField,
     OutputDelayField,
+    OutputScaleField,
     RotationField,
     SpecField,
     TargetField,
@@ -35,7 +36,7 @@ from mjfim.model.variants import MocapPlacement
 FRAME_FIELDS = {"pos", "ipos", "rot", *INERTIAL_FIELDS}
 
 # Fields that are outside the model: the initial state and the measurement.
-FIELDS_OUTSIDE_MODEL = (InitialStateField, OutputBiasField, OutputDelayField)
+FIELDS_OUTSIDE_MODEL = (InitialStateField, OutputBiasField, OutputScaleField, OutputDelayField)
 
 # Parametrisation of a body's inertia -> arrays of MjModel that may be varied together with it.
 ARRAYS_BESIDE_INERTIA = {
@@ -262,6 +263,14 @@ class ParameterSet:
         matrix = np.zeros((ny, len(self)))
         for j, target in self._targets():
             if isinstance(target.field, OutputBiasField):
+                matrix[target.field.output, j] += target.scale
+        return matrix
+
+    def scale_derivative(self, ny: int) -> Array:
+        """(ny, p) derivative of the relative scale error of every output."""
+        matrix = np.zeros((ny, len(self)))
+        for j, target in self._targets():
+            if isinstance(target.field, OutputScaleField):
                 matrix[target.field.output, j] += target.scale
         return matrix
 

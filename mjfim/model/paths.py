@@ -30,6 +30,7 @@ from mjfim.model.targets import (
     ModelField,
     OutputBiasField,
     OutputDelayField,
+    OutputScaleField,
     RotationField,
     SpecField,
     TargetField,
@@ -107,7 +108,7 @@ SERVO_FIELDS = ("kp", "kv")
 INITIAL_STATE_FIELDS = ("qpos", "qvel", "act")
 
 # Fields of the measurement.
-OUTPUT_FIELDS = ("bias", "delay")
+OUTPUT_FIELDS = ("bias", "scale", "delay")
 
 # All kinds of paths.
 KINDS = (*MODEL_ARRAYS, "term", "initial", "output")
@@ -203,7 +204,7 @@ def resolve(
     Args:
         model: The compiled model (`mujoco.MjModel`).
         text: The path.
-        outputs: Names of the measured columns, which `output/<name>:bias` may name.
+        outputs: Names of the measured columns, which `output/<name>:bias` and `:scale` may name.
         decoration: Names of geoms that neither collide nor give their body its inertia, whose place
             and size can be changed without a compile.
         terms: Physical terms by which the model is extended, which `term/<name>:...` may name.
@@ -316,7 +317,7 @@ def _option_field(model: Any, path: ParameterPath) -> ModelField:
 
 
 def _output_field(path: ParameterPath, outputs: Sequence[str]) -> TargetField:
-    """Bias of one output, or the delay of all. outputs: names of the measured columns."""
+    """Bias or scale of one output, or the delay of all. outputs: names of the measured columns."""
     if path.field == "delay":
         if path.name:
             raise path.error("one delay lags all outputs; write 'output:delay'")
@@ -324,7 +325,8 @@ def _output_field(path: ParameterPath, outputs: Sequence[str]) -> TargetField:
 
     if path.name not in outputs:
         raise path.error(unknown("output", path.name, list(outputs)))
-    return OutputBiasField(list(outputs).index(path.name))
+    output = list(outputs).index(path.name)
+    return OutputBiasField(output) if path.field == "bias" else OutputScaleField(output)
 
 
 def _initial_state_field(model: Any, path: ParameterPath) -> InitialStateField:

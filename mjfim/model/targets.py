@@ -8,7 +8,7 @@ A field is a number inside a model, of the initial state, or of the measurement:
 - `SpecField`: a number of the MJCF from which the compiler derives others;
 - `TermField`: a field of a physical term on which several numbers depend;
 - `InitialStateField`: a deviation of the initial state;
-- `OutputBiasField`, `OutputDelayField`: the measurement itself.
+- `OutputBiasField`, `OutputScaleField`, `OutputDelayField`: the measurement itself.
 
 Each field has `read(model)`, its value in a model, and `magnitude(model)`, the order of magnitude
 with which a change of it is compared.
@@ -274,6 +274,17 @@ class OutputBiasField(DeviationField):
 
 
 @dataclass(frozen=True)
+class OutputScaleField(DeviationField):
+    """Relative error s of the scale of one measured output, which reads (1 + s) times its value.
+
+    Attributes:
+        output: Place of the output among the measured ones.
+    """
+
+    output: int
+
+
+@dataclass(frozen=True)
 class OutputDelayField(DeviationField):
     """Time by which all outputs lag [s]."""
 
@@ -286,5 +297,6 @@ TargetField = (
     | TermField
     | InitialStateField
     | OutputBiasField
+    | OutputScaleField
     | OutputDelayField
 )

@@ -410,6 +410,14 @@ class MixedDerivatives(StepDerivatives):
                 changes.append(plant.outputs.mixed_change(states, unit, psi @ w, of_sensors))
             h_mixed = np.moveaxis(np.array(changes), 1, 2)
 
+        # A scale error multiplies the outputs, so that its effect changes with them.
+        calibration = plant.calibration
+        if calibration.scales:
+            of_scales = np.einsum("kyz,rp,yp->rkzy", CD, directions, calibration.scale)
+            if h_mixed is not None:
+                of_scales = of_scales + calibration.factor(theta) * h_mixed
+            h_mixed, CD = of_scales, calibration.scaled(CD, theta)
+
         return Bilinear(
             A=AB[..., :nx],
             B=AB[..., nx:],

@@ -35,7 +35,7 @@ class Output:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outputs:
-    """The output map h without bias and delay.
+    """The output map h without errors of the sensors and delay.
 
     States are scalar coordinates or components of quaternions, for which h and its derivatives are
     known exactly.

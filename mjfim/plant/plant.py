@@ -16,6 +16,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import PlantModel
 from mjfim.optimize.lq import TangentCurve
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
+from mjfim.plant.calibration import Calibration
 from mjfim.plant.closed_form_derivatives import ClosedFormMemory
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.derivatives import Derivatives
@@ -35,15 +36,14 @@ class Plant:
     Attributes:
         source: PlantModel of the private model copies that are stepped.
         parameters: The p parameters theta.
-        outputs: Output map h without bias and delay.
+        outputs: Output map h without errors and delay.
         simulator: Steps the model copies.
         sizes: Natural sizes of states and controls.
         space: Layout of the state and of its tangent space.
         nominal_initial_state: (ns,) initial state where no parameter moves it.
         initial_state_derivative: (nx, p) derivative of the initial state by theta [x-unit /
             theta-unit].
-        bias_derivative: (ny, p) derivative of the constant output biases by theta [y-unit /
-            theta-unit].
+        calibration: Scale errors and biases of the outputs as functions of theta.
         nu: Number of controls.
         dt: Sample period [s].
         closed_form_memory: What derivatives in closed form keep from call to call.
@@ -81,7 +81,7 @@ class Plant:
         self.space = self.simulator.space
         self.nominal_initial_state = np.array(nominal_initial_state, dtype=np.float64)
         self.initial_state_derivative = parameters.initial_state_derivative(self.space.nx)
-        self.bias_derivative = parameters.bias_derivative(len(outputs))
+        self.calibration = Calibration.of(parameters, len(outputs))
         self.nu = int(source.model.nu)
         self.dt = substeps * float(source.model.opt.timestep)
         self.sizes = StateSizes.of(source.model, self.space, self.dt)
@@ -355,7 +355,7 @@ class Plant:
         return self.trajectory(out.states[0], ctrl), out.observed[0]
 
     def measure(self, theta: Array, ctrl: Array) -> tuple[Array, np.ndarray]:
-        """Outputs of many open-loop simulations under one control, bias and delay included.
+        """Outputs of many open-loop simulations under one control, with their errors and the delay.
 
         Args:
             theta: (m, p) parameters [theta-unit].
@@ -368,8 +368,10 @@ class Plant:
         held = np.broadcast_to(ctrl, (len(theta), *np.shape(ctrl)))
         out = self.simulator.rollout(models, self.initial_state(theta), held)
 
-        y = self.outputs(out.states, out.sensors) + (theta @ self.bias_derivative.T)[:, None]
+        h = self.outputs(out.states, out.sensors)
+        y = np.empty_like(h)
         for i, row in enumerate(theta):
+            y[i] = self.calibration.measured(h[i], row)
             delay = self.output_delay(row, y.shape[1])
             if delay is not None:
                 y[i] = delay.apply(y[i])

@@ -209,7 +209,8 @@ class RolloutDerivatives(ClosedFormDerivatives):
         """
         plant = self.plant
         delay = plant.output_delay(theta, len(ctrl) + 1)
-        needs_origin = states is None or (delay is not None and plant.outputs.needs_sensors)
+        needs_values = delay is not None or plant.calibration.scales
+        needs_origin = states is None or (needs_values and plant.outputs.needs_sensors)
 
         moving, directions, h = self._moved_directions(step, lumped)
         known = None
@@ -253,7 +254,7 @@ class RolloutDerivatives(ClosedFormDerivatives):
                     closed_form=closed_form,
                 )
 
-        y, G = self._with_bias_and_delay(theta, plant.outputs(origin, sensors), G, delay)
+        y, G = self._as_measured(theta, plant.outputs(origin, sensors), G, delay)
         return y, Sensitivity(psi=psi, G=G, is_lumped=lumped is not None)
 
     def _largest_outputs(self, out: Rollouts | None, origin: Array) -> Array:
@@ -264,23 +265,23 @@ class RolloutDerivatives(ClosedFormDerivatives):
             y = self.plant.outputs(out.states[0], None if out.sensors is None else out.sensors[0])
         return np.asarray(np.abs(y).max(axis=0))
 
-    def _with_bias_and_delay(
-        self, theta: Array, y: Array, G: Array, delay: OutputDelay | None
+    def _as_measured(
+        self, theta: Array, h: Array, G: Array, delay: OutputDelay | None
     ) -> tuple[Array, Array]:
-        """Outputs with the biases and the delay, which act on those of the simulation.
+        """Outputs with the errors of the sensors and the delay.
 
         Args:
             theta: (p,) parameters [theta-unit].
-            y: (N+1, ny) outputs of the simulation [y-unit].
-            G: (N+1, ny, p) their derivatives by theta [y-unit / theta-unit]; it is changed.
+            h: (N+1, ny) outputs of the simulation [y-unit].
+            G: (N+1, ny, p) their derivatives by theta [y-unit / theta-unit].
             delay: The delay, or None.
 
         Returns:
             The outputs and their derivatives.
         """
         plant = self.plant
-        y = y + plant.bias_derivative @ theta
-        G += plant.bias_derivative
+        y = plant.calibration.measured(h, theta)
+        G = plant.calibration.by_theta(h, G, theta)
         if delay is None:
             return y, G
 
@@ -505,8 +506,9 @@ class RolloutDerivatives(ClosedFormDerivatives):
             moves: The J moves.
             differentiate: Whether derivatives are requested.
         """
-        outputs, bias = self.plant.outputs, self.plant.bias_derivative
-        y = outputs(states[0], None if sensors is None else sensors[0]) + bias @ theta
+        outputs, calibration = self.plant.outputs, self.plant.calibration
+        h = outputs(states[0], None if sensors is None else sensors[0])
+        y = calibration.measured(h, theta)
         if not differentiate:
             return Response(first=first, y=y, common=None, private=None)
 
@@ -524,7 +526,12 @@ class RolloutDerivatives(ClosedFormDerivatives):
         count = len(moves.moving)
         common = np.zeros((*y.shape, len(theta)))
         common[..., moves.moving] = G[..., :count]
-        return Response(first=first, y=y, common=common + bias, private=G[..., count:])
+        return Response(
+            first=first,
+            y=y,
+            common=calibration.by_theta(h, common, theta),
+            private=calibration.scaled(G[..., count:], theta),
+        )
 
 
 def _origin(ctrl: Array, states: Array | None, out: Rollouts | None) -> tuple[Array, Array | None]:

@@ -111,7 +111,18 @@ class StepDerivatives(ClosedFormDerivatives):
         E = np.moveaxis(_require_finite(by_theta[:, :-1]), 0, 2)
         no_move = np.zeros((len(theta), len(states), self.plant.space.nx))
         H = np.moveaxis(outputs.tangent(states, no_move, sensors_by_theta), 0, 2)
-        return Linearization(A=A, B=B, E=E, C=C, D=D, H=H + self.plant.bias_derivative)
+        h = self._outputs_at(theta, states, ctrl)
+        return Linearization(
+            A=A, B=B, E=E, C=C, D=D, H=self.plant.calibration.by_theta(h, H, theta)
+        )
+
+    def _outputs_at(self, theta: Array, states: Array, ctrl: Array) -> Array:
+        """(n, ny) outputs of the model at n states under controls, where scale errors need them."""
+        plant = self.plant
+        sensors = None
+        if plant.calibration.scales and plant.outputs.needs_sensors:
+            sensors = plant.simulator.step([plant.model(theta)], states, ctrl).sensors
+        return plant.outputs(states, sensors)
 
     def jacobians(
         self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
@@ -139,7 +150,7 @@ class StepDerivatives(ClosedFormDerivatives):
 
         AB = np.moveaxis(_require_finite(by_z[:, :-1]), 0, 2)
         dy = plant.outputs.tangent(trajectory.state, self._unit_moves(by_z.shape[1]), sensors_by_z)
-        CD = np.moveaxis(dy, 0, 2)
+        CD = plant.calibration.scaled(np.moveaxis(dy, 0, 2), theta)
         return AB[..., :nx], AB[..., nx:], CD[..., :nx], CD[..., nx:]
 
     def observation_jacobians(

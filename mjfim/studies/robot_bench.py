@@ -459,7 +459,7 @@ class RobotBench:
         model = task.system.model_at(theta)
         start = self._start(model, theta, controller)
         before = controller.before_start(start)
-        noise = noise + task.parameters.bias_derivative(len(task.system.outputs)) @ theta
+        noise = noise + task.system.plant.calibration.bias @ theta
         sent = controller.sent(model, start, before, noise)
 
         # The control arrives late. Until then the robot gets the control before the motion begins.
@@ -472,7 +472,8 @@ class RobotBench:
         # Noise is added at the rows of the plan; samples that are not measured are NaN.
         last = rows * self.steps_per_row + 1
         sensors = None if out.sensors is None else out.sensors[0, :last]
-        y = task.system.outputs(out.states[0, :last], sensors)
+        h = task.system.outputs(out.states[0, :last], sensors)
+        y = task.system.plant.calibration.factor(theta) * h
         y[:: self.steps_per_row] += noise
         y[task.system.noise.measured(last - 1) == 0.0] = np.nan
 

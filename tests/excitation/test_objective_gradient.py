@@ -164,6 +164,15 @@ SETUPS: dict[str, Callable[[Path], DesignTask]] = {
         parameters={**CART_PARAMETERS, "lag": {"target": "output:delay", "guess": 0.013}},
         noise=SENSED,
     ),
+    "scales wanted": cart(
+        parameters={
+            **CART_PARAMETERS,
+            "angle": {"target": "output/angle:scale", "guess": 0.1},
+            "acc": {"target": "output/acc[2]:scale", "guess": -0.05, "prior": 0.1},
+            "lag": {"target": "output:delay", "guess": 0.013},
+        },
+        noise=SENSED,
+    ),
     "sensors, all nuisances": cart(
         "implicitfast", noise=SENSED, nuisance=LATE, cost={"criterion": "A"}
     ),

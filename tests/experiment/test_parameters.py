@@ -246,6 +246,7 @@ BODY_LENGTH = 0.15 + np.hypot(0.05, 0.25) + np.sqrt(0.012 / 0.4)
         ("initial/float:qvel.ry", 0.0, "rad/s", 1.0),
         ("initial/ball:qvel.rx", 0.0, "rad/s", 1.0),
         ("output/acc[1]:bias", 0.0, "", 0.1),
+        ("output/acc[1]:scale", 0.0, "", 1.0),
         ("output:delay", 0.0, "s", 0.01),
         ("option:gravity[2]", -0.5, "m/s²", 0.5),
     ],

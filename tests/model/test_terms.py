@@ -20,6 +20,7 @@ from tests.support.terms import (
     DAMPING,
     EXAMPLES,
     INERTIA,
+    ROTOR,
     WEIGHT,
     experiment_of,
     motor_torque,
@@ -121,3 +122,265 @@ def test_smooth_terms_move_as_their_equation_says(tmp_path: Path, kind: str) -> 
     # Without the term, the motion is another one.
     without = simulated(system, ctrl, system.parameters.guess)
     assert (np.abs(without - expected).max(axis=0) > 0.02 * span).all()
+
+
+def steady_force(system: System, speed: float) -> float:
+    """Force of the passive device after sliding at a constant speed for a while."""
+    model = system.model_at(system.parameters.true)
+    data = mujoco.MjData(model)
+    for _ in range(200):
+        data.qpos[0], data.qvel[0] = 0.0, speed
+        mujoco.mj_step(model, data)
+    data.qpos[0], data.qvel[0] = 0.0, speed
+    mujoco.mj_forward(model, data)
+    return float(data.actuator_force[1])
+
+
+@pytest.mark.parametrize("kind", ["stribeck", "lugre"])
+@pytest.mark.parametrize("speed", [-3.0, -0.6, -0.1, 0.05, 0.5, 2.0])
+def test_steady_friction_is_the_stribeck_curve(tmp_path: Path, kind: str, speed: float) -> None:
+    system = System.resolve(experiment_of(tmp_path, kind))
+    values = {"coulomb": 0.0, **EXAMPLES[kind][1]}
+    drop = values["excess"] * np.exp(-((speed / values["speed"]) ** 2))
+    expected = -(values["coulomb"] + drop) * np.sign(speed)
+    assert steady_force(system, speed) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def lugre_motion(values: dict[str, float], ctrl: Any, start: Any) -> Any:
+    """Motion of the pendulum with the LuGre equation, by SciPy."""
+
+    def derivative(x: Any, u: float) -> list[float]:
+        angle, speed, z = x
+        g = values["coulomb"] + values["excess"] * np.exp(-((speed / values["speed"]) ** 2))
+        rate = speed - values["stiffness"] * abs(speed) / g * z
+        friction = -values["stiffness"] * z - values["damping"] * rate
+        return [speed, rigid(angle, speed, u + friction), rate]
+
+    return integrated(derivative, ctrl, 0.01, [*start, 0.0])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_dynamic_friction_moves_as_lugre_says(tmp_path: Path, integrator: str) -> None:
+    values = {"coulomb": 0.03, "excess": 0.03, "speed": 0.5, "stiffness": 30.0, "damping": 0.1}
+    path = write_pendulum(tmp_path, timestep=0.0005, integrator=integrator)
+    stated = mjfim.Experiment(
+        model=path.name,
+        rate=100.0,
+        noise={"angle": 0.001},
+        terms={"extra": {"kind": "lugre", "joint": "pivot", "values": values}},
+        parameters={"d": {"target": "joint/pivot:damping"}},
+        directory=tmp_path,
+    )
+    ctrl = motor_torque(2.0, 100.0)
+    found = simulated(System.resolve(stated), ctrl)
+    expected = lugre_motion(values, ctrl, [0.0, 0.0])[:, :2]
+    error = np.sqrt(np.mean((found - expected) ** 2, axis=0)) / np.ptp(expected, axis=0)
+    assert (error < 0.02).all()
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_stribeck_friction_moves_like_a_stiff_bristle(tmp_path: Path, integrator: str) -> None:
+    """The bristle of the library is short; SciPy integrates one that is shorter still."""
+    experiment = experiment_of(tmp_path, "stribeck")
+    write_pendulum(tmp_path, integrator=integrator, joint='frictionloss="0.03"')
+    ctrl = motor_torque(2.0, 100.0)
+    found = simulated(System.resolve(experiment), ctrl)
+
+    stiff = {**EXAMPLES["stribeck"][1], "coulomb": 0.03, "stiffness": 2e3, "damping": 2.0}
+    expected = lugre_motion(stiff, ctrl, [0.0, 0.0])[:, :2]
+    error = np.sqrt(np.mean((found - expected) ** 2, axis=0)) / np.ptp(expected, axis=0)
+    assert (error < 0.02).all()
+
+
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+def test_friction_with_an_offset_differs_by_direction(tmp_path: Path, direction: float) -> None:
+    experiment = experiment_of(
+        tmp_path, "asymmetric_friction", initial={"qpos": [0.0], "qvel": [6.0 * direction]}
+    )
+    ctrl = np.zeros((20, 1))
+    found = simulated(System.resolve(experiment), ctrl)
+
+    torque = -0.03 * direction + EXAMPLES["asymmetric_friction"][1]["offset"]
+    expected = integrated(
+        lambda x, u: [x[1], rigid(x[0], x[1], torque)], ctrl, 0.01, [0.0, 6.0 * direction]
+    )
+    np.testing.assert_allclose(found, expected, atol=0.02)
+
+
+@pytest.mark.parametrize("encoder", ["motor", "link"])
+@pytest.mark.parametrize("kind", ["joint_elasticity", "backlash"])
+def test_motor_and_link_move_as_two_inertias(tmp_path: Path, kind: str, encoder: str) -> None:
+    values = {"compliance": 0.05, "damping": 0.004, **EXAMPLES[kind][1]}
+    terms = {"extra": {"kind": kind, "joint": "pivot", "encoder": encoder, "values": values}}
+    experiment = experiment_of(
+        tmp_path, kind, initial={"keyframe": "start"}, terms=terms, noise={"state": 0.001}
+    )
+    write_pendulum(tmp_path, timestep=0.0005, joint=f'armature="{ROTOR}"')
+    system = System.resolve(experiment)
+    assert system.outputs.names == ("qpos:pivot", "qvel:pivot")
+    np.testing.assert_array_equal(system.nominal_initial_state, [0.5, 0.0, 0.0, 0.0])
+
+    # The friction of the joint is on its side.
+    of_motor, of_link = (DAMPING, 0.0) if encoder == "motor" else (0.0, DAMPING)
+
+    def derivative(x: Any, u: float) -> list[float]:
+        motor, motor_speed, link, speed = x
+        deflection = motor - link
+        beyond = np.sign(deflection) * max(abs(deflection) - values.get("gap", 0.0) / 2.0, 0.0)
+        torque = beyond / values["compliance"] + values["damping"] * (motor_speed - speed)
+        return [
+            motor_speed,
+            (u - torque - of_motor * motor_speed) / ROTOR,
+            speed,
+            (torque - WEIGHT * np.sin(link) - of_link * speed) / INERTIA,
+        ]
+
+    ctrl = motor_torque(2.0, 100.0)
+    expected = integrated(derivative, ctrl, 0.01, [0.5, 0.0, 0.5, 0.0])
+    found = system.plant.simulate(system.parameters.guess, ctrl).qpos
+    sides = np.stack([found[:, 0], found.sum(axis=1)], axis=1)
+    motor, link = sides.T if encoder == "motor" else sides.T[::-1]
+    span = np.ptp(expected[:, 2])
+    assert np.abs(motor - expected[:, 0]).max() < 0.005 * span
+    assert np.abs(link - expected[:, 2]).max() < 0.005 * span
+    deflection = expected[:, 0] - expected[:, 2]
+    assert np.abs(motor - link - deflection).max() < 0.1 * np.ptp(deflection)
+
+
+def test_a_keyframe_of_the_file_gets_the_new_joint(tmp_path: Path) -> None:
+    experiment = experiment_of(tmp_path, "joint_elasticity")
+    source = System.resolve(experiment).source
+    np.testing.assert_array_equal(source.model.key_qpos, [[0.5, 0.0]])
+    np.testing.assert_array_equal(source.stated.model.key_qpos, [[0.5]])
+
+    # Stated positions may leave out the joint that the term adds.
+    for qpos in ([0.7], [0.7, 0.0]):
+        start = System.resolve(experiment.replace(initial={"qpos": qpos})).nominal_initial_state
+        np.testing.assert_array_equal(start, [0.7, 0.0, 0.0, 0.0])
+    with pytest.raises(ExperimentError, match=r"initial\.qpos: 3 numbers; this model needs 2"):
+        System.resolve(experiment.replace(initial={"qpos": [0.7, 0.0, 0.0]}))
+
+
+# ---- writing into the model, and into the text
+
+
+def arrays_of(model: Any) -> dict[str, Any]:
+    """All numeric arrays of a model and of its options."""
+    names = [name for name in dir(model) if not name.startswith("_")]
+    arrays = {name: getattr(model, name) for name in names}
+    arrays["gravity"] = model.opt.gravity
+    numeric = {
+        k: v for k, v in arrays.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fi"
+    }
+    return {name: np.array(value) for name, value in numeric.items()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_values_written_in_place_equal_a_compile(tmp_path: Path, kind: str) -> None:
+    experiment = experiment_of(tmp_path, kind)
+    system = System.resolve(experiment)
+    assert not system.parameters.needs_compile.any()
+    written = arrays_of(system.model_at(system.parameters.true))
+
+    table, true = EXAMPLES[kind]
+    compiled = System.resolve(
+        experiment.restated(
+            {
+                **experiment.model_dump(exclude_unset=True),
+                "terms": {"extra": {"kind": kind, **table, "values": true}},
+                "parameters": {"d": {"target": "joint/pivot:damping"}},
+            }
+        )
+    )
+    expected = arrays_of(compiled.model_at(compiled.parameters.guess))
+    assert set(written) == set(expected)
+    for name, value in expected.items():
+        scale = (
+            np.abs(value[np.isfinite(value)]).max(initial=1e-300) if value.dtype.kind == "f" else 1
+        )
+        np.testing.assert_allclose(
+            written[name], value, rtol=1e-12, atol=1e-14 * scale, err_msg=name
+        )
+
+    # The guess is the value in the model.
+    for field, value in true.items():
+        assert System.resolve(
+            experiment.replace(
+                terms={"extra": {"kind": kind, **table, "values": {field: value}}},
+            )
+        ).parameters.guess[list(true).index(field)] == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_identified_text_moves_as_the_identified_model(tmp_path: Path, kind: str) -> None:
+    experiment = experiment_of(tmp_path, kind, initial={"keyframe": "start"})
+    system = System.resolve(experiment)
+    path = tmp_path / "out" / "identified.xml"
+    path.parent.mkdir()
+    remark = write_identified(path, system, system.parameters.true)
+    assert remark is None
+
+    # The user's comments and spelling stay.
+    text = path.read_text(encoding="utf-8")
+    assert '<!-- a rod with a weight; "pivot" is the motor\'s joint -->' in text
+    assert 'diaginertia="0.0105 0.0105 0.001"' in text
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    ctrl = motor_torque(0.5, 100.0)
+    angles = [data.qpos[0]]
+    for u in ctrl[:, 0]:
+        data.ctrl[0] = u
+        mujoco.mj_step(model, data, 10)
+        angles.append(data.qpos[0])
+    np.testing.assert_allclose(angles, simulated(system, ctrl)[:, 0], atol=1e-9)
+
+
+# ---- wrong tables
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"kind": "stribeck"}, "needs 'joint'; valid: pivot"),
+        ({"kind": "stribeck", "joint": "pivt"}, "did you mean 'pivot'|valid: pivot"),
+        ({"kind": "stribeck", "actuator": "motor"}, "takes 'joint', not 'actuator'"),
+        ({"kind": "actuator_lag", "actuator": "motr"}, "motor"),
+        ({"kind": "tilt", "joint": "pivot"}, "acts on the base"),
+        ({"kind": "payload", "body": "world"}, "does not move"),
+        ({"kind": "stribeck", "joint": "pivot", "values": {"static": 1.0}}, "excess, speed"),
+        ({"kind": "stribeck", "joint": "pivot", "values": {"speed": "3 N m"}}, "rad/s"),
+    ],
+)
+def test_a_wrong_table_is_one_clear_message(
+    tmp_path: Path, table: dict[str, Any], message: str
+) -> None:
+    experiment = experiment_of(tmp_path, "stribeck")
+    tables = {
+        **experiment.model_dump(exclude_unset=True),
+        "terms": {"extra": table},
+        "parameters": {"d": {"target": "joint/pivot:damping"}},
+    }
+    with pytest.raises(ExperimentError, match=message) as caught:
+        System.resolve(experiment.restated(tables))
+    assert "terms.extra" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_paths_into_terms_are_checked(tmp_path: Path) -> None:
+    experiment = experiment_of(tmp_path, "stribeck")
+    for path, message in (
+        ("term/other:excess", "extra"),
+        ("term/extra:static", "excess, speed"),
+        ("term/extra:excess[0]", "single number"),
+    ):
+        with pytest.raises(ExperimentError, match=message):
+            System.resolve(experiment.replace(parameters={"excess": {"target": path}}))
+
+
+def test_a_bristle_refuses_rk4(tmp_path: Path) -> None:
+    experiment = experiment_of(tmp_path, "stribeck")
+    write_pendulum(tmp_path, integrator="RK4")
+    with pytest.raises(ExperimentError, match="lugre"):
+        System.resolve(experiment)

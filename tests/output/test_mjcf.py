@@ -162,6 +162,7 @@ OUTSIDE = (
     "initial/j:qvel",
     "initial/g:act",
     "output/seen[0]:bias",
+    "output/seen[0]:scale",
     "output:delay",
 )
 
@@ -601,6 +602,8 @@ def test_shortcuts_set_the_entries_that_mujoco_sets(element: str) -> None:
     joint = 'body="b" ctrlrange="0 1"' if element == "adhesion" else 'joint="j"'
     for attribute, numbers in SHORTCUTS[element].items():
         values = [1.7 if attribute == "lmax" else 0.7 + 0.2 * i for i in range(len(numbers))]
+        if element == "dcmotor":
+            needs = 'input="none"' + ' resistance="1"' * (attribute != "resistance")
         written = f'<{element} {joint} {needs} {attribute}="{" ".join(map(str, values))}"/>'
         model = mujoco.MjModel.from_xml_string(
             '<mujoco><worldbody><body name="b"><joint name="j"/><geom size="1"/></body></worldbody>'

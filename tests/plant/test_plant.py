@@ -728,6 +728,42 @@ def test_each_bias_adds_to_its_output_only(tmp_path) -> None:
     np.testing.assert_allclose(y[1] - y[0], np.broadcast_to(shift, y[0].shape), rtol=0, atol=1e-12)
 
 
+def test_a_scale_error_multiplies_its_output(tmp_path) -> None:
+    parameters = {
+        **CART_PARAMETERS,
+        "angle": {"target": "output/angle:scale", "guess": 0.1},
+        "acc": {"target": "output/acc[2]:scale"},
+    }
+    scaled = cart_task(tmp_path, **OUTSIDE, parameters=parameters)
+    plain = cart_task(tmp_path, **OUTSIDE)
+    names = list(scaled.system.outputs.names)
+    angle, acc = names.index("angle"), names.index("acc[2]")
+    y, G = scaled.plant.derivatives.predict(scaled.theta, scaled.control)
+    h, exact_G = plain.plant.derivatives.predict(plain.theta, plain.control)
+
+    # y = (1 + s) h, and its derivatives by s and by the other parameters.
+    factor = np.ones(len(names))
+    factor[angle] = 1.1
+    np.testing.assert_allclose(y, factor * h, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(G[..., :3], factor[:, None] * exact_G, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(G[:, angle, 3], h[:, angle], rtol=1e-12)
+    np.testing.assert_allclose(G[:, acc, 4], h[:, acc], rtol=1e-12)
+    assert not np.delete(G[..., 3], angle, axis=1).any()
+
+    # All ways to the derivatives agree, and they are those of what is measured.
+    derivatives = scaled.plant.derivatives
+    assert relative_error(derivatives.sensitivity(scaled.theta, scaled.initial).G, G) < 1e-6
+    lin = derivatives.linearize(scaled.theta, scaled.initial)
+    recursion = np.einsum(
+        "kyx,kxp->kyp", lin.C, derivatives.sensitivity(scaled.theta, scaled.initial).psi
+    )
+    assert relative_error(recursion + lin.H, G) < 1e-5
+    h_step = 1e-6
+    moves = scaled.theta + np.outer([h_step, -h_step], np.eye(5)[4])
+    moved, _ = scaled.plant.measure(moves, scaled.control)
+    assert relative_error(G[..., 4], (moved[0] - moved[1]) / (2 * h_step)) < 1e-7
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.0237])
 def test_a_delay_shifts_all_outputs(delay: float, tmp_path) -> None:
     parameters = {

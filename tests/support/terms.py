@@ -52,12 +52,20 @@ EXAMPLES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
     "asymmetric_friction": ({"joint": "pivot"}, {"offset": 0.02}),
     "back_emf": ({"actuator": "motor"}, {"constant": 0.02}),
     "actuator_lag": ({"actuator": "motor"}, {"time_constant": 0.03}),
+    "joint_elasticity": ({"joint": "pivot"}, {"compliance": 0.05, "damping": 0.004}),
+    "backlash": ({"joint": "pivot"}, {"gap": 0.06}),
     "tilt": ({}, {"y": 0.1}),
     "payload": ({"body": "rod"}, {"mass": 0.05, "z": -0.3}),
 }
 
 # Attributes of the joint that a term needs.
-JOINTS = {"stribeck": 'frictionloss="0.03"', "asymmetric_friction": 'frictionloss="0.03"'}
+JOINTS = {
+    "stribeck": 'frictionloss="0.03"',
+    "asymmetric_friction": 'frictionloss="0.03"',
+    "joint_elasticity": 'armature="0.002"',
+    "backlash": 'armature="0.002"',
+}
+ROTOR = 0.002
 
 
 def write_pendulum(

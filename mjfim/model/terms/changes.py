@@ -37,6 +37,7 @@ class ChangedElement:
         name: Its name.
         tag: New name of the element in the text; empty where it stays.
         attributes: The new attributes.
+        removed: Names of attributes that are removed.
         of_shorthand: Further attributes where the element of the text is a shorthand, such as
             `position`, whose own attributes the new element does not have.
     """
@@ -45,6 +46,7 @@ class ChangedElement:
     name: str
     tag: str = ""
     attributes: Attributes = ()
+    removed: tuple[str, ...] = ()
     of_shorthand: Attributes = ()
 
 

@@ -59,6 +59,13 @@ class StateLayout:
             act[first : first + count] = int(extended.actuator_actadr[new]) + np.arange(count)
         return cls(qpos=qpos, qvel=qvel, act=act, model=extended)
 
+    @property
+    def added(self) -> frozenset[int]:
+        """Addresses in (qpos, qvel) of the extended model that the stated one does not have."""
+        size = int(self.model.nq) + int(self.model.nv)
+        stated = {*self.qpos.tolist(), *(int(self.model.nq) + self.qvel).tolist()}
+        return frozenset(range(size)) - stated
+
     def positions(self, stated: Any) -> Array:
         """(nq,) extended positions: those of the stated model, and references of added joints."""
         positions = np.array(self.model.qpos0)

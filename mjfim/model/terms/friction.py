@@ -15,18 +15,17 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
-from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.terms.changes import Attributes, ChangedElement, MjcfChange, NewElement
+from mjfim.model.terms.joint_sizes import JointSizes, rounded
 from mjfim.model.terms.term import (
     FieldDescription,
     Term,
     TermQuantity,
     TermTable,
-    named_element,
     require_free_name,
     resolved_values,
 )
-from mjfim.model.units import FORCE_UNITS, JOINT_FIELD_UNITS, joint_unit, per_second
+from mjfim.model.units import FORCE_UNITS, JOINT_FIELD_UNITS, per_second
 
 # Stiffness of the bristle times the timestep squared over the inertia of the joint. The larger it
 # is, the shorter the displacement before sliding; above 1, an explicit step overshoots.
@@ -38,9 +37,6 @@ BRISTLE_STIFFNESS_RK4 = 0.1
 # Damping of the bristle of the dynamic model times the timestep over the inertia of the joint.
 BRISTLE_DAMPING = 0.2
 BRISTLE_DAMPING_RK4 = 0.1
-
-# Significant digits of numbers that the library chooses.
-CHOSEN_DIGITS = 3
 
 # Stribeck speed where none is stated, and the smallest one, over the natural speed of the joint.
 STRIBECK_SHARE = 0.1
@@ -66,53 +62,6 @@ OLSSON_1998 = (
     "H. Olsson, K. J. Åström, C. Canudas de Wit, M. Gäfvert and P. Lischinsky, Friction models and "
     "friction compensation, European Journal of Control 4, 1998"
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _JointSizes:
-    """Natural sizes at a slide or hinge joint.
-
-    Attributes:
-        joint: Name of the joint.
-        number: Number of the joint.
-        dof: Its degree of freedom.
-        unit: Unit of its coordinate, m or rad.
-        inertia: Inertia that its force feels in the reference position [kg or kg m²].
-        force: Force that moves it by its natural size in the natural time [N or N m].
-        speed: Its natural size over the natural time [m/s or rad/s].
-    """
-
-    joint: str
-    number: int
-    dof: int
-    unit: str
-    inertia: float
-    force: float
-    speed: float
-
-    @staticmethod
-    def of(table: TermTable, model: Any, period: float, kind: str) -> _JointSizes:
-        """Sizes at the joint that a table names; ExperimentError for ball and free joints."""
-        name, number = named_element(table, "joint", model, kind)
-        scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
-        if int(model.jnt_type[number]) not in scalar:
-            raise ExperimentError(
-                f"joint: {name!r} is a ball or free joint; a term of kind {kind!r} acts on slides "
-                "and hinges"
-            )
-
-        time = period / LEAST_MOVE_PER_SAMPLE
-        dof = int(model.jnt_dofadr[number])
-        weight = float(model.dof_invweight0[dof])
-        return _JointSizes(
-            joint=name,
-            number=number,
-            dof=dof,
-            unit=joint_unit(model, number),
-            inertia=1.0 / weight if weight > 0.0 else 1.0,
-            force=float(force_sizes(model, time)[dof]),
-            speed=float(position_sizes(model)[dof]) / time,
-        )
 
 
 class _PassiveDevice(Term):
@@ -197,7 +146,7 @@ class Stribeck(_PassiveDevice):
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> Stribeck:
         """Resolve the term; RK4 is refused, whose stages would make the bristle unstable."""
-        at = _JointSizes.of(table, model, period, cls.kind)
+        at = JointSizes.of(table, model, period, cls.kind)
         require_free_name(model, "actuator", table.name)
         if _is_rk4(model):
             raise ExperimentError(
@@ -222,7 +171,7 @@ class Stribeck(_PassiveDevice):
             ),
             ("speed", _stribeck_speed(values["speed"], at, f"{place}[5]")),
         )
-        stiffness = _rounded(BRISTLE_STIFFNESS * at.inertia / float(model.opt.timestep) ** 2)
+        stiffness = rounded(BRISTLE_STIFFNESS * at.inertia / float(model.opt.timestep) ** 2)
         return cls(name=table.name, joint=at.joint, quantities=quantities, stiffness=stiffness)
 
     @property
@@ -276,7 +225,7 @@ class LuGre(_PassiveDevice):
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> LuGre:
         """Resolve the term."""
-        at = _JointSizes.of(table, model, period, cls.kind)
+        at = JointSizes.of(table, model, period, cls.kind)
         require_free_name(model, "actuator", table.name)
 
         stiffness, damping = BRISTLE_STIFFNESS, BRISTLE_DAMPING
@@ -288,8 +237,8 @@ class LuGre(_PassiveDevice):
             "coulomb": frictionloss,
             "excess": 0.0,
             "speed": STRIBECK_SHARE * at.speed,
-            "stiffness": _rounded(stiffness * at.inertia / timestep**2),
-            "damping": _rounded(damping * at.inertia / timestep),
+            "stiffness": rounded(stiffness * at.inertia / timestep**2),
+            "damping": rounded(damping * at.inertia / timestep),
         }
         values = resolved_values(cls.kind, table, defaults)
 
@@ -434,7 +383,7 @@ class AsymmetricFriction(_PassiveDevice):
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> AsymmetricFriction:
         """Resolve the term."""
-        at = _JointSizes.of(table, model, period, cls.kind)
+        at = JointSizes.of(table, model, period, cls.kind)
         require_free_name(model, "actuator", table.name)
         values = resolved_values(cls.kind, table, {"offset": 0.0})
         offset = TermQuantity(
@@ -456,7 +405,7 @@ class AsymmetricFriction(_PassiveDevice):
         actuator.biasprm = _with(actuator.biasprm, constant)
 
 
-def _stribeck_speed(value: float, at: _JointSizes, path: str) -> TermQuantity:
+def _stribeck_speed(value: float, at: JointSizes, path: str) -> TermQuantity:
     """The Stribeck speed of a joint as a field; it is never zero."""
     return TermQuantity(
         value=value,
@@ -465,11 +414,6 @@ def _stribeck_speed(value: float, at: _JointSizes, path: str) -> TermQuantity:
         bounds=(LEAST_STRIBECK_SHARE * at.speed, np.inf),
         numbers=((path, 1.0),),
     )
-
-
-def _rounded(number: float) -> float:
-    """A number that the library chooses, with as many digits as matter."""
-    return float(f"{number:.{CHOSEN_DIGITS}g}")
 
 
 def _is_rk4(model: Any) -> bool:

@@ -8,13 +8,24 @@ from typing import Any
 from mjfim.errors import ExperimentError, unknown
 from mjfim.model.terms.base import Payload, Tilt
 from mjfim.model.terms.drives import ActuatorLag, BackEmf
+from mjfim.model.terms.elasticity import Backlash, JointElasticity
 from mjfim.model.terms.friction import AsymmetricFriction, LuGre, Stribeck
 from mjfim.model.terms.term import Term, TermTable
 
 # All kinds of terms, by the name that the experiment file gives them.
 KINDS: dict[str, type[Term]] = {
     kind.kind: kind
-    for kind in (Stribeck, LuGre, AsymmetricFriction, BackEmf, ActuatorLag, Tilt, Payload)
+    for kind in (
+        Stribeck,
+        LuGre,
+        AsymmetricFriction,
+        BackEmf,
+        ActuatorLag,
+        JointElasticity,
+        Backlash,
+        Tilt,
+        Payload,
+    )
 }
 
 

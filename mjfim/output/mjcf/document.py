@@ -16,7 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ModelError
 from mjfim.model.included_files import included_file
-from mjfim.output.mjcf.xml_edit import Tag, XmlText
+from mjfim.output.mjcf.xml_edit import NewTag, Tag, XmlText
 
 # Relative difference below which two numbers differ only by rounding.
 RELATIVE_TOLERANCE = 1e-14
@@ -199,25 +199,16 @@ class MjcfDocument:
         text, own = self._places[parent]
         text.insert_child(own, name, attributes)
 
-    def append_child(
-        self,
-        parent: int,
-        name: str,
-        attributes: dict[str, str],
-        children: Sequence[tuple[str, dict[str, str]]] = (),
-        comment: str = "",
-    ) -> None:
+    def append_child(self, parent: int, element: NewTag, comment: str = "") -> None:
         """Add an element as the last child of another one. See `XmlText.append_child`.
 
         Args:
             parent: Index of the tag of the enclosing element.
-            name: Name of the new element.
-            attributes: Values by name of the attribute.
-            children: Names and attributes of empty elements inside the new one.
-            comment: Comment above the new element; empty for none.
+            element: The new element.
+            comment: Comment above it; empty for none.
         """
         text, own = self._places[parent]
-        text.append_child(own, name, attributes, children, comment)
+        text.append_child(own, element, comment)
 
     def element(self, kind: str, name: str) -> int:
         """Find a named element.

@@ -15,6 +15,7 @@ from mjfim.model.loading import ModelSource
 from mjfim.model.terms.changes import Attributes, ChangedElement, NewElement
 from mjfim.model.terms.term import Term
 from mjfim.output.mjcf.document import MjcfDocument, all_digits
+from mjfim.output.mjcf.xml_edit import NewTag
 
 # Elements of actuators that state gain and bias as `general` does, or not at all.
 PLAIN_ACTUATORS = ("general", "motor")
@@ -54,21 +55,21 @@ def with_terms(document: MjcfDocument, source: ModelSource) -> MjcfDocument:
 
 def _add(document: MjcfDocument, term: Term, new: NewElement) -> None:
     """Add an element, with a comment that says what it is."""
-    attributes = _texts(new.attributes)
-    children = [(tag, _texts(inside)) for tag, inside in new.children]
+    children = tuple(NewTag(name=tag, attributes=_texts(inside)) for tag, inside in new.children)
+    element = NewTag(name=new.tag, attributes=_texts(new.attributes), children=children)
     comment = f"{term.kind} {term.name!r}".replace("--", "- -")
 
     if new.parent_kind:
-        parent = document.element(new.parent_kind, new.parent)
-        document.append_child(parent, new.tag, attributes, children, comment)
+        document.append_child(document.element(new.parent_kind, new.parent), element, comment)
         return
 
     # Elements of a section keep their order, so that the new one is in the last section.
     sections = document.top_level(new.parent)
     if sections and document.is_in_main_file(sections[-1]):
-        document.append_child(sections[-1], new.tag, attributes, children, comment)
+        document.append_child(sections[-1], element, comment)
     else:
-        document.append_child(ROOT, new.parent, {}, [(new.tag, attributes)], comment)
+        section = NewTag(name=new.parent, attributes={}, children=(element,))
+        document.append_child(ROOT, section, comment)
 
 
 def _change(document: MjcfDocument, change: ChangedElement) -> None:
@@ -89,6 +90,8 @@ def _change(document: MjcfDocument, change: ChangedElement) -> None:
             for attribute in OF_SHORTHANDS:
                 document.set(tag, attribute, None)
             _set(document, tag, change.of_shorthand)
+    for attribute in change.removed:
+        document.set(tag, attribute, None)
     _set(document, tag, change.attributes)
 
 
@@ -99,7 +102,7 @@ def _set(document: MjcfDocument, tag: int, attributes: Attributes) -> None:
         if isinstance(value, str):
             document.set(tag, attribute, value)
         elif not _are_numbers(written, value):
-            document.set(tag, attribute, all_digits(*value))
+            document.set(tag, attribute, _short(*value))
 
 
 def _are_numbers(written: list[str], values: Iterable[float]) -> bool:
@@ -131,11 +134,14 @@ def _extend_keyframes(document: MjcfDocument, source: ModelSource) -> None:
 
 def _set_row(document: MjcfDocument, tag: int, attribute: str, numbers: Array) -> None:
     """State the numbers of an attribute of a keyframe."""
-    document.set(tag, attribute, all_digits(*np.asarray(numbers).tolist()))
+    document.set(tag, attribute, _short(*np.asarray(numbers).tolist()))
 
 
 def _texts(attributes: Attributes) -> dict[str, str]:
     """Attributes as the text states them."""
-    return {
-        name: value if isinstance(value, str) else all_digits(*value) for name, value in attributes
-    }
+    return {name: value if isinstance(value, str) else _short(*value) for name, value in attributes}
+
+
+def _short(*values: float) -> str:
+    """Numbers with all digits; whole numbers without a decimal point."""
+    return " ".join(word.removesuffix(".0") for word in all_digits(*values).split())

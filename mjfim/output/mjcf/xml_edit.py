@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 from xml.parsers import expat
@@ -49,6 +48,33 @@ class Tag:
     attributes: dict[str, str]
     start: int
     parent: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewTag:
+    """An element that is added to a text.
+
+    Attributes:
+        name: Name of the element.
+        attributes: Values by name of the attribute.
+        children: Elements inside it.
+    """
+
+    name: str
+    attributes: dict[str, str]
+    children: tuple[NewTag, ...] = ()
+
+    def lines(self, depth: int) -> list[tuple[int, bytes]]:
+        """Lines of the element with their depths.
+
+        Args:
+            depth: Depth of its own line.
+        """
+        tag = _start_tag(self.name, self.attributes)
+        if not self.children:
+            return [(depth, b"<%s/>" % tag)]
+        inside = [line for child in self.children for line in child.lines(depth + 1)]
+        return [(depth, b"<%s>" % tag), *inside, (depth, b"</%s>" % self.name.encode())]
 
 
 class XmlText:
@@ -179,33 +205,18 @@ class XmlText:
         """
         self._children.setdefault(parent, []).append(b"<%s/>" % _start_tag(name, attributes))
 
-    def append_child(
-        self,
-        parent: int,
-        name: str,
-        attributes: dict[str, str],
-        children: Sequence[tuple[str, dict[str, str]]] = (),
-        comment: str = "",
-    ) -> None:
+    def append_child(self, parent: int, element: NewTag, comment: str = "") -> None:
         """Add an element as the last child of another one.
 
         It gets the indentation of the present last child.
 
         Args:
             parent: Index of the tag of the enclosing element.
-            name: Name of the new element.
-            attributes: Values by name of the attribute.
-            children: Names and attributes of empty elements inside the new one.
-            comment: Comment above the new element; empty for none.
+            element: The new element.
+            comment: Comment above it; empty for none.
         """
         lines = [(0, f"<!-- {comment} -->".encode())] if comment else []
-        if children:
-            lines.append((0, b"<%s>" % _start_tag(name, attributes)))
-            lines += [(1, b"<%s/>" % _start_tag(*child)) for child in children]
-            lines.append((0, b"</%s>" % name.encode()))
-        else:
-            lines.append((0, b"<%s/>" % _start_tag(name, attributes)))
-        self._last_children.setdefault(parent, []).extend(lines)
+        self._last_children.setdefault(parent, []).extend([*lines, *element.lines(0)])
 
     def edited(self) -> bytes:
         """Return the text with all edits applied.
