@@ -248,13 +248,18 @@ def test_every_field_is_tested() -> None:
     assert tried == every
 
 
-def test_parameters_outside_the_model_change_nothing(tmp_path: Path) -> None:
+def test_parameters_outside_the_model_are_a_comment(tmp_path: Path) -> None:
     task = task_of(RICH, tmp_path, *OUTSIDE, noise={"seen": 0.1, "qpos:j": 0.1})
-    assert (
-        write_identified(tmp_path / "identified.xml", task.system, np.full(len(OUTSIDE), 0.01))
-        is None
-    )
-    assert (tmp_path / "identified.xml").read_bytes() == (tmp_path / "model.xml").read_bytes()
+    path, model = tmp_path / "identified.xml", tmp_path / "model.xml"
+    said = "  <!-- not part of an MJCF: output/seen[0]:bias = 0.01, output/seen[0]:scale = 0.01, "
+    assert write_identified(path, task.system, np.full(len(OUTSIDE), 0.01)) is None
+    gone, came = lines(model, path)
+    assert not gone
+    assert came == [f"{said}output:delay = 0.01 s -->"]
+
+    # Errors of zero need no comment.
+    assert write_identified(path, task.system, np.zeros(len(OUTSIDE))) is None
+    assert path.read_bytes() == model.read_bytes()
 
 
 # Without masses of geoms, which the compiled model does not keep, and inertias, of which a body

@@ -199,6 +199,16 @@ class MjcfDocument:
         text, own = self._places[parent]
         text.insert_child(own, name, attributes)
 
+    def insert_comment(self, parent: int, comment: str) -> None:
+        """Add a comment before the first child of an element. See `XmlText.insert_comment`.
+
+        Args:
+            parent: Index of the tag of the element.
+            comment: The comment; two hyphens in a row are separated.
+        """
+        text, own = self._places[parent]
+        text.insert_comment(own, comment.replace("--", "- -"))
+
     def append_child(self, parent: int, element: NewTag, comment: str = "") -> None:
         """Add an element as the last child of another one. See `XmlText.append_child`.
 

@@ -16,7 +16,16 @@ from mjfim.errors import ModelError
 from mjfim.model.elements import element_name
 from mjfim.model.parameters import ParameterSet, Target
 from mjfim.model.paths import MODEL_ARRAYS, POLYNOMIAL_ARRAYS, ParameterPath, resolve
-from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TargetField
+from mjfim.model.targets import (
+    InertiaField,
+    ModelField,
+    OutputBiasField,
+    OutputDelayField,
+    OutputScaleField,
+    RotationField,
+    SpecField,
+    TargetField,
+)
 from mjfim.output.mjcf.actuators import ARRAYS, attribute_changes
 from mjfim.output.mjcf.document import MjcfDocument, all_digits, nearly_equal
 from mjfim.output.mjcf.inertials import write_inertial
@@ -106,6 +115,10 @@ class ParameterEdits:
             write_inertial(self.document, name, self._old, self._wanted, as_matrix=as_matrix)
         if self._new_option:
             self.document.insert_child(0, "option", self._new_option)
+
+        outside = _errors_of_sensors(parameters, theta)
+        if outside:
+            self.document.insert_comment(0, f"not part of an MJCF: {', '.join(outside)}")
 
     def _numbers_of(self, target: Target) -> Iterator[tuple[ParameterPath, TargetField]]:
         """The numbers of the model that a target determines, with their paths."""
@@ -294,6 +307,19 @@ class ParameterEdits:
             raise ModelError(f"{kind} {name!r} is inside a <frame>")
         if kind == "site" and np.isfinite(self._spec.site(name).fromto[0]):
             raise ModelError(f"site {name!r} is given by its end points")
+
+
+def _errors_of_sensors(parameters: ParameterSet, theta: Array) -> list[str]:
+    """Values of biases, scales and delays that are not zero, which no element can state."""
+    kinds = (OutputBiasField, OutputScaleField, OutputDelayField)
+    found = []
+    for parameter, value in zip(parameters.parameters, theta, strict=True):
+        for target in parameter.targets:
+            written = target.scale * float(value) + target.offset
+            if isinstance(target.field, kinds) and written != 0.0:
+                unit = parameter.unit if target.scale == 1.0 else ""
+                found.append(f"{target.path} = {all_digits(written)} {unit}".rstrip())
+    return found
 
 
 def _numbers(model: Any, target_field: ModelField) -> Array:

@@ -205,6 +205,15 @@ class XmlText:
         """
         self._children.setdefault(parent, []).append(b"<%s/>" % _start_tag(name, attributes))
 
+    def insert_comment(self, parent: int, comment: str) -> None:
+        """Add a comment before the first child of an element, with the indentation of this child.
+
+        Args:
+            parent: Index of the tag of the element.
+            comment: The comment, without two hyphens in a row.
+        """
+        self._children.setdefault(parent, []).append(f"<!-- {comment} -->".encode())
+
     def append_child(self, parent: int, element: NewTag, comment: str = "") -> None:
         """Add an element as the last child of another one.
 
