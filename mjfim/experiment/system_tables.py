@@ -30,6 +30,7 @@ TermKind = Literal[
     "stribeck",
     "lugre",
     "asymmetric_friction",
+    "load_dependent_friction",
     "back_emf",
     "actuator_lag",
     "joint_elasticity",

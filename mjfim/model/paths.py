@@ -69,6 +69,7 @@ MODEL_ARRAYS: dict[str, dict[str, str]] = {
         "dynprm": "actuator_dynprm",
     },
     "geom": {"friction": "geom_friction", "solref": "geom_solref"},
+    "pair": {"friction": "pair_friction", "solref": "pair_solref"},
     "site": {"pos": "site_pos"},
     "tendon": {
         "stiffness": "tendon_stiffness",
@@ -123,8 +124,8 @@ class ParameterPath:
 
     Attributes:
         text: The path.
-        kind: Kind of the element: `body`, `joint`, `actuator`, `geom`, `site`, `tendon`, `option`,
-            `term`, `initial`, `output`.
+        kind: Kind of the element: `body`, `joint`, `actuator`, `geom`, `pair`, `site`, `tendon`,
+            `option`, `term`, `initial`, `output`.
         name: Name of the element; empty where the path has none.
         field: Field of the element.
         index: Index of the component; None where the path has none.

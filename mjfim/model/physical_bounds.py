@@ -15,6 +15,7 @@ NOT_NEGATIVE = {
     "joint": ("damping", "frictionloss", "armature", "stiffness"),
     "tendon": ("damping", "frictionloss", "armature", "stiffness"),
     "geom": ("mass", "density", "size", "friction"),
+    "pair": ("friction",),
     "option": ("density", "viscosity"),
 }
 

@@ -28,7 +28,7 @@ from mjfim.records.inventory import (
 WORLD = "world"
 
 # Kinds of elements that parameter paths name, in the order of the list.
-NAMED_KINDS = ("body", "joint", "actuator", "geom", "site", "tendon")
+NAMED_KINDS = ("body", "joint", "actuator", "geom", "pair", "site", "tendon")
 
 # Fields of an actuator with many entries of which most are unused; entries that are 0 are left out.
 SPARSE_FIELDS = ("gear", "gainprm", "biasprm", "dynprm")

@@ -530,7 +530,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
             HOME,
             "parameters.m",
             "kind 'bdy'",
-            "actuator, body, geom, initial, joint, option, output, site, tendon",
+            "actuator, body, geom, initial, joint, option, output, pair, site, tendon, term",
         ],
     ),
     "path name": (

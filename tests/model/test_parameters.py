@@ -149,6 +149,11 @@ DRAWN = """
 """
 
 # model, path, new value, the derived constants of MjModel that must follow
+PAIR = CONTACT.replace(
+    "</worldbody>",
+    '</worldbody><contact><pair name="rub" geom1="ball" geom2="floor"/></contact>',
+)
+
 EDITS = [
     (ARM, "body/a:mass", 2.0, ("body_subtreemass", "dof_M0", "body_invweight0")),
     (ARM, "body/b:mass", 2.0, ("body_subtreemass", "dof_M0", "actuator_acc0")),
@@ -195,6 +200,8 @@ EDITS = [
     (CONTACT, "geom/ball:solref[1]", 0.3, ()),
     (CONTACT, "geom/ball:friction", 0.9, ()),
     (CONTACT, "geom/floor:friction", 2.0, ()),
+    (PAIR, "pair/rub:friction", 0.9, ()),
+    (PAIR, "pair/rub:solref[1]", 0.3, ()),
     (DRAWN, "geom/skin:pos[1]", 0.5, ()),
     (TENDON, "tendon/t:stiffness", 40.0, ()),
     (TENDON, "tendon/t:damping", 3.0, ()),
@@ -1065,7 +1072,7 @@ def test_names_may_hold_slashes_and_spaces() -> None:
             [
                 "unknown kind 'bodies'",
                 "did you mean 'body'",
-                "actuator, body, geom, initial, joint, option, output, site",
+                "actuator, body, geom, initial, joint, option, output, pair, site",
             ],
         ),
         (

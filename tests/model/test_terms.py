@@ -192,6 +192,28 @@ def test_stribeck_friction_moves_like_a_stiff_bristle(tmp_path: Path, integrator
     assert (error < 0.02).all()
 
 
+@pytest.mark.parametrize("timestep", [0.001, 0.002])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_friction_grows_with_the_torque_of_the_motor(
+    tmp_path: Path, integrator: str, timestep: float
+) -> None:
+    system = System.resolve(experiment_of(tmp_path, "load_dependent_friction"))
+    write_pendulum(tmp_path, timestep=timestep, integrator=integrator)
+    system = System.resolve(system.experiment)
+    ctrl = motor_torque(1.5, 100.0)
+
+    def derivative(x: Any, u: float) -> list[float]:
+        friction = 0.2 * abs(u) * np.tanh(x[1] / 1e-3)
+        return [x[1], rigid(x[0], x[1], u - friction)]
+
+    expected = integrated(derivative, ctrl, 0.01, [0.0, 0.0])
+    found = simulated(system, ctrl)
+    error = np.sqrt(np.mean((found - expected) ** 2, axis=0)) / np.ptp(expected, axis=0)
+    assert (error < 0.005).all()
+    without = simulated(system, ctrl, system.parameters.guess)
+    assert np.abs(without - expected)[:, 0].max() > 0.1 * np.ptp(expected[:, 0])
+
+
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
 def test_friction_with_an_offset_differs_by_direction(tmp_path: Path, direction: float) -> None:
     experiment = experiment_of(

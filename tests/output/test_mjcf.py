@@ -74,6 +74,9 @@ RICH = """<?xml version="1.0"?>
     <general name="g" joint="l" dyntype="filter"
       dynprm="0.050" gainprm="2.0" biastype="affine" biasprm="0 -2.0 -0.10"/>
   </actuator>
+  <contact>
+    <pair name="touch" geom1="g" geom2="i"   friction="0.50 0.50 0.0050"/>
+  </contact>
   <sensor><framepos objtype="site" objname="s" name="seen" noise=".01"/></sensor>
 </mujoco>
 """
@@ -147,6 +150,11 @@ STATED: dict[str, tuple[float, str]] = {
     "site/s:rot[1]": (0.1, '            quat="'),
     "tendon/band:stiffness": (60.0, 'name="band" stiffness="60.0" springlength="0.20 0.90"'),
     "tendon/band:damping": (2.0, 'springlength="0.20 0.90" damping="2.0">'),
+    "pair/touch:friction[2]": (
+        0.007,
+        '    <pair name="touch" geom1="g" geom2="i"   friction="0.50 0.50 0.007"/>',
+    ),
+    "pair/touch:solref": (0.03, 'friction="0.50 0.50 0.0050" solref="0.03"/>'),
     "tendon/band:frictionloss": (2.0, 'damping="1" frictionloss="2.0">'),
     "tendon/band:armature": (2.0, 'damping="1" armature="2.0">'),
     "tendon/band:springlength[1]": (0.8, 'springlength="0.20 0.8" damping="1">'),

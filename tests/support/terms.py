@@ -50,6 +50,7 @@ EXAMPLES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
     "stribeck": ({"joint": "pivot"}, {"excess": 0.04, "speed": 0.5}),
     "lugre": ({"joint": "pivot"}, {"coulomb": 0.03, "excess": 0.03, "speed": 0.5}),
     "asymmetric_friction": ({"joint": "pivot"}, {"offset": 0.02}),
+    "load_dependent_friction": ({"actuator": "motor"}, {"coefficient": 0.2}),
     "back_emf": ({"actuator": "motor"}, {"constant": 0.02}),
     "actuator_lag": ({"actuator": "motor"}, {"time_constant": 0.03}),
     "joint_elasticity": ({"joint": "pivot"}, {"compliance": 0.05, "damping": 0.004}),

@@ -32,7 +32,12 @@ PLAIN_BIASES = {
     int(mujoco.mjtBias.mjBIAS_AFFINE): "affine",
 }
 
-# Smallest time constant over the timestep that the stages of RK4 follow.
+# Time constant over the timestep where none is stated. It delays by less than a timestep, and yet
+# the motion depends on it: a shorter lag has no effect at all, so that no fit could begin there.
+SHORT_LAG = 0.5
+
+# Smallest time constant over the timestep. The stages of RK4 need a longer one.
+LEAST_LAG = 0.25
 LEAST_LAG_RK4 = 0.5
 
 KRAUSE_2013 = (
@@ -75,16 +80,16 @@ class ActuatorLag(Term):
         name, number = named_element(table, "actuator", model, cls.kind)
         _require_plain(model, name, number, cls.kind)
 
-        # With `actearly` a time constant of zero is the actuator without the lag. RK4 takes the
-        # activation through its stages and needs a longer one.
+        # With `actearly` the actuator acts within the same step, so that a vanishing lag would be
+        # the actuator without it. RK4 takes the activation through its stages.
         timestep = float(model.opt.timestep)
         explicit = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-        least = LEAST_LAG_RK4 * timestep if explicit else 0.0
-        values = resolved_values(cls.kind, table, {"time_constant": least})
+        least = (LEAST_LAG_RK4 if explicit else LEAST_LAG) * timestep
+        values = resolved_values(cls.kind, table, {"time_constant": SHORT_LAG * timestep})
         if values["time_constant"] < least:
             raise ExperimentError(
-                f"values.time_constant: with the integrator RK4 it must be at least {least:g} s, "
-                "half of a timestep"
+                f"values.time_constant: {values['time_constant']:g} s is too short to have an "
+                f"effect; state at least {least:g} s"
             )
         quantity = TermQuantity(
             value=values["time_constant"],

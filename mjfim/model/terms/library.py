@@ -10,6 +10,7 @@ from mjfim.model.terms.base import Payload, Tilt
 from mjfim.model.terms.drives import ActuatorLag, BackEmf
 from mjfim.model.terms.elasticity import Backlash, JointElasticity
 from mjfim.model.terms.friction import AsymmetricFriction, LuGre, Stribeck
+from mjfim.model.terms.load_friction import LoadDependentFriction
 from mjfim.model.terms.term import Term, TermTable
 
 # All kinds of terms, by the name that the experiment file gives them.
@@ -19,6 +20,7 @@ KINDS: dict[str, type[Term]] = {
         Stribeck,
         LuGre,
         AsymmetricFriction,
+        LoadDependentFriction,
         BackEmf,
         ActuatorLag,
         JointElasticity,

@@ -33,6 +33,9 @@ TREE_KINDS = {
 # Sections of the MJCF whose children all define objects of the section's name.
 SECTIONS = ("actuator", "tendon")
 
+# Kind of object that an element inside <contact> defines.
+CONTACT_KINDS = {"pair": "pair"}
+
 # Attributes that state an orientation.
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 
@@ -380,5 +383,7 @@ def _named_elements(tags: Sequence[Tag]) -> Iterator[tuple[tuple[str, str], int]
         kind = parent.name if parent.name in SECTIONS and parent.parent == 0 else None
         if in_tree:
             kind = TREE_KINDS.get(tag.name)
+        elif parent.name == "contact" and parent.parent == 0:
+            kind = CONTACT_KINDS.get(tag.name)
         if kind is not None and "name" in tag.attributes:
             yield (kind, tag.attributes["name"]), i

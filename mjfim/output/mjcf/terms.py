@@ -82,6 +82,12 @@ def _change(document: MjcfDocument, change: ChangedElement) -> None:
             document.insert_child(ROOT, "option", _texts(change.attributes))
         return
 
+    if change.kind == "flag":
+        for i, each in enumerate(document.tags):
+            if each.name == "flag":
+                _set(document, i, change.attributes)
+        return
+
     tag = document.element(change.kind, change.name)
     name = document.tags[tag].name
     if change.tag and change.tag != name:

@@ -45,6 +45,8 @@ COMPARED = (
     "geom_size",
     "geom_friction",
     "geom_solref",
+    "pair_friction",
+    "pair_solref",
 )
 
 # Prefixes of arrays that COMPARED covers but that only speed up the computation, or are compared as
