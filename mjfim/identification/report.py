@@ -37,11 +37,11 @@ from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
     Estimate,
-    MissingTerm,
     Prediction,
     Restart,
 )
 from mjfim.records.horizons import HorizonStudy
+from mjfim.records.missing_term import MissingTerm
 from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
 

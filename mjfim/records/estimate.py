@@ -12,6 +12,7 @@ from mjfim.arrays import Array, freeze
 from mjfim.records.combinations import join_names
 from mjfim.records.horizons import HorizonStudy
 from mjfim.records.labels import Labels
+from mjfim.records.missing_term import MissingTerm
 from mjfim.records.recording import Recording
 from mjfim.records.selection import Selection
 from mjfim.records.serialization import SavedRecord
@@ -407,44 +408,6 @@ class Prediction:
             "nominal_rms": self.nominal.by_output(self.nominal.rms),
             "nominal_mae": self.nominal.by_output(self.nominal.mae),
             "ratio": self.ratio,
-        }
-
-
-@dataclass(frozen=True, kw_only=True)
-class MissingTerm:
-    """A physical term that the model lacks and that would explain part of the residuals.
-
-    Attributes:
-        description: The term in words.
-        path: Target of a parameter that would add it.
-        value: Estimated value of that parameter [unit].
-        unit: Its unit; may be empty.
-        sigmas: `value` divided by its standard deviation.
-        share: Fraction of the sum of squared residuals that the term explains, 0 to 1.
-    """
-
-    description: str
-    path: str
-    value: float
-    unit: str
-    sigmas: float
-    share: float
-
-    def __str__(self) -> str:
-        amount = f"{self.value:.2g} {self.unit}".strip()
-        share = f"{100 * self.share:.2g} % of the sum of squares"
-        evidence = f"about {amount} ({self.sigmas:.0f} σ, {share})"
-        return f'{self.description}, {evidence}; to estimate it, add: target = "{self.path}"'
-
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `suspects` in estimate.json."""
-        return {
-            "words": self.description,
-            "path": self.path,
-            "value": self.value,
-            "unit": self.unit,
-            "sigmas": self.sigmas,
-            "share": self.share,
         }
 
 

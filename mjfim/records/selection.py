@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any
+
+from mjfim.records.missing_term import AddedTerm, TermParameter, toml_table
 
 
 class Decision(Enum):
@@ -21,14 +23,16 @@ class Decision(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class SelectedTerm:
-    """A term that was added to a model, which a parameter of the experiment stands for.
+    """A term that was added to a model, which parameters of the experiment stand for.
 
     Attributes:
-        name: Name of the parameter.
+        name: Name of its main parameter.
         description: The term in words.
-        path: Target of the parameter.
-        unit: Unit of the parameter; may be empty.
+        path: Target of the main parameter.
+        unit: Unit of the main parameter; may be empty.
         scale: Size of the term [unit].
+        further: Its further parameters by name.
+        added: Table of the library of terms that it needs; None for a number of the model.
         source: Publication that describes the term; may be empty.
     """
 
@@ -37,12 +41,35 @@ class SelectedTerm:
     path: str
     unit: str
     scale: float
+    further: dict[str, TermParameter] = field(default_factory=dict)
+    added: AddedTerm | None = None
     source: str = ""
 
     @property
     def table(self) -> dict[str, object]:
-        """The table of the parameter in an experiment file."""
+        """The table of the main parameter in an experiment file."""
         return {"target": self.path, "scale": self.scale}
+
+    @property
+    def parameters(self) -> dict[str, dict[str, object]]:
+        """The tables of all its parameters, by name."""
+        further = {name: parameter.table for name, parameter in self.further.items()}
+        return {self.name: self.table, **further}
+
+    @property
+    def terms(self) -> dict[str, dict[str, object]]:
+        """The table of the library of terms that it needs, by name; empty without one."""
+        return {} if self.added is None else {self.added.name: self.added.table}
+
+    @property
+    def toml(self) -> str:
+        """The tables in an experiment file, each in one line."""
+        lines = [] if self.added is None else [toml_table("terms", self.added)]
+        for name, table in self.parameters.items():
+            lines.append(
+                f'[parameters.{name}] target = "{table["target"]}", scale = {table["scale"]:.2g}'
+            )
+        return "; ".join(lines)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +156,18 @@ class Selection:
 
     @property
     def parameters(self) -> dict[str, dict[str, object]]:
-        """Tables of the terms, for `experiment.replace(parameters=...)`."""
-        return {term.name: term.table for term in self.terms}
+        """Tables of the parameters of the terms, for `experiment.replace(parameters=...)`."""
+        return {name: table for term in self.terms for name, table in term.parameters.items()}
+
+    @property
+    def library_terms(self) -> dict[str, dict[str, object]]:
+        """Tables of the library that the terms need, for `experiment.replace(terms=...)`."""
+        return {name: table for term in self.terms for name, table in term.terms.items()}
+
+    @property
+    def tables(self) -> dict[str, dict[str, dict[str, object]]]:
+        """All tables of the terms: `experiment.replace(**selection.tables)` has them."""
+        return {"parameters": self.parameters, "terms": self.library_terms}
 
     @property
     def errors(self) -> tuple[float, float]:

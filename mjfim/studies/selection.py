@@ -30,7 +30,8 @@ from mjfim.identification.searches import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError
 from mjfim.parallel import ExecutorLike, one_blas_thread
-from mjfim.records.estimate import Estimate, MissingTerm
+from mjfim.records.estimate import Estimate
+from mjfim.records.missing_term import MissingTerm, TermParameter
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
 from mjfim.records.selection import (
@@ -71,8 +72,8 @@ def select_terms(
     """Estimate parameters, and extend the model by the terms that the recordings show it to lack.
 
     `estimate.selection` says which terms were added and why. The experiment of the extended model
-    is `experiment.replace(parameters=estimate.selection.parameters)`. Ctrl-C ends the selection
-    with the terms so far.
+    is `experiment.replace(**estimate.selection.tables)`. Ctrl-C ends the selection with the terms
+    so far.
 
     Args:
         experiment: Model, parameters and noise.
@@ -170,6 +171,11 @@ class _Model:
     losses: HeldOutLosses
     cost: float
     terms: tuple[SelectedTerm, ...]
+
+    @property
+    def penalised_cost(self) -> float:
+        """Cost and the number of parameters of the terms, by which chance reduces it (AIC)."""
+        return self.cost + sum(len(term.parameters) for term in self.terms)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -285,8 +291,8 @@ class _Selector:
             similar = [
                 pair for pair in clear if not pair[0].losses.reduction(least[0].losses).is_clear
             ]
-            highest = min(pair[0].cost for pair in similar) + EQUAL_COST
-            best = next(pair for pair in similar if pair[0].cost <= highest)
+            highest = min(pair[0].penalised_cost for pair in similar) + EQUAL_COST
+            best = next(pair for pair in similar if pair[0].penalised_cost <= highest)
         steps.extend(step for found, step in tried if best is None or found is not best[0])
         if best is None:
             return None
@@ -340,16 +346,15 @@ class _Selector:
     def _extended(self, model: _Model, first: _Model, candidate: MissingTerm) -> _Model | None:
         """The model with one term more; None where it cannot be simulated, or after a stop."""
         names = model.result.task.system.parameters.names
-        term = SelectedTerm(
-            name=_name_of(candidate.path, names),
-            description=candidate.description,
-            path=candidate.path,
-            unit=candidate.unit,
-            scale=abs(candidate.value),
-        )
+        term = selected_term(candidate, names)
         values = dict(zip(names, model.result.theta, strict=True))
+        starts = {name: parameter.value for name, parameter in term.further.items()}
         return self._fitted(
-            model, first, (*model.terms, term), values, {term.name: candidate.value}
+            model,
+            first,
+            (*model.terms, term),
+            values,
+            {term.name: candidate.value, **starts},
         )
 
     def _without(self, model: _Model, first: _Model, term: SelectedTerm) -> _Model | None:
@@ -374,19 +379,23 @@ class _Selector:
             first: The stated model.
             terms: The terms.
             values: Values of the parameters where the search begins [theta-unit].
-            changes: Values that the terms add to those of the model [theta-unit].
+            changes: Values of new parameters: what numbers of the model gain, and values of fields
+                of the library of terms [theta-unit].
         """
         stated = first.result.task.system
-        tables = {term.name: term.table for term in terms}
+        tables = Selection(terms=terms, steps=(), ending="").tables
         system = System.resolve(
-            stated.experiment.replace(parameters=tables),
+            stated.experiment.replace(**tables),
             threads=stated.threads,
             source=stated.source,
         )
         parameters = system.parameters
         start = np.array(parameters.guess)
-        for i, name in enumerate(parameters.names):
-            start[i] = values.get(name, start[i]) + changes.get(name, 0.0)
+        for i, parameter in enumerate(parameters.parameters):
+            change = changes.get(parameter.name, 0.0)
+            is_field = parameter.name in changes and parameter.targets[0].term is not None
+            start[i] = change if is_field else values.get(parameter.name, start[i]) + change
+        start = np.clip(start, parameters.lower, parameters.upper)
 
         task = FitTask.of(system, first.result.task.recordings, start=start)
         try:
@@ -426,6 +435,30 @@ class _Selector:
     def _is_stopped(self) -> bool:
         """True after a request to stop."""
         return self.budget.stop.requested
+
+
+def selected_term(candidate: MissingTerm, taken: Iterable[str]) -> SelectedTerm:
+    """The term that a candidate stands for, with names of its parameters.
+
+    Args:
+        candidate: The candidate.
+        taken: Names of the present parameters.
+    """
+    name = _name_of(candidate.path, taken)
+    further: dict[str, TermParameter] = {}
+    for parameter in candidate.further:
+        used = {*taken, name, *further}
+        further[_name_of(parameter.path, used)] = parameter
+    return SelectedTerm(
+        name=name,
+        description=candidate.description,
+        path=candidate.path,
+        unit=candidate.unit,
+        scale=abs(candidate.value),
+        further=further,
+        added=candidate.added,
+        source=candidate.source,
+    )
 
 
 def _stated_values(model: _Model, first: _Model) -> dict[str, float]:

@@ -18,12 +18,12 @@ from mjfim.records.design import (
 )
 from mjfim.records.estimate import (
     Estimate,
-    MissingTerm,
     Prediction,
     PredictionErrors,
     Whiteness,
 )
 from mjfim.records.labels import Labels
+from mjfim.records.missing_term import MissingTerm
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness

@@ -35,10 +35,7 @@ def describe_selection(selection: Selection) -> list[Part]:
             text = _describe_alternatives(step)
             parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
     if selection.terms:
-        tables = "; ".join(
-            f'[parameters.{term.name}] target = "{term.path}", scale = {term.scale:.2g}'
-            for term in selection.terms
-        )
+        tables = "; ".join(term.toml for term in selection.terms)
         text = f"To keep these terms, add to the experiment file: {tables}"
         parts.append(Paragraph(text=text, emphasis=Emphasis.WEAK))
     return parts

@@ -253,7 +253,7 @@ def _steps_after_estimate(estimate: Estimate) -> Iterator[str]:
     for term in estimate.missing_terms[:1]:
         yield (
             f"Add the term that explains most of the residuals, {term.description}: "
-            f'`target = "{term.path}"`.'
+            f"`{term.recipe}`."
         )
     if estimate.misfit and estimate.worst_residual is not None:
         yield f"Look where the model fails: {estimate.worst_residual}."

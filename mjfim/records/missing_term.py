@@ -1,0 +1,134 @@
+"""Records of physical terms that a model lacks: what a test promises, and how to add them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class TermParameter:
+    """A parameter that a term needs.
+
+    Attributes:
+        path: Target of the parameter.
+        value: Value where a search begins [unit].
+        unit: Its unit; may be empty.
+        scale: Size of the parameter, larger than 0 [unit].
+    """
+
+    path: str
+    value: float
+    unit: str
+    scale: float
+
+    @property
+    def table(self) -> dict[str, object]:
+        """The table of the parameter in an experiment file."""
+        return {"target": self.path, "scale": self.scale}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddedTerm:
+    """A table `[terms.<name>]` that a term needs.
+
+    Attributes:
+        name: Name of the term.
+        kind: Its kind.
+        element: Key of the element on which it acts, such as `joint`; empty for the base.
+        element_name: Name of this element.
+        values: Values of fields that no parameter sets [unit of the field].
+    """
+
+    name: str
+    kind: str
+    element: str
+    element_name: str
+    values: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def table(self) -> dict[str, object]:
+        """The table in an experiment file."""
+        acts_on = {self.element: self.element_name} if self.element else {}
+        values = {"values": dict(self.values)} if self.values else {}
+        return {"kind": self.kind, **acts_on, **values}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissingTerm:
+    """A physical term that the model lacks and that would explain part of the residuals.
+
+    Attributes:
+        description: The term in words.
+        path: Target of a parameter that would add it.
+        value: Estimated value of that parameter [unit].
+        unit: Its unit; may be empty.
+        sigmas: `value` divided by its standard deviation; for a term with several parameters, the
+            size of the deviation of a normal variable with the same probability.
+        share: Fraction of the sum of squared residuals that the term explains, 0 to 1.
+        further: Further parameters that belong to the term.
+        added: Table of the library of terms that it needs; None for a number of the model.
+        source: Publication that describes the term; may be empty.
+    """
+
+    description: str
+    path: str
+    value: float
+    unit: str
+    sigmas: float
+    share: float
+    further: tuple[TermParameter, ...] = ()
+    added: AddedTerm | None = None
+    source: str = ""
+
+    @property
+    def recipe(self) -> str:
+        """What to add to the experiment file, in one line of TOML."""
+        tables = [] if self.added is None else [toml_table("terms", self.added)]
+        targets = [self.path, *(parameter.path for parameter in self.further)]
+        return "; ".join([*tables, *(f'target = "{path}"' for path in targets)])
+
+    def __str__(self) -> str:
+        amount = f"{self.value:.2g} {self.unit}".strip()
+        share = f"{100 * self.share:.2g} % of the sum of squares"
+        evidence = f"about {amount} ({self.sigmas:.0f} σ, {share})"
+        return f"{self.description}, {evidence}; to estimate it, add: {self.recipe}"
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one entry of `suspects` in estimate.json."""
+        found = {
+            "words": self.description,
+            "path": self.path,
+            "value": self.value,
+            "unit": self.unit,
+            "sigmas": self.sigmas,
+            "share": self.share,
+        }
+        if self.further:
+            found["further"] = {each.path: each.value for each in self.further}
+        if self.added is not None:
+            found["terms"] = {self.added.name: self.added.table}
+        return found
+
+
+def toml_table(section: str, added: AddedTerm) -> str:
+    """A table in one line of TOML, such as `[terms.friction] kind = "stribeck", joint = "pivot"`.
+
+    Args:
+        section: Name of the table of tables.
+        added: The table.
+    """
+    return f"[{section}.{added.name}] {_entries(added.table)}"
+
+
+def _entries(table: Mapping[str, object]) -> str:
+    """Entries of a table in one line."""
+    return ", ".join(f"{key} = {_value(value)}" for key, value in table.items())
+
+
+def _value(value: object) -> str:
+    """A value in TOML; numbers with two digits."""
+    if isinstance(value, Mapping):
+        return f"{{ {_entries(value)} }}"
+    return f"{value:.2g}" if isinstance(value, float) else f'"{value}"'
