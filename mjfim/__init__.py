@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from mjfim.studies.compare import compare
     from mjfim.studies.monte_carlo import monte_carlo
     from mjfim.studies.robustness import assess_robustness
+    from mjfim.studies.selected_models import selected_experiment
     from mjfim.studies.selection import select_terms
 
 __all__ = [
@@ -74,6 +75,7 @@ __all__ = [
     "run_campaign",
     "save_video",
     "select_terms",
+    "selected_experiment",
     "shortest_experiment",
     "simulate",
 ]
@@ -113,6 +115,7 @@ MODULES = {
     "monte_carlo": "mjfim.studies.monte_carlo",
     "assess_robustness": "mjfim.studies.robustness",
     "select_terms": "mjfim.studies.selection",
+    "selected_experiment": "mjfim.studies.selected_models",
 }
 
 # Names of earlier versions, each with its new name.

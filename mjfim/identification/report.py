@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,12 @@ class FitResult:
         """(p,) estimate, with the values of the first recording."""
         return self.problem.theta(self.solution.unknowns)
 
+    @cached_property
+    def accuracy(self) -> Accuracy:
+        """Accuracy of the estimate."""
+        rows = self.quality.correlation_rows(self.problem.row_count)
+        return accuracy_of(self.problem, self.solution, self.null_space, rows)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Findings:
@@ -145,7 +152,7 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
     Raises:
         SimulationDivergedError: The simulation diverges at the estimate.
     """
-    task, problem, quality = result.task, result.problem, result.quality
+    task, quality = result.task, result.quality
 
     # Optional parts, each of which takes about as long as a search.
     begin_stage("looking for terms that the model lacks")
@@ -156,12 +163,7 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
         quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, missing
     )
     begin_stage("computing the intervals")
-    accuracy = accuracy_of(
-        problem,
-        result.solution,
-        result.null_space,
-        quality.correlation_rows(problem.row_count),
-    )
+    accuracy = result.accuracy
     at_bound, outside = _at_bounds(task.system.parameters, result.theta, task.settings.hold)
 
     findings = _Findings(

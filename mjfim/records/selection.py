@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from enum import Enum
+from math import isfinite
 from typing import Any
 
+from mjfim.arrays import Array, freeze
 from mjfim.records.missing_term import AddedTerm, TermParameter, toml_table
 
 
@@ -79,14 +81,45 @@ class PooledParameter:
     Attributes:
         name: Name of the parameter.
         members: Names of the parameters in whose place it is.
+        paths: Targets of the members.
         scales: Value of each member over that of the parameter.
-        table: The table of the parameter in an experiment file.
+        guess: Guess of the parameter.
+        unit: Its unit; empty for a factor on the guesses of the members.
+        scale: Its natural size.
+        bounds: Bounds that all members allow.
     """
 
     name: str
     members: tuple[str, ...]
+    paths: tuple[str, ...]
     scales: tuple[float, ...]
-    table: dict[str, Any]
+    guess: float
+    unit: str
+    scale: float
+    bounds: tuple[float, float]
+
+    @property
+    def table(self) -> dict[str, object]:
+        """The table of the parameter in an experiment file."""
+        targets = [
+            {"path": path, "scale": scale}
+            for path, scale in zip(self.paths, self.scales, strict=True)
+        ]
+        table: dict[str, object] = {"targets": targets, "guess": self.guess, "scale": self.scale}
+        if self.unit:
+            table["unit"] = self.unit
+        if isfinite(self.bounds[0]) and isfinite(self.bounds[1]):
+            table["bounds"] = list(self.bounds)
+        return table
+
+    @property
+    def toml(self) -> str:
+        """The table in an experiment file, in one line."""
+        targets = ", ".join(
+            f'{{ path = "{path}", scale = {scale:.6g} }}'
+            for path, scale in zip(self.paths, self.scales, strict=True)
+        )
+        return f"[parameters.{self.name}] targets = [{targets}], guess = {self.guess:.6g}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +170,29 @@ class SelectionStep:
     @property
     def is_kept(self) -> bool:
         """Whether the selection continued with the model of this step."""
-        return self.decision is not Decision.REJECTED
+        return self.decision not in (Decision.REJECTED, Decision.KEPT)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeldOutRefit:
+    """Fit of the selected model to the held-out recordings, which took no part in the selection.
+
+    Its intervals do not depend on how the terms were chosen.
+
+    Attributes:
+        theta: (p,) estimate [theta-unit].
+        interval: (p, 2) 95 % intervals [theta-unit].
+        differs: Names of the parameters that differ from those of the fitted recordings by more
+            than both intervals explain.
+    """
+
+    theta: Array
+    interval: Array
+    differs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        freeze(self, "theta", "interval")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,11 +203,17 @@ class Selection:
         terms: The terms of the final model.
         steps: The steps, beginning with the stated model.
         ending: Why the selection ended, in words.
+        pooled: Parameters in place of several that the recordings hardly determine.
+        held: Names of parameters that keep their guess, for the same reason.
+        refit: The selected model fitted to the held-out recordings; None without any.
     """
 
     terms: tuple[SelectedTerm, ...]
     steps: tuple[SelectionStep, ...]
     ending: str
+    pooled: tuple[PooledParameter, ...] = ()
+    held: tuple[str, ...] = ()
+    refit: HeldOutRefit | None = None
 
     @property
     def parameters(self) -> dict[str, dict[str, object]]:
@@ -177,10 +238,22 @@ class Selection:
 
     def __str__(self) -> str:
         before, after = self.errors
-        if not self.terms:
-            return f"No term was added; held-out error {before:.3g} σ. {self.ending}"
         words = ", ".join(term.description for term in self.terms)
-        return f"Added: {words}. Held-out error {before:.3g} → {after:.3g} σ. {self.ending}"
+        added = f"Added: {words}." if self.terms else "No term was added."
+        error = f"Held-out error {before:.3g} → {after:.3g} σ."
+        if not (self.terms or self.pooled or self.held):
+            error = f"Held-out error {before:.3g} σ."
+        return " ".join([added, *self._simplifications, error, self.ending])
+
+    @property
+    def _simplifications(self) -> list[str]:
+        """Sentences about pooled and held parameters."""
+        sentences = [
+            f"Pooled: {pool.name} in place of {', '.join(pool.members)}." for pool in self.pooled
+        ]
+        if self.held:
+            sentences.append(f"Held at the guess: {', '.join(self.held)}.")
+        return sentences
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of `selection` in estimate.json."""
@@ -189,4 +262,7 @@ class Selection:
             "ending": self.ending,
             "terms": [asdict(term) for term in self.terms],
             "steps": [{**asdict(step), "decision": step.decision.value} for step in self.steps],
+            "pooled": [asdict(pool) for pool in self.pooled],
+            "held": list(self.held),
+            "held_out_refit": None if self.refit is None else asdict(self.refit),
         }

@@ -9,15 +9,14 @@ test of the result.
 
 from __future__ import annotations
 
-import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
 
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.fit_workers import FitWorkers
@@ -31,16 +30,29 @@ from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.records.estimate import Estimate
-from mjfim.records.missing_term import MissingTerm, TermParameter
+from mjfim.records.missing_term import MissingTerm
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
 from mjfim.records.selection import (
     AlternativeTerm,
     Decision,
+    HeldOutRefit,
     SelectedTerm,
     Selection,
     SelectionStep,
 )
+from mjfim.studies.selected_models import (
+    FittedModel,
+    different,
+    pooled_values,
+    poorly_known,
+    selected_experiment,
+    selected_term,
+    stated_values,
+    tried_step,
+    with_selection,
+)
+from mjfim.studies.simplification import possible_pools
 
 # Largest number of terms that are added.
 MAX_TERMS = 6
@@ -49,12 +61,12 @@ MAX_TERMS = 6
 # together with it in the first attempt of a step, because the test is linear.
 SIMILAR_SHARE = 0.5
 
+# Largest number of poorly known parameters that are held one by one.
+MAX_HELD_ATTEMPTS = 8
+
 # Difference of the costs of two fits (half of the sum of squared residuals in standard deviations)
 # below which both explain the data equally well: by one standard deviation at most.
 EQUAL_COST = 0.5
-
-# Probability that an interval holds the true value.
-CONFIDENCE = 0.95
 
 
 def select_terms(
@@ -71,9 +83,10 @@ def select_terms(
 ) -> Estimate:
     """Estimate parameters, and extend the model by the terms that the recordings show it to lack.
 
-    `estimate.selection` says which terms were added and why. The experiment of the extended model
-    is `experiment.replace(**estimate.selection.tables)`. Ctrl-C ends the selection with the terms
-    so far.
+    `estimate.selection` says which terms were added and why. Parameters that the recordings hardly
+    determine are pooled, or held at their guess, where left-out data are predicted as well without
+    them. The experiment of the selected model is `mjfim.selected_experiment(experiment,
+    estimate.selection)`. Ctrl-C ends the selection with the terms so far.
 
     Args:
         experiment: Model, parameters and noise.
@@ -157,28 +170,6 @@ def select_terms_system(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Model:
-    """A fitted model, with the losses of its predictions of left-out data.
-
-    Attributes:
-        result: The fit.
-        losses: The losses.
-        cost: Cost of the fit with the noise of the fit of the stated model.
-        terms: The terms that were added to the stated model.
-    """
-
-    result: FitResult
-    losses: HeldOutLosses
-    cost: float
-    terms: tuple[SelectedTerm, ...]
-
-    @property
-    def penalised_cost(self) -> float:
-        """Cost and the number of parameters of the terms, by which chance reduces it (AIC)."""
-        return self.cost + sum(len(term.parameters) for term in self.terms)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _Selector:
     """Searches of one selection, which share a budget.
 
@@ -204,15 +195,17 @@ class _Selector:
             ending = "The selection was interrupted, or no part of the data can be left out."
             return estimate_from(result, self.budget), task.system
 
-        first = _Model(result=result, losses=losses, cost=result.solution.cost, terms=())
+        first = FittedModel(result=result, losses=losses, cost=result.solution.cost, terms=())
         steps = [SelectionStep(decision=Decision.BEGUN, error=losses.error)]
         model, ending = self._grown(first, first, steps)
         model = self._pruned(model, first, steps)
+        model = self._simplified(model, first, steps)
 
         # The chosen model is fitted like any other, with all attempts against local minima, and
         # over the length of segments that suits it.
         result = model.result
-        if model.terms and not self._is_stopped():
+        is_changed = bool(model.terms or model.pooled or model.held)
+        if is_changed and not self._is_stopped():
             final = replace(result.task, start=result.theta, held_out=self.held_out)
             if task.settings.segments is None:
                 final = with_length(final, None)
@@ -221,16 +214,42 @@ class _Selector:
         # The report compares the estimate with the guess, not with where the last search began.
         guess = result.task.system.parameters.guess
         result = replace(result, task=replace(result.task, start=guess))
-        selection = Selection(terms=model.terms, steps=tuple(steps), ending=ending)
+        selection = Selection(
+            terms=model.terms,
+            steps=tuple(steps),
+            ending=ending,
+            pooled=model.pooled,
+            held=model.held,
+        )
         estimate = estimate_from(result, self.budget)
+        if is_changed:
+            selection = replace(selection, refit=self._refit(result, estimate))
         final_system = result.task.system
-        return _with_selection(estimate, selection, model.losses, final_system), final_system
+        return with_selection(estimate, selection, model.losses, final_system), final_system
+
+    def _refit(self, result: FitResult, estimate: Estimate) -> HeldOutRefit | None:
+        """Fit the selected model to the held-out recordings; None without any, or after a stop."""
+        if not self.held_out or self._is_stopped():
+            return None
+
+        begin_stage("fitting the selected model to the held-out recordings")
+        task = FitTask.of(result.task.system, self.held_out, start=estimate.theta)
+        try:
+            found = fit_task(self._search(task), self.workers)
+        except (InterruptedPassError, SimulationDivergedError):
+            return None
+        interval = found.accuracy.interval
+        return HeldOutRefit(
+            theta=found.theta,
+            interval=interval,
+            differs=different(estimate, found.theta, interval),
+        )
 
     # ---- steps
 
     def _grown(
-        self, model: _Model, first: _Model, steps: list[SelectionStep]
-    ) -> tuple[_Model, str]:
+        self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
+    ) -> tuple[FittedModel, str]:
         """Add terms while they improve the prediction of left-out data.
 
         Args:
@@ -265,20 +284,20 @@ class _Selector:
 
     def _best_extension(
         self,
-        model: _Model,
-        first: _Model,
+        model: FittedModel,
+        first: FittedModel,
         candidates: Sequence[MissingTerm],
         steps: list[SelectionStep],
-    ) -> _Model | None:
+    ) -> FittedModel | None:
         """The model with the one of some terms that predicts best; None where none is better."""
-        tried: list[tuple[_Model, SelectionStep]] = []
+        tried: list[tuple[FittedModel, SelectionStep]] = []
         for candidate in candidates:
             extended = self._extended(model, first, candidate)
             if self._is_stopped():
                 return None
             if extended is not None:
                 reduction = model.losses.reduction(extended.losses)
-                tried.append((extended, _tried(candidate, extended, reduction)))
+                tried.append((extended, tried_step(candidate, extended, reduction)))
 
         # Of the models that do not clearly predict worse than the best one, the one that fits the
         # data best is chosen: the fit uses all data, so that it tells similar terms apart better.
@@ -301,7 +320,7 @@ class _Selector:
         chosen, step = best
         alternatives = tuple(
             AlternativeTerm(
-                description=other.description, path=other.path, values=_stated_values(found, first)
+                description=other.description, path=other.path, values=stated_values(found, first)
             )
             for found, other in clear
             if found is not chosen and not found.losses.reduction(chosen.losses).is_clear
@@ -310,11 +329,13 @@ class _Selector:
         steps.append(replace(step, decision=Decision.ADDED, count=count, alternatives=alternatives))
         return chosen
 
-    def _pruned(self, model: _Model, first: _Model, steps: list[SelectionStep]) -> _Model:
+    def _pruned(
+        self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
+    ) -> FittedModel:
         """Remove terms without which left-out data are predicted as well."""
         while len(model.terms) > 1 and not self._is_stopped():
             begin_stage("testing whether all added terms are needed")
-            needless: list[tuple[Reduction, SelectedTerm, _Model]] = []
+            needless: list[tuple[Reduction, SelectedTerm, FittedModel]] = []
 
             # The last term has just been tested against the model without it.
             for term in model.terms[:-1]:
@@ -341,9 +362,72 @@ class _Selector:
             )
         return model
 
+    def _simplified(
+        self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
+    ) -> FittedModel:
+        """Pool or hold poorly known parameters as long as the prediction stays as good."""
+        if self._is_stopped():
+            return model
+        begin_stage("testing whether poorly known parameters are needed")
+        for pool in possible_pools(first.result.task.system.parameters, poorly_known(model)):
+            words = f"one value of {pool.name} for {listed(pool.members)}"
+            changed = replace(model, pooled=(*model.pooled, pool))
+            model = self._simpler(model, changed, first, (Decision.POOLED, words), steps)
+
+        # All of those that are still poorly known are held at once, or else one by one.
+        names = poorly_known(model)
+        attempts = [names] if len(names) > 1 else []
+        attempts += [(name,) for name in names[:MAX_HELD_ATTEMPTS]]
+        for attempt in attempts:
+            if self._is_stopped() or set(attempt) <= set(model.held):
+                continue
+            changed = replace(model, held=(*model.held, *attempt))
+            model = self._simpler(model, changed, first, (Decision.HELD, listed(attempt)), steps)
+        return model
+
+    def _simpler(
+        self,
+        model: FittedModel,
+        changed: FittedModel,
+        first: FittedModel,
+        named: tuple[Decision, str],
+        steps: list[SelectionStep],
+    ) -> FittedModel:
+        """A simpler model, if it predicts left-out data as well; otherwise the model itself.
+
+        Args:
+            model: The model.
+            changed: It with the pooled and held parameters of the simpler one, not yet fitted.
+            first: The stated model.
+            named: The decision for the simpler model, and what it changes in words.
+            steps: Receives the step.
+        """
+        names = model.result.task.system.parameters.names
+        values = dict(zip(names, model.result.theta, strict=True))
+        simpler = self._fitted(changed, first, changed.terms, values, {})
+        if simpler is None:
+            return model
+
+        decision, words = named
+        reduction = simpler.losses.reduction(model.losses)
+        is_worse = reduction.is_clear
+        steps.append(
+            SelectionStep(
+                decision=Decision.KEPT if is_worse else decision,
+                description=words,
+                count=len(model.terms),
+                error=simpler.losses.error,
+                reduction=-reduction.mean,
+                standard_error=reduction.standard_error,
+            )
+        )
+        return model if is_worse else simpler
+
     # ---- models
 
-    def _extended(self, model: _Model, first: _Model, candidate: MissingTerm) -> _Model | None:
+    def _extended(
+        self, model: FittedModel, first: FittedModel, candidate: MissingTerm
+    ) -> FittedModel | None:
         """The model with one term more; None where it cannot be simulated, or after a stop."""
         names = model.result.task.system.parameters.names
         term = selected_term(candidate, names)
@@ -357,7 +441,9 @@ class _Selector:
             {term.name: candidate.value, **starts},
         )
 
-    def _without(self, model: _Model, first: _Model, term: SelectedTerm) -> _Model | None:
+    def _without(
+        self, model: FittedModel, first: FittedModel, term: SelectedTerm
+    ) -> FittedModel | None:
         """The model without a term; None where it cannot be simulated, or after a stop."""
         names = model.result.task.system.parameters.names
         values = dict(zip(names, model.result.theta, strict=True))
@@ -366,12 +452,12 @@ class _Selector:
 
     def _fitted(
         self,
-        model: _Model,
-        first: _Model,
+        model: FittedModel,
+        first: FittedModel,
         terms: tuple[SelectedTerm, ...],
         values: dict[str, float],
         changes: dict[str, float],
-    ) -> _Model | None:
+    ) -> FittedModel | None:
         """Fit the stated model with some terms, beginning at the fit of a similar model.
 
         Args:
@@ -383,15 +469,20 @@ class _Selector:
                 of the library of terms [theta-unit].
         """
         stated = first.result.task.system
-        tables = Selection(terms=terms, steps=(), ending="").tables
+        selection = Selection(
+            terms=terms, steps=(), ending="", pooled=model.pooled, held=model.held
+        )
         system = System.resolve(
-            stated.experiment.replace(**tables),
+            selected_experiment(stated.experiment, selection),
             threads=stated.threads,
             source=stated.source,
         )
         parameters = system.parameters
         start = np.array(parameters.guess)
+        values = {**values, **pooled_values(model.pooled, values)}
         for i, parameter in enumerate(parameters.parameters):
+            if parameter.name in model.held:
+                continue
             change = changes.get(parameter.name, 0.0)
             is_field = parameter.name in changes and parameter.targets[0].term is not None
             start[i] = change if is_field else values.get(parameter.name, start[i]) + change
@@ -407,9 +498,16 @@ class _Selector:
             return None
         if losses is None:
             return None
-        return _Model(result=result, losses=losses, cost=cost, terms=terms)
+        return FittedModel(
+            result=result,
+            losses=losses,
+            cost=cost,
+            terms=terms,
+            pooled=model.pooled,
+            held=model.held,
+        )
 
-    def _candidates(self, model: _Model) -> tuple[MissingTerm, ...]:
+    def _candidates(self, model: FittedModel) -> tuple[MissingTerm, ...]:
         """Significant terms that the model lacks, the most promising one first."""
         result = model.result
         unknowns = result.solution.unknowns
@@ -435,87 +533,3 @@ class _Selector:
     def _is_stopped(self) -> bool:
         """True after a request to stop."""
         return self.budget.stop.requested
-
-
-def selected_term(candidate: MissingTerm, taken: Iterable[str]) -> SelectedTerm:
-    """The term that a candidate stands for, with names of its parameters.
-
-    Args:
-        candidate: The candidate.
-        taken: Names of the present parameters.
-    """
-    name = _name_of(candidate.path, taken)
-    further: dict[str, TermParameter] = {}
-    for parameter in candidate.further:
-        used = {*taken, name, *further}
-        further[_name_of(parameter.path, used)] = parameter
-    return SelectedTerm(
-        name=name,
-        description=candidate.description,
-        path=candidate.path,
-        unit=candidate.unit,
-        scale=abs(candidate.value),
-        further=further,
-        added=candidate.added,
-        source=candidate.source,
-    )
-
-
-def _stated_values(model: _Model, first: _Model) -> dict[str, float]:
-    """Values of the parameters of the stated model in an extended one [theta-unit]."""
-    names = model.result.task.system.parameters.names
-    values = dict(zip(names, model.result.theta.tolist(), strict=True))
-    return {name: values[name] for name in first.result.task.system.parameters.names}
-
-
-def _tried(candidate: MissingTerm, model: _Model, reduction: Reduction) -> SelectionStep:
-    """Step of a term that was tried, before it is decided on."""
-    return SelectionStep(
-        decision=Decision.REJECTED,
-        description=candidate.description,
-        path=candidate.path,
-        count=len(model.terms) - 1,
-        error=model.losses.error,
-        reduction=reduction.mean,
-        standard_error=reduction.standard_error,
-        sigmas=candidate.sigmas,
-        share=candidate.share,
-    )
-
-
-def _name_of(path: str, taken: Iterable[str]) -> str:
-    """Name of a new parameter, such as `pivot_damping` for `joint/pivot:damping`."""
-    place, _, field = path.partition(":")
-    words = re.findall(r"\w+", place.partition("/")[2] or place) + re.findall(r"\w+", field)
-    name = "_".join(words)
-    used = set(taken)
-    number = 2
-    while name in used:
-        name = f"{'_'.join(words)}_{number}"
-        number += 1
-    return name
-
-
-def _with_selection(
-    estimate: Estimate, selection: Selection, losses: HeldOutLosses, system: System
-) -> Estimate:
-    """The estimate with its selection.
-
-    The terms were chosen with the same data. Where the scatter between the estimates without each
-    part of the data is larger than the interval of the fit, the interval is widened to it.
-    """
-    jackknife = losses.jackknife
-    parts = len(losses.estimates)
-    if not selection.terms or parts < 2:
-        return replace(estimate, selection=selection)
-
-    quantile = float(scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, parts - 1))
-    low = np.minimum(estimate.interval[:, 0], estimate.theta - quantile * jackknife)
-    high = np.maximum(estimate.interval[:, 1], estimate.theta + quantile * jackknife)
-    interval = np.column_stack([low, high])
-    lower, upper = system.parameters.lower, system.parameters.upper
-    return replace(
-        estimate,
-        selection=selection,
-        interval=np.clip(interval, lower[:, None], upper[:, None]),
-    )

@@ -7,7 +7,6 @@ for each of them, and is known much better.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -74,28 +73,19 @@ def _pool(stem: str, members: Sequence[Parameter], taken: Collection[str]) -> Po
     scales = guesses if is_factor else np.ones(len(members))
     guess = 1.0 if is_factor else float(guesses.mean())
 
-    table: dict[str, Any] = {
-        "targets": [
-            {"path": member.targets[0].path, "scale": float(scale)}
-            for member, scale in zip(members, scales, strict=True)
-        ],
-        "guess": guess,
-    }
-    if not is_factor and members[0].unit:
-        table["unit"] = members[0].unit
-    if guess == 0.0:
-        table["scale"] = max(member.scale for member in members)
-
     # The pool keeps the bounds of all members.
     low = max(min(bound / s for bound in m.bounds) for m, s in zip(members, scales, strict=True))
     high = min(max(bound / s for bound in m.bounds) for m, s in zip(members, scales, strict=True))
-    if np.isfinite(low) and np.isfinite(high) and low < high:
-        table["bounds"] = [float(low), float(high)]
+    sizes = [m.scale / abs(s) for m, s in zip(members, scales, strict=True)]
     return PooledParameter(
         name=name,
         members=tuple(member.name for member in members),
+        paths=tuple(member.targets[0].path for member in members),
         scales=tuple(float(scale) for scale in scales),
-        table=table,
+        guess=guess,
+        unit="" if is_factor else members[0].unit,
+        scale=max(1.0, *sizes) if is_factor else max(sizes),
+        bounds=(float(low), float(high)) if low < high else (-np.inf, np.inf),
     )
 
 

@@ -169,7 +169,7 @@ def test_segments_share_the_recordings_of_the_whole_problem(tmp_path: Path) -> N
     system = pendulum(tmp_path, 4.0)
     task = FitTask.resolve(system.experiment, [swings(system, 4.0)], threads=1)
     problem = task.problem()
-    part = continuation._segment_problem(problem, task, task.system, 1.0)
+    part = continuation.problem_of_segments(problem, task, task.system, 1.0)
     assert part is not None
     assert len(part.segments) == 4
     assert all(a is b for a, b in zip(part.recordings, problem.recordings, strict=True))

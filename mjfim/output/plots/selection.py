@@ -84,5 +84,5 @@ def _label(step: SelectionStep) -> str:
     """Return the name of a step."""
     if step.decision is Decision.BEGUN:
         return "the stated model"
-    sign = "without" if step.decision is Decision.REMOVED else "+"
-    return f"{sign} {style.shorten(step.description, TERM_WIDTH)}"
+    signs = {Decision.REMOVED: "without ", Decision.ADDED: "+ "}
+    return f"{signs.get(step.decision, '')}{style.shorten(step.description, TERM_WIDTH)}"

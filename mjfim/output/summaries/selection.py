@@ -12,7 +12,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.selection import Decision, Selection, SelectionStep
+from mjfim.records.selection import Decision, HeldOutRefit, Selection, SelectionStep
 
 # What each decision is called in the table.
 WORDS = {
@@ -20,6 +20,9 @@ WORDS = {
     Decision.ADDED: "added",
     Decision.REJECTED: "not better",
     Decision.REMOVED: "not needed",
+    Decision.POOLED: "pooled",
+    Decision.HELD: "held at the guess",
+    Decision.KEPT: "kept apart",
 }
 
 
@@ -34,11 +37,32 @@ def describe_selection(selection: Selection) -> list[Part]:
         if step.alternatives:
             text = _describe_alternatives(step)
             parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
-    if selection.terms:
-        tables = "; ".join(term.toml for term in selection.terms)
-        text = f"To keep these terms, add to the experiment file: {tables}"
+    if selection.refit is not None:
+        parts.append(_describe_refit(selection.refit))
+    tables = [term.toml for term in selection.terms]
+    tables += [f"{pool.toml}, in place of {listed(pool.members)}" for pool in selection.pooled]
+    if selection.held:
+        names = ", ".join(f'"{name}"' for name in selection.held)
+        tables.append(f"[fit] hold = [{names}]")
+    if tables:
+        text = f"To keep this model, change the experiment file: {'; '.join(tables)}"
         parts.append(Paragraph(text=text, emphasis=Emphasis.WEAK))
     return parts
+
+
+def _describe_refit(refit: HeldOutRefit) -> Paragraph:
+    """Say whether the held-out recordings alone give the same parameters."""
+    text = (
+        "The held-out recordings took no part in the selection. Fitted to them alone, the selected "
+        "model has "
+    )
+    if not refit.differs:
+        return Paragraph(text=text + "the same parameters within the intervals.")
+    text += (
+        f"other values of {listed(refit.differs)}, by more than both intervals explain; the "
+        "intervals are widened to hold both."
+    )
+    return Paragraph(text=text, emphasis=Emphasis.WARNING)
 
 
 def _describe_alternatives(step: SelectionStep) -> str:

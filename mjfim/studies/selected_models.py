@@ -1,0 +1,228 @@
+"""Models that a selection compares, and what follows from the selected one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.identification.held_out_losses import HeldOutLosses, Reduction
+from mjfim.identification.report import FitResult
+from mjfim.records.estimate import Estimate
+from mjfim.records.missing_term import MissingTerm, TermParameter
+from mjfim.records.selection import (
+    Decision,
+    PooledParameter,
+    SelectedTerm,
+    Selection,
+    SelectionStep,
+)
+from mjfim.studies.simplification import simplified_experiment
+
+# Probability that an interval holds the true value.
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FittedModel:
+    """A fitted model, with the losses of its predictions of left-out data.
+
+    Attributes:
+        result: The fit.
+        losses: The losses.
+        cost: Cost of the fit with the noise of the fit of the stated model.
+        terms: The terms that were added to the stated model.
+        pooled: Parameters in place of several stated ones.
+        held: Names of stated parameters that keep their guess.
+    """
+
+    result: FitResult
+    losses: HeldOutLosses
+    cost: float
+    terms: tuple[SelectedTerm, ...]
+    pooled: tuple[PooledParameter, ...] = ()
+    held: tuple[str, ...] = ()
+
+    @property
+    def penalised_cost(self) -> float:
+        """Cost and the number of parameters of the terms, by which chance reduces it (AIC)."""
+        return self.cost + sum(len(term.parameters) for term in self.terms)
+
+
+def selected_term(candidate: MissingTerm, taken: Iterable[str]) -> SelectedTerm:
+    """The term that a candidate stands for, with names of its parameters.
+
+    Args:
+        candidate: The candidate.
+        taken: Names of the present parameters.
+    """
+    name = _name_of(candidate.path, taken)
+    further: dict[str, TermParameter] = {}
+    for parameter in candidate.further:
+        used = {*taken, name, *further}
+        further[_name_of(parameter.path, used)] = parameter
+    return SelectedTerm(
+        name=name,
+        description=candidate.description,
+        path=candidate.path,
+        unit=candidate.unit,
+        scale=abs(candidate.value),
+        further=further,
+        added=candidate.added,
+        source=candidate.source,
+    )
+
+
+def selected_experiment(experiment: Experiment, selection: Selection) -> Experiment:
+    """The experiment of a selected model.
+
+    Args:
+        experiment: The experiment before the selection.
+        selection: The selection, `estimate.selection`.
+
+    Returns:
+        The experiment with the added terms, and with the pooled and held parameters.
+
+    Raises:
+        ExperimentError: The selection is one of another experiment.
+    """
+    extended = experiment.replace(**selection.tables)
+    return simplified_experiment(extended, selection.pooled, selection.held)
+
+
+def poorly_known(model: FittedModel) -> tuple[str, ...]:
+    """Names of the stated parameters that a fit determines poorly.
+
+    Args:
+        model: The fitted model.
+    """
+    added = {name for term in model.terms for name in term.parameters}
+    added |= {pool.name for pool in model.pooled}
+    return tuple(name for name, _ in model.result.accuracy.poorly_known if name not in added)
+
+
+def pooled_values(pooled: Sequence[PooledParameter], values: dict[str, float]) -> dict[str, float]:
+    """Values of pooled parameters where a search begins: the mean of what their members suggest.
+
+    Args:
+        pooled: The pooled parameters.
+        values: Values of other parameters by name [theta-unit].
+
+    Returns:
+        The values of those that have none yet, by name.
+    """
+    found = {}
+    for pool in pooled:
+        suggested = [
+            values[name] / scale
+            for name, scale in zip(pool.members, pool.scales, strict=True)
+            if name in values
+        ]
+        if suggested and pool.name not in values:
+            found[pool.name] = float(np.mean(suggested))
+    return found
+
+
+def different(estimate: Estimate, theta: Array, interval: Array) -> tuple[str, ...]:
+    """Names of the parameters that differ by more than two intervals explain.
+
+    Args:
+        estimate: The estimate from the fitted recordings.
+        theta: (p,) estimate from other recordings [theta-unit].
+        interval: (p, 2) its intervals [theta-unit].
+    """
+    halves = np.stack([0.5 * np.ptp(each, axis=1) for each in (estimate.interval, interval)])
+    explained = np.sqrt(np.sum(halves**2, axis=0))
+    apart = np.isfinite(explained) & (np.abs(theta - estimate.theta) > explained)
+    return tuple(name for name, flag in zip(estimate.parameters, apart, strict=True) if flag)
+
+
+def stated_values(model: FittedModel, first: FittedModel) -> dict[str, float]:
+    """Values of the parameters of the stated model in an extended one.
+
+    Args:
+        model: The extended model.
+        first: The stated model.
+
+    Returns:
+        The values by name, without parameters that are pooled [theta-unit].
+    """
+    names = model.result.task.system.parameters.names
+    values = dict(zip(names, model.result.theta.tolist(), strict=True))
+    stated = first.result.task.system.parameters.names
+    return {name: values[name] for name in stated if name in values}
+
+
+def tried_step(candidate: MissingTerm, model: FittedModel, reduction: Reduction) -> SelectionStep:
+    """Step of a term that was tried, before it is decided on.
+
+    Args:
+        candidate: The term.
+        model: The model with the term.
+        reduction: Reduction of the loss of left-out data by the term.
+    """
+    return SelectionStep(
+        decision=Decision.REJECTED,
+        description=candidate.description,
+        path=candidate.path,
+        count=len(model.terms) - 1,
+        error=model.losses.error,
+        reduction=reduction.mean,
+        standard_error=reduction.standard_error,
+        sigmas=candidate.sigmas,
+        share=candidate.share,
+    )
+
+
+def _name_of(path: str, taken: Iterable[str]) -> str:
+    """Name of a new parameter, such as `pivot_damping` for `joint/pivot:damping`."""
+    place, _, field = path.partition(":")
+    words = re.findall(r"\w+", place.partition("/")[2] or place) + re.findall(r"\w+", field)
+    name = "_".join(words)
+    used = set(taken)
+    number = 2
+    while name in used:
+        name = f"{'_'.join(words)}_{number}"
+        number += 1
+    return name
+
+
+def with_selection(
+    estimate: Estimate, selection: Selection, losses: HeldOutLosses, system: System
+) -> Estimate:
+    """The estimate with its selection.
+
+    The terms were chosen with the same data. Where the scatter between the estimates without each
+    part of the data is larger than the interval of the fit, the interval is widened to it.
+
+    Args:
+        estimate: The estimate.
+        selection: The selection.
+        losses: Losses of predictions of left-out data by the selected model.
+        system: The selected model.
+    """
+    estimate = replace(estimate, selection=selection)
+    jackknife = losses.jackknife
+    parts = len(losses.estimates)
+    if not (selection.terms or selection.pooled) or parts < 2:
+        return estimate
+
+    quantile = float(scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, parts - 1))
+    low = np.minimum(estimate.interval[:, 0], estimate.theta - quantile * jackknife)
+    high = np.maximum(estimate.interval[:, 1], estimate.theta + quantile * jackknife)
+
+    # Held-out recordings took no part in the choice, so that what they contradict is not known.
+    if selection.refit is not None:
+        differs = np.isin(estimate.parameters, selection.refit.differs)
+        other = selection.refit.interval
+        low = np.where(differs, np.minimum(low, other[:, 0]), low)
+        high = np.where(differs, np.maximum(high, other[:, 1]), high)
+    interval = np.column_stack([low, high])
+    lower, upper = system.parameters.lower, system.parameters.upper
+    return replace(estimate, interval=np.clip(interval, lower[:, None], upper[:, None]))

@@ -1,0 +1,140 @@
+"""Poorly known parameters are pooled or held where left-out data are predicted as well."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
+from mjfim.records.recording import Recording
+from mjfim.records.selection import Decision
+from mjfim.studies.selected_models import selected_experiment
+from mjfim.studies.simplification import possible_pools, simplified_experiment
+from tests.support.paths import ROOT
+
+
+def arm(**damping: float) -> mjfim.Experiment:
+    """The double pendulum, of which the damping of both joints is unknown."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "double_pendulum.toml")
+    tables = {
+        name: {"target": f"joint/{name}:damping", "guess": guess} for name, guess in damping.items()
+    }
+    kept = {"model", "rate", "noise"}
+    values = {k: v for k, v in base.model_dump(exclude_unset=True).items() if k in kept}
+    return base.restated(
+        {
+            **values,
+            "horizon": 2.0,
+            "initial": {"control": {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}},
+            "parameters": tables,
+            "fit": {"bootstrap": 0},
+        }
+    )
+
+
+def recorded(experiment: mjfim.Experiment, count: int) -> list[Recording]:
+    """Recordings of the true robot."""
+    task = DesignTask.resolve(experiment, threads=1)
+    return [simulate_system(task.system, task.initial, seed) for seed in range(count)]
+
+
+def names_of_joints() -> tuple[str, str]:
+    """Names of the two joints."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "double_pendulum.toml")
+    first, second = System.resolve(base).coordinates[:2]
+    return first.name, second.name
+
+
+def test_parameters_of_one_field_are_pooled_by_a_factor_on_their_guesses() -> None:
+    first, second = names_of_joints()
+    experiment = arm(**{first: 0.2, second: 0.05})
+    system = System.resolve(experiment)
+    (pool,) = possible_pools(system.parameters, {first, second})
+    assert pool.members == (first, second)
+    assert pool.scales == (0.2, 0.05)
+    assert pool.guess == 1.0
+
+    # The pooled parameter sets both dampings of the model.
+    pooled = System.resolve(simplified_experiment(experiment, [pool], ()))
+    assert pooled.parameters.names == ("joint_damping",)
+    model = pooled.model_at(np.array([3.0]))
+    np.testing.assert_allclose(model.dof_damping[:2], [0.6, 0.15])
+
+    # Equal guesses give one value, and one name alone nothing.
+    (same,) = possible_pools(
+        System.resolve(arm(**{first: 0.1, second: 0.1})).parameters, {first, second}
+    )
+    assert same.scales == (1.0, 1.0)
+    assert same.guess == pytest.approx(0.1)
+    assert possible_pools(system.parameters, {first}) == []
+
+
+def test_held_parameters_are_added_to_those_that_the_user_holds() -> None:
+    first, second = names_of_joints()
+    experiment = arm(**{first: 0.2, second: 0.05}).replace(fit={"hold": (first,)})
+    held = simplified_experiment(experiment, (), (second,))
+    assert held.fit.hold == (first, second)
+    assert simplified_experiment(experiment, (), ()) is experiment
+
+
+@pytest.mark.slow
+def test_a_selection_holds_what_the_recordings_hardly_determine(tmp_path: Path) -> None:
+    """The damping of the hinge is determined; that of a slow slide is not."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
+    experiment = base.replace(
+        horizon=2.0,
+        initial={"control": control},
+        parameters={"slide": {"target": "joint/slide:damping", "guess": 0.02, "scale": 0.1}},
+        fit={"bootstrap": 0},
+    )
+    logs = recorded(experiment, 3)
+    plain = mjfim.identify(experiment, logs)
+    assert "slide" in plain.sloppy
+    found = mjfim.select_terms(experiment, logs)
+    selection = found.selection
+    assert selection is not None
+    assert not selection.terms
+    assert selection.held == ("slide",)
+    assert selection.steps[-1].decision is Decision.HELD
+    assert found.held == ("slide",)
+    assert found.theta[found.parameters.index("slide")] == 0.02
+
+    # The selected experiment says the same, and the record is saved.
+    again = selected_experiment(experiment, selection)
+    assert again.fit.hold == ("slide",)
+    np.testing.assert_allclose(mjfim.identify(again, logs).theta, found.theta, rtol=1e-3)
+    found.save(tmp_path)
+    assert mjfim.Estimate.load(tmp_path).selection == selection
+
+
+@pytest.mark.slow
+def test_the_selected_model_is_fitted_to_held_out_recordings() -> None:
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    control = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
+    stated = base.replace(horizon=2.0, initial={"control": control}, fit={"bootstrap": 0})
+    friction = {"f": {"target": "joint/slide:frictionloss", "guess": 0.6, "scale": 1.0}}
+    robot = stated.replace(parameters=friction)
+    *logs, kept = recorded(robot, 4)
+    found = mjfim.select_terms(stated, logs, held_out=[kept])
+    assert found.selection is not None
+    refit = found.selection.refit
+    assert refit is not None
+    assert refit.differs == ()
+    assert refit.theta.shape == found.theta.shape
+    assert (refit.interval[:, 0] < refit.interval[:, 1]).all()
+
+    # Held-out recordings of another robot contradict the others, and widen the intervals.
+    heavier = robot.replace(parameters={"m": {"true": 2.6}})
+    task = DesignTask.resolve(heavier.replace(cost={"linearize_at": "true"}), threads=1)
+    other = simulate_system(task.system, task.initial, 9)
+    odd = mjfim.select_terms(stated, logs, held_out=[other])
+    assert odd.selection is not None and odd.selection.refit is not None
+    assert "m" in odd.selection.refit.differs
+    j = odd.parameters.index("m")
+    assert odd.interval[j, 1] > found.interval[j, 1] + 0.1
