@@ -22,7 +22,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.identification.candidates import Candidate, CandidateParameter, candidates_of
-from mjfim.identification.extended_problems import extended_problem
+from mjfim.identification.extended_problems import extended_problem, with_residuals_of
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.screened_terms import screened_terms
 from mjfim.optimize.condensed_least_squares import Condensed
@@ -67,8 +67,7 @@ class _Linearisation:
 
     Attributes:
         H: (m, m) information.
-        g: (m,) gradient of half of the squared residuals, with all candidates at their values in
-            the model.
+        g: (m,) gradient of half of the squared residuals of the stated model.
         norms: (m,) lengths of the columns.
         columns: Columns of the numbers of every candidate.
         others: Columns of the parameters.
@@ -171,15 +170,17 @@ def _linearise(
     if extended is None:
         return None
 
+    # The score is that of the residuals without the terms.
     wider, begin = extended_problem(problem, recordings, at, extended)
-    condensed = wider.condense(begin)
+    shifted = with_residuals_of(problem, at, wider, begin)
+    condensed = None if shifted is None else shifted.condense(begin)
     if condensed is None:
         return None
 
     column_names = np.array(extended.parameters.names)[wider.layout.parameter_of_column]
     place = {str(name): column for column, name in enumerate(column_names)}
     columns = [[place[name] for name in of_candidate] for of_candidate in names]
-    return _normal_equations(condensed, candidates, columns)
+    return _normal_equations(condensed, columns)
 
 
 def _extended_system(
@@ -214,26 +215,13 @@ def _path_under(name: str, candidate: Candidate, number: CandidateParameter) -> 
     return number.path.replace(f"term/{candidate.added.name}:", f"term/{name}:", 1)
 
 
-def _normal_equations(
-    condensed: Condensed, candidates: Sequence[Candidate], columns: list[list[int]]
-) -> _Linearisation:
-    """Information and gradient with scaled columns.
-
-    The gradient is that of the residuals with all candidates at their values in the model.
-    """
+def _normal_equations(condensed: Condensed, columns: list[list[int]]) -> _Linearisation:
+    """Information and gradient with scaled columns."""
     rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
     norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
     J = rows[:, :-1] / norms
     H = J.T @ J
     g = J.T @ rows[:, -1]
-
-    # Sensitivities were computed at a small value of each term. Correct the gradient to the
-    # residuals without the terms.
-    offset = np.zeros(len(H))
-    for candidate, of_candidate in zip(candidates, columns, strict=True):
-        numbers = candidate.tested
-        offset[of_candidate] = [number.linearised_at - number.value for number in numbers]
-    g = g - H @ (offset * norms)
 
     # The parameters are eliminated by the pseudo-inverse of their information.
     tested = [column for of_candidate in columns for column in of_candidate]
