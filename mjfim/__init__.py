@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mjfim.experiment.simulate import simulate
     from mjfim.identification.cross_validation import predict
     from mjfim.identification.identify import identify
+    from mjfim.identification.inverse_dynamics import inverse_dynamics
     from mjfim.output.live import live
     from mjfim.output.robot.export import export_design
     from mjfim.output.video.results import save_video
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from mjfim.records.comparison import Comparison
     from mjfim.records.design import Design
     from mjfim.records.estimate import Estimate
+    from mjfim.records.inverse_dynamics import InverseDynamicsFit
     from mjfim.records.monte_carlo import MonteCarloStudy
     from mjfim.records.recording import Recording
     from mjfim.records.trajectory import Trajectory
@@ -53,6 +55,7 @@ __all__ = [
     "Estimate",
     "ExecutorLike",
     "Experiment",
+    "InverseDynamicsFit",
     "MjfimError",
     "MonteCarloStudy",
     "Pool",
@@ -69,6 +72,7 @@ __all__ = [
     "evaluate",
     "export_design",
     "identify",
+    "inverse_dynamics",
     "live",
     "monte_carlo",
     "predict",
@@ -95,6 +99,7 @@ MODULES = {
     "simulate": "mjfim.experiment.simulate",
     "predict": "mjfim.identification.cross_validation",
     "identify": "mjfim.identification.identify",
+    "inverse_dynamics": "mjfim.identification.inverse_dynamics",
     "export_design": "mjfim.output.robot.export",
     "live": "mjfim.output.live",
     "save_video": "mjfim.output.video.results",
@@ -106,6 +111,7 @@ MODULES = {
     "Comparison": "mjfim.records.comparison",
     "Design": "mjfim.records.design",
     "Estimate": "mjfim.records.estimate",
+    "InverseDynamicsFit": "mjfim.records.inverse_dynamics",
     "MonteCarloStudy": "mjfim.records.monte_carlo",
     "Recording": "mjfim.records.recording",
     "Trajectory": "mjfim.records.trajectory",

@@ -30,6 +30,10 @@ from mjfim.model.variants import MocapPlacement
 # Prefix of the names of parameters that are nuisance deviations of the initial state.
 INITIAL_STATE_PREFIX = "initial "
 
+# Standard deviation of the logarithm of a pseudo-inertia relative to that of the model, where none
+# is stated. It is weak: mass and second moments within a factor of e or so.
+CAD_PRIOR = 1.0
+
 # Fields of a body that hold the ten barycentric coordinates of its inertia, in their order.
 BARYCENTRIC_FIELDS = (
     "mass",
@@ -247,7 +251,15 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
             nuisance=spec.nuisance,
             group=name,
             per_recording=spec.per_recording,
+            cad_prior=_cad_prior(spec),
         )
+
+
+def _cad_prior(spec: ParameterSpec) -> float | None:
+    """Standard deviation of the logarithm of an inertia relative to the model's, or None."""
+    if spec.cad_prior is None:
+        return CAD_PRIOR if spec.prior is None else None
+    return None if spec.cad_prior is False else float(spec.cad_prior)
 
 
 def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[int, Array, Array]:

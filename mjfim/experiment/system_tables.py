@@ -266,6 +266,16 @@ class ParameterSpec(Section):
             "prior knowledge."
         ),
     )
+    cad_prior: PositiveWithUnit | Literal[False] | None = Field(
+        default=None,
+        description=(
+            "How well the inertia of the model, for example from CAD, is known for `inertial`: "
+            "standard deviation of the logarithm of the pseudo-inertia relative to it. With 1, "
+            "mass and second moments are right within a factor of e or so; this holds only what "
+            "the recordings hardly determine. false: no prior knowledge. Default: 1 without "
+            "`prior`, false with it."
+        ),
+    )
     unit: str = Field(
         default="",
         description=(
@@ -329,6 +339,8 @@ class ParameterSpec(Section):
         if self.inertial is None:
             if self.coordinates is not None:
                 raise ValueError("coordinates can only be given together with inertial")
+            if self.cad_prior is not None:
+                raise ValueError("cad_prior can only be given together with inertial")
             return
 
         single = [

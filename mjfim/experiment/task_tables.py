@@ -401,11 +401,13 @@ class FitSpec(Section):
             "them."
         ),
     )
-    start: Literal["stated", "measured"] = Field(
+    start: Literal["stated", "measured", "inverse_dynamics"] = Field(
         default="stated",
         description=(
             "Initial state of a recording. stated: the state of `initial` plus the deviations of "
-            "`nuisance.initial`. measured: read from the log, then estimated freely."
+            "`nuisance.initial`. measured: read from the log, then estimated freely. "
+            "inverse_dynamics: as measured, and the parameters start from a fit to the equation of "
+            "motion, which needs a measured position or velocity of every degree of freedom."
         ),
     )
     loss: Literal["linear", "huber", "soft_l1", "cauchy"] = Field(

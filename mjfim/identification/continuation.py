@@ -21,6 +21,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality, fit_quality
+from mjfim.identification.inverse_dynamics import try_fit_equations
 from mjfim.identification.residual_tests import misfit_reasons
 from mjfim.identification.searches import FitSearch
 from mjfim.identification.subsets import restart_subset
@@ -33,6 +34,7 @@ from mjfim.optimize.levenberg_marquardt import (
     UnknownValues,
 )
 from mjfim.records.estimate import Restart
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 
 # Number of parts into which a recording is cut for the first fit, at most.
 MAX_SEGMENTS = 64
@@ -78,12 +80,30 @@ class WholeFit:
         solution: Its solution.
         quality: Quality of the fit.
         restart: How it was repeated from fits over segments; None where it was not.
+        inverse_dynamics: The fit to the equation of motion at which these began, or None.
     """
 
     problem: FitProblem
     solution: Solution
     quality: FitQuality
     restart: Restart | None = None
+    inverse_dynamics: InverseDynamicsFit | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SegmentFits:
+    """Fits over longer and longer segments.
+
+    Attributes:
+        start: Unknowns of the whole recordings to which they led; None where all of them diverge.
+        lengths: Lengths of the segments [s]; none where no such fit is possible.
+        inverse_dynamics: The fit to the equation of motion at which they began; None where they
+            began at the start.
+    """
+
+    start: UnknownValues | None
+    lengths: tuple[float, ...]
+    inverse_dynamics: InverseDynamicsFit | None
 
 
 def continued_fit(
@@ -132,12 +152,13 @@ def _better_of_two(
     if stated or search.interrupted() or not is_doubtful(task, begun):
         return begun
 
-    start, lengths = _start_from_segments(search, problem, null_space)
-    if not lengths:
+    segments = _start_from_segments(search, problem, null_space)
+    if not segments.lengths:
         return begun
 
+    start = segments.start
     again = None if start is None else _repeated(search, problem, start, begun)
-    return _better(begun, again, lengths)
+    return _better(begun, again, segments)
 
 
 def is_doubtful(task: FitTask, fit: WholeFit) -> bool:
@@ -162,19 +183,19 @@ def is_doubtful(task: FitTask, fit: WholeFit) -> bool:
 
 def _start_from_segments(
     search: FitSearch, problem: FitProblem, null_space: NullSpace
-) -> tuple[UnknownValues | None, tuple[float, ...]]:
+) -> _SegmentFits:
     """Unknowns of the whole recordings from fits over longer and longer segments.
 
-    Each fit begins at the result of the one before. The unknowns are those at which the whole
-    recordings cost least; None where all of them diverge. The lengths of the segments [s] are empty
-    where no such fit is possible.
+    The first fit begins at the start, or at a fit to the equation of motion where that costs less,
+    and each other one at the result of the one before. The unknowns are those at which the whole
+    recordings cost least.
     """
-    best, best_cost = None, np.inf
+    best, best_cost, dynamics = None, np.inf, None
     lengths: list[float] = []
     task = search.task
     system = _free_system(task.system)
     if system is None:
-        return None, ()
+        return _SegmentFits(start=None, lengths=(), inverse_dynamics=None)
 
     # Parameters that move the stated initial state are no unknowns of the segments.
     names = task.system.parameters.names
@@ -189,6 +210,9 @@ def _start_from_segments(
         if part is None:
             continue
         part = part.pinned(theta[places], _of_parameters(null_space, places))
+        if not lengths:
+            dynamics = _cheaper_dynamics(search, problem, part, places)
+            theta = theta if dynamics is None else np.array(dynamics.theta)
         iterations = _iterations(problem, part, len(all_lengths))
         found = _fit_segments(search, part, theta[places], length, iterations)
         if found is None:
@@ -203,7 +227,31 @@ def _start_from_segments(
             break
         if cost < best_cost:
             best, best_cost = unknowns, cost
-    return best, tuple(lengths)
+    return _SegmentFits(start=best, lengths=tuple(lengths), inverse_dynamics=dynamics)
+
+
+def _cheaper_dynamics(
+    search: FitSearch, problem: FitProblem, part: FitProblem, places: np.ndarray
+) -> InverseDynamicsFit | None:
+    """A fit to the equation of motion where segments cost less at it than at the start; else None.
+
+    Args:
+        search: The searches of the identification.
+        problem: The problem of the whole recordings.
+        part: The problem of short segments.
+        places: Places of its parameters in theta.
+    """
+    start = search.task.start
+    found = try_fit_equations(problem.system, problem.recordings, start)
+    if found is None:
+        return None
+
+    some = part.of_segments(restart_subset(part))
+    try:
+        cost, stated = (some.cost(some.begin(theta[places])) for theta in (found.theta, start))
+    except InterruptedPassError:
+        return None
+    return found if cost < stated else None
 
 
 def segment_lengths(recordings: Sequence[AlignedRecording]) -> tuple[float, ...]:
@@ -384,9 +432,15 @@ def _cost(first: WholeFit, solution: Solution) -> float:
     return first.problem.cost(solution.unknowns)
 
 
-def _better(first: WholeFit, again: WholeFit | None, lengths: tuple[float, ...]) -> WholeFit:
+def _better(first: WholeFit, again: WholeFit | None, segments: _SegmentFits) -> WholeFit:
     """The fit with the lower cost, and of two equal ones that which has converged."""
-    restart = Restart(lengths=lengths, cost_before=first.solution.cost, cost=first.solution.cost)
+    restart = Restart(
+        lengths=segments.lengths,
+        cost_before=first.solution.cost,
+        cost=first.solution.cost,
+        by_dynamics=segments.inverse_dynamics is not None,
+    )
+    first = replace(first, inverse_dynamics=segments.inverse_dynamics)
     if again is None:
         return replace(first, restart=restart)
 
@@ -394,5 +448,6 @@ def _better(first: WholeFit, again: WholeFit | None, lengths: tuple[float, ...])
     fall = first.solution.cost - cost
     converges = again.solution.success and not first.solution.success
     if fall > SAME_COST or (converges and fall > -SAME_COST):
+        again = replace(again, inverse_dynamics=segments.inverse_dynamics)
         return replace(again, restart=replace(restart, cost=cost))
     return replace(first, restart=restart)

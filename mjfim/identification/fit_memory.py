@@ -58,7 +58,7 @@ def recordings_bytes(system: System, rows: int, *, fit: bool) -> float:
     """
     settings = system.experiment.fit
     directions = len(system.parameters)
-    is_free = settings.start == "measured" or settings.segment_length is not None
+    is_free = settings.start != "stated" or settings.segment_length is not None
     if is_free or free_release(system):
         directions += system.space.nx
 

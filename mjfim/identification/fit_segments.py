@@ -35,8 +35,8 @@ def has_free_starts(system: System) -> bool:
         system: System with the table `[fit]`.
     """
     settings = system.experiment.fit
-    is_cut = settings.segment_length is not None
-    return settings.start == "measured" or is_cut or free_release(system)
+    is_measured = settings.start != "stated" or settings.segment_length is not None
+    return is_measured or free_release(system)
 
 
 def segments_of_fit(
@@ -85,9 +85,15 @@ def _require_measured_starts(system: System) -> None:
         name = parameters.names[int(np.argmax(moves_start))]
         raise ExperimentError(
             f"{system.experiment.source}: {name}: the initial state is free where fit.segments or "
-            'fit.start = "measured" is stated; remove nuisance.initial and parameters of the '
-            "initial state, or remove the settings of the fit"
+            f'fit.start = "{_stated_start(system)}" is stated; remove nuisance.initial and '
+            "parameters of the initial state, or remove the settings of the fit"
         )
+
+
+def _stated_start(system: System) -> str:
+    """The value of fit.start for a message, an example of those with a free initial state."""
+    start = system.experiment.fit.start
+    return "measured" if start == "stated" else start
 
 
 def _max_delay(parameters: ParameterSet, duration: float) -> float:

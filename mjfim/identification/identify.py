@@ -25,6 +25,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.horizons import choose_horizon, with_length
+from mjfim.identification.inverse_dynamics import fit_equations
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import NEWTON, FitSearch
@@ -49,6 +50,7 @@ from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
 
@@ -195,8 +197,13 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
         RecordingError: A recording cannot be used.
         SimulationDivergedError: The model diverges at the start.
     """
+    stated = search.task
+    problem, held_out = _problems(stated, workers)
+
+    # A fit to the equation of motion gives the start where that is asked for.
+    dynamics = _inverse_dynamics(stated, problem)
+    search = _started_at(search, problem, dynamics)
     task = search.task
-    problem, held_out = _problems(task, workers)
 
     # With much data, the search begins on a subset of the segments.
     begin_stage("simulating the segments from the initial guess")
@@ -217,7 +224,7 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
     # give another start, and the better one of the two results is kept.
     fit = continued_fit(search, problem, first, null_space)
     result = FitResult(
-        task=task,
+        task=stated,
         problem=fit.problem,
         solution=fit.solution,
         quality=fit.quality,
@@ -225,6 +232,7 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
         held_out=held_out,
         subset=subset,
         restart=fit.restart,
+        inverse_dynamics=fit.inverse_dynamics if dynamics is None else dynamics,
     )
 
     # Where the model does not explain whole recordings, the length of the segments matters.
@@ -319,6 +327,34 @@ def refit_task(search: FitSearch, near: FitResult, workers: FitWorkers | None = 
         subset=subset,
         restart=None,
     )
+
+
+def _inverse_dynamics(task: FitTask, problem: FitProblem) -> InverseDynamicsFit | None:
+    """The fit to the equation of motion; None where the search does not start from it.
+
+    Raises:
+        RecordingError: A degree of freedom was not measured.
+    """
+    if task.settings.start != "inverse_dynamics":
+        return None
+    begin_stage("fitting the equation of motion")
+    return fit_equations(problem.system, problem.recordings, task.start)
+
+
+def _started_at(
+    search: FitSearch, problem: FitProblem, dynamics: InverseDynamicsFit | None
+) -> FitSearch:
+    """The searches of a task from a fit to the equation of motion, if the model does not diverge.
+
+    Parameters that the equation of motion does not contain keep their start.
+    """
+    if dynamics is None:
+        return search
+    task = replace(search.task, start=np.array(dynamics.theta))
+    subset = quick_subset(problem)
+    begin = of_subset(problem.begin(task.start), subset)
+    cost = completed(partial(problem.of_segments(subset).cost, begin))
+    return replace(search, task=task) if np.isfinite(cost) else search
 
 
 def _problems(task: FitTask, workers: FitWorkers | None) -> tuple[FitProblem, FitProblem | None]:

@@ -42,6 +42,7 @@ from mjfim.records.estimate import (
     Restart,
 )
 from mjfim.records.horizons import HorizonStudy
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.missing_term import MissingTerm
 from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
@@ -83,6 +84,7 @@ class FitResult:
         subset: Indices of segments that are quick to simulate, evenly spread over the data.
         restart: How the fit was repeated from fits over segments; None where it was not.
         horizons: Lengths of segments that were compared; None where they were not.
+        inverse_dynamics: The fit to the equation of motion from which the search started, or None.
     """
 
     task: FitTask
@@ -94,6 +96,7 @@ class FitResult:
     subset: np.ndarray
     restart: Restart | None
     horizons: HorizonStudy | None = None
+    inverse_dynamics: InverseDynamicsFit | None = None
 
     @property
     def theta(self) -> Array:
@@ -330,6 +333,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         restart=result.restart,
         horizons=result.horizons,
         held=result.task.settings.hold,
+        inverse_dynamics=result.inverse_dynamics,
     )
 
 

@@ -96,6 +96,8 @@ class Parameter:
         wanted: Standard deviation aimed at, or None.
         group: Name of the group with which it was declared; empty for a single parameter.
         per_recording: Whether every recording has a separate value.
+        cad_prior: For a coordinate of a body's inertia, the standard deviation of the logarithm of
+            the pseudo-inertia relative to the model's; None where the model is no prior knowledge.
     """
 
     name: str
@@ -112,6 +114,7 @@ class Parameter:
     wanted: float | None = None
     group: str = ""
     per_recording: bool = False
+    cad_prior: float | None = None
 
 
 def moved_bodies(parameters: Sequence[Parameter]) -> set[str]:

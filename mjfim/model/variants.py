@@ -73,7 +73,7 @@ class ModelVariant:
 # The model as the user states it.
 STATED = ModelVariant()
 
-# The model without clamps, stops and contacts.
+# The model without clamps, stops and contacts, as far as a relaxation states.
 RELAXED = ModelVariant(relaxed=True)
 
 
@@ -139,6 +139,9 @@ class Relaxation:
         tendon_forces: Ids of tendons whose limit of actuator force is removed.
         controls: Whether all control ranges are removed.
         contacts: Whether all contacts are removed.
+        constraints: Whether all constraints are removed, dry friction among them, and the forces of
+            any step are those at its beginning: steps of RK4 have a single stage, and states with
+            too large accelerations are not reset.
         smoothing_speeds: Speeds below which dry friction is viscous [m/s or rad/s]; empty for the
             friction of the engine.
     """
@@ -150,6 +153,7 @@ class Relaxation:
     tendon_forces: tuple[int, ...] = ()
     controls: bool = False
     contacts: bool = False
+    constraints: bool = False
     smoothing_speeds: tuple[float, ...] = ()
 
     def apply(self, model: Any) -> None:
@@ -163,6 +167,12 @@ class Relaxation:
             model.actuator_ctrllimited[:] = 0
         if self.contacts:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        if self.constraints:
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+            if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+                model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
+                model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 
 
 class PlantModel:

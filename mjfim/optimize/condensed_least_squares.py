@@ -311,7 +311,7 @@ class Condensed:
         segment_rows = R[:, n:, n:].reshape(-1, c + 1)
         damping_rows = np.concatenate([np.diag(weight[n:]), np.zeros((c, 1))], axis=1)
         rows = triangle(np.concatenate([segment_rows, self.common_rows, damping_rows]))
-        common = _bounded_least_squares(rows[:, :-1], -rows[:, -1], lower, upper)
+        common = bounded_least_squares(rows[:, :-1], -rows[:, -1], lower, upper)
 
         return self._evaluated(common, self._substituted(R, common))
 
@@ -490,8 +490,18 @@ def triangle(rows: Array) -> Array:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def _bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Array:
-    """(c,) minimiser of `|A d - b|` between bounds that contain 0; A need not have full rank."""
+def bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Array:
+    """Minimiser of `|A d - b|` between bounds that contain 0.
+
+    Args:
+        A: (k, c) matrix, which need not have full rank.
+        b: (k,) right-hand side.
+        lower: (c,) lower bounds, at most 0.
+        upper: (c,) upper bounds, at least 0.
+
+    Returns:
+        (c,) minimiser.
+    """
     norms = np.maximum(np.linalg.norm(A, axis=0), SMALLEST_NORM)
 
     # The unbounded minimum is the solution where it lies inside the bounds.

@@ -91,7 +91,15 @@ def estimate_files(recordings: int, held_out: int = 0, *, select: bool = False) 
         held_out: Number of recordings that are held out.
         select: Whether terms of the model are selected.
     """
-    names = ("parameters", "spectra", "trace", "pairs", "predictions", "horizons")
+    names = (
+        "parameters",
+        "spectra",
+        "inverse_dynamics",
+        "trace",
+        "pairs",
+        "predictions",
+        "horizons",
+    )
     figures = tuple(f"{name}.png" for name in (*names, *(["selection"] if select else [])))
     fits = tuple(f"{name}.png" for name in (*fit_names(recordings), *held_out_names(held_out)))
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
@@ -333,7 +341,7 @@ def write_estimate_folder(
     endings = "|".join(PictureFormat)
     _clear(
         folder,
-        rf"((fit|held_out)(_\d+)?|predictions|pairs|trace|selection|horizons)\.({endings})|identified(_.*)?\.xml",
+        rf"((fit|held_out)(_\d+)?|predictions|pairs|trace|selection|horizons|inverse_dynamics)\.({endings})|identified(_.*)?\.xml",
     )
     archive.save_with_origin(folder, estimate, system)
     write_tables(folder, estimate)

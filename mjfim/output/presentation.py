@@ -17,6 +17,7 @@ from mjfim.output.summaries.check import describe_check
 from mjfim.output.summaries.comparison import describe_comparison
 from mjfim.output.summaries.design import describe_design
 from mjfim.output.summaries.estimate import describe_estimate
+from mjfim.output.summaries.inverse_dynamics import describe_inverse_dynamics
 from mjfim.output.summaries.monte_carlo import describe_study
 from mjfim.output.summaries.robustness import describe_robustness
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
@@ -26,6 +27,7 @@ from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robustness import Robustness
 from mjfim.records.shown import ShownRecord
@@ -102,5 +104,6 @@ def _(record: Campaign) -> Summary:
 
 _described.register(Check, describe_check)
 _described.register(Estimate, describe_estimate)
+_described.register(InverseDynamicsFit, describe_inverse_dynamics)
 _described.register(Comparison, describe_comparison)
 _described.register(Robustness, describe_robustness)

@@ -11,6 +11,7 @@ import numpy as np
 from mjfim.arrays import Array, freeze
 from mjfim.records.combinations import join_names
 from mjfim.records.horizons import HorizonStudy
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
 from mjfim.records.missing_term import MissingTerm
 from mjfim.records.recording import Recording
@@ -91,6 +92,8 @@ class Estimate(ShownRecord):
         held: Names of the parameters that kept their guess, whose standard deviation is 0.
         horizons: Lengths of segments that were compared, because the model does not explain whole
             recordings; None where they were not.
+        inverse_dynamics: The fit to the equation of motion from which the search started; None
+            where there was none.
     """
 
     parameters: tuple[str, ...]
@@ -138,6 +141,7 @@ class Estimate(ShownRecord):
     selection: Selection | None = None
     horizons: HorizonStudy | None = None
     held: tuple[str, ...] = ()
+    inverse_dynamics: InverseDynamicsFit | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -240,6 +244,9 @@ class Estimate(ShownRecord):
             "selection": None if self.selection is None else self.selection.summary(),
             "held": list(self.held),
             "horizons": None if self.horizons is None else self.horizons.summary(),
+            "inverse_dynamics": (
+                None if self.inverse_dynamics is None else self.inverse_dynamics.summary()
+            ),
         }
 
 
@@ -251,11 +258,14 @@ class Restart:
         lengths: Lengths of the segments, in the order of the fits [s].
         cost_before: Half of the sum of squares of the first fit.
         cost: That of the fit that was kept, with the noise of the first fit.
+        by_dynamics: Whether the fits over segments began at a fit to the equation of motion, which
+            costs less there than the start.
     """
 
     lengths: tuple[float, ...]
     cost_before: float
     cost: float
+    by_dynamics: bool = False
 
     def __str__(self) -> str:
         lengths = join_names([f"{length:.2g}" for length in self.lengths])
@@ -263,6 +273,8 @@ class Restart:
             "The first fit did not explain the recordings or did not converge, so it was restarted "
             f"from fits over segments of {lengths} s"
         )
+        if self.by_dynamics:
+            begin += ", which began at a fit to the equation of motion"
         if not self.cost < self.cost_before:
             return f"{begin}. This found nothing better, and the first result stands."
         return (
@@ -276,6 +288,7 @@ class Restart:
             "lengths": list(self.lengths),
             "cost_before": self.cost_before,
             "cost": self.cost,
+            "by_dynamics": self.by_dynamics,
             "words": str(self),
         }
 

@@ -4,6 +4,7 @@ from .compare import compare_figure
 from .convergence import convergence
 from .design import sensitivity_phase, trajectories
 from .horizons import horizons_figure
+from .inverse_dynamics import inverse_dynamics_figure
 from .limit_usage import limits
 from .monte_carlo import histogram, study_overview
 from .pairs import check_pairs, estimate_pairs
@@ -26,6 +27,7 @@ __all__ = [
     "held_out",
     "histogram",
     "horizons_figure",
+    "inverse_dynamics_figure",
     "limits",
     "parameter_intervals",
     "parameter_trace",

@@ -20,6 +20,7 @@ from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robustness import Robustness
 from mjfim.records.shown import ShownRecord
@@ -107,6 +108,10 @@ def _(estimate: Estimate) -> Pictures:
         pictures["selection"] = partial(plots.selection_figure, estimate)
     if estimate.horizons is not None:
         pictures["horizons"] = partial(plots.horizons_figure, estimate)
+    if estimate.inverse_dynamics is not None:
+        pictures["inverse_dynamics"] = partial(
+            plots.inverse_dynamics_figure, estimate.inverse_dynamics
+        )
     if len(estimate.trace) > 1:
         pictures["trace"] = partial(plots.parameter_trace, estimate, labels)
     if has_pairs(estimate.std):
@@ -121,6 +126,12 @@ def _(estimate: Estimate) -> Pictures:
     for i, name in enumerate(held_out_names(kept)):
         pictures[name] = partial(plots.held_out, estimate, i, labels)
     return pictures
+
+
+@pictures_of.register
+def _(result: InverseDynamicsFit) -> Pictures:
+    """The figure of a fit to the equation of motion."""
+    return {"inverse_dynamics": partial(plots.inverse_dynamics_figure, result)}
 
 
 @pictures_of.register

@@ -27,6 +27,7 @@ from mjfim.output.report.curves import (
     thinned,
 )
 from mjfim.output.report.horizons import horizons_section
+from mjfim.output.report.inverse_dynamics import inverse_dynamics_section
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
 from mjfim.output.report.residual_curves import Residuals
 from mjfim.output.report.selection import selection_section
@@ -83,6 +84,8 @@ def estimate_page(estimate: Estimate) -> Page:
         sections.append(selection_section(estimate.selection))
     if estimate.horizons is not None:
         sections.append(horizons_section(estimate.horizons))
+    if estimate.inverse_dynamics is not None:
+        sections.append(inverse_dynamics_section(estimate.inverse_dynamics))
     if estimate.predictions:
         found: list[Part | PlotGroup] = [summary.table("predictions")]
         found += [summary.table("prediction details"), _prediction_plots(estimate, labels)]
@@ -122,7 +125,7 @@ def estimate_page(estimate: Estimate) -> Page:
 
 def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | PlotGroup]:
     """Yield the table of the estimates, their plots, and the sentences of the summary."""
-    elsewhere = {"predictions", "prediction details", "residuals"}
+    elsewhere = {"predictions", "prediction details", "residuals", "equations"}
     table = summary.table("estimates")
     yield table
 

@@ -9,6 +9,7 @@ import numpy as np
 from mjfim.errors import listed
 from mjfim.output.summaries.accuracy import NOT_ALONE
 from mjfim.output.summaries.horizons import describe_horizons
+from mjfim.output.summaries.inverse_dynamics import equation_parts
 from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.summary_parts import (
     Cell,
@@ -60,6 +61,8 @@ def describe_estimate(estimate: Estimate) -> Summary:
         parts += describe_selection(estimate.selection)
     if estimate.horizons is not None:
         parts += describe_horizons(estimate.horizons)
+    if estimate.inverse_dynamics is not None:
+        parts += equation_parts(estimate.inverse_dynamics)
     if estimate.predictions:
         parts.append(Paragraph(text=_prediction_sentence(estimate.predictions)))
     parts.append(

@@ -11,6 +11,7 @@ import numpy as np
 
 from mjfim.errors import MjfimError, first_ones
 from mjfim.output.summaries.accuracy import relative
+from mjfim.output.summaries.inverse_dynamics import LARGE_SHARE
 from mjfim.output.summaries.robustness import robustness_sentences
 from mjfim.output.vocabulary import shown_word
 from mjfim.records.campaign import Campaign, CampaignStatus
@@ -18,6 +19,7 @@ from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.robustness import Robustness
 from mjfim.records.shown import ShownRecord
@@ -327,6 +329,28 @@ def _(comparison: Comparison) -> tuple[str, ...]:
         f"Begin a design at the control of {name}: state its table as `initial.control`.",
         "Give all methods more time with `--seconds`.",
     )
+
+
+@verdict_of.register
+def _(fit: InverseDynamicsFit) -> Verdict:
+    """The verdict on a fit to the equation of motion."""
+    worst = max(fit.equations, key=lambda each: float(np.nan_to_num(each.share)))
+    share = f"{100.0 * worst.share:.2g} %"
+    if not fit.success:
+        return Verdict(text=f"The fit to the equation of motion {fit.status}.", level=Level.BAD)
+    if not worst.share <= LARGE_SHARE:
+        text = f"The equation of motion of {worst.name} does not hold: residuals are {share} of it."
+        return Verdict(text=text, level=Level.DOUBTFUL)
+    text = f"The equation of motion holds: residuals are at most {share} of the forces."
+    return Verdict(text=text, level=Level.GOOD)
+
+
+@next_steps.register
+def _(fit: InverseDynamicsFit) -> tuple[str, ...]:
+    """Return the next steps after a fit to the equation of motion."""
+    if verdict_of(fit).level is not Level.GOOD:
+        return ("Look at the forces in `inverse_dynamics.png`: signs, units, delays, friction.",)
+    return ('Identify with `fit.start = "inverse_dynamics"`, which predicts the motion itself.',)
 
 
 @verdict_of.register

@@ -1,0 +1,227 @@
+"""Coordinates in which the equation of motion is linear.
+
+They are the barycentric coordinates of the bodies whose whole inertia is unknown, and all other
+parameters as they are: damping, dry friction, armature, stiffness and gains. Bodies are physical
+where their pseudo-inertia is positive definite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, BodyInertia
+from mjfim.model.inertia_distance import (
+    BARYCENTRIC_DERIVATIVES,
+    InertiaDifference,
+    barycentric_of,
+    inertia_difference,
+    is_positive_definite,
+    logcholesky_derivatives,
+    logcholesky_factor,
+    pseudo_inertia_of,
+)
+from mjfim.model.parameters import ParameterSet
+from mjfim.model.targets import InertiaField
+
+# Number of coordinates of an inertia.
+COUNT = 10
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UnknownBody:
+    """A body whose whole inertia is unknown.
+
+    Attributes:
+        body: Number of the body.
+        columns: (10,) indices in theta of its coordinates, in their order.
+        is_logcholesky: True for log-Cholesky, False for barycentric coordinates.
+        reference: (10,) log-Cholesky coordinates of the inertia in the model.
+        sizes: (10,) natural magnitudes of changes of its parameters.
+        linear_sizes: (10,) those of its barycentric coordinates.
+        cad_sigma: Standard deviation of the logarithm of the inertia relative to the model's; None
+            where the model's inertia is no prior knowledge.
+    """
+
+    body: int
+    columns: np.ndarray
+    is_logcholesky: bool
+    reference: Array
+    sizes: Array
+    linear_sizes: Array
+    cad_sigma: float | None
+
+    def linear(self, values: Array) -> Array:
+        """(10,) barycentric coordinates of (10,) parameters."""
+        if not self.is_logcholesky:
+            return values
+        factor = logcholesky_factor(values)
+        return barycentric_of(factor @ factor.T)
+
+    def values(self, linear: Array) -> Array:
+        """(10,) parameters of (10,) barycentric coordinates, which are physical."""
+        if not self.is_logcholesky:
+            return linear
+        inertia = INERTIA_PARAMETRISATIONS["barycentric"].inertia(linear)
+        return INERTIA_PARAMETRISATIONS["logcholesky"].coordinates(inertia)
+
+    def derivative(self, linear: Array) -> Array:
+        """(10, 10) derivatives of the parameters by the barycentric coordinates."""
+        if not self.is_logcholesky:
+            return np.eye(COUNT)
+        by_parameters = barycentric_of(logcholesky_derivatives(self.values(linear))).T
+        return np.asarray(np.linalg.inv(by_parameters))
+
+    def is_physical(self, linear: Array) -> bool:
+        """Whether the barycentric coordinates: (10,) are those of a body with a volume."""
+        return is_positive_definite(pseudo_inertia_of(linear))
+
+    def difference(self, linear: Array) -> InertiaDifference:
+        """Difference of an inertia, by its (10,) barycentric coordinates, from the model's."""
+        return inertia_difference(
+            pseudo_inertia_of(linear), BARYCENTRIC_DERIVATIVES, self.reference
+        )
+
+
+def unknown_bodies(parameters: ParameterSet) -> tuple[UnknownBody, ...]:
+    """Bodies all of whose inertial coordinates are parameters without bounds.
+
+    Points, rods and plates, which have no log-Cholesky coordinates, are left out.
+
+    Args:
+        parameters: The parameters.
+    """
+    columns: dict[tuple[int, str], dict[int, int]] = {}
+    for j, parameter in enumerate(parameters.parameters):
+        if len(parameter.targets) != 1 or np.isfinite(parameter.bounds).any():
+            continue
+        target = parameter.targets[0]
+        field = target.field
+        if isinstance(field, InertiaField) and target.scale == 1.0 and target.offset == 0.0:
+            key = field.body, field.parametrisation
+            columns.setdefault(key, {})[field.component] = j
+
+    found = []
+    for (body, kind), places in columns.items():
+        if len(places) < COUNT or kind == "central":
+            continue
+        inertia = INERTIA_PARAMETRISATIONS[kind].inertia(parameters.nominal[kind, body])
+        reference = _logcholesky(inertia)
+        if reference is None:
+            continue
+        order = np.array([places[i] for i in range(COUNT)], dtype=np.intp)
+        found.append(
+            UnknownBody(
+                body=body,
+                columns=order,
+                is_logcholesky=kind == "logcholesky",
+                reference=reference,
+                sizes=INERTIA_PARAMETRISATIONS[kind].magnitudes(inertia),
+                linear_sizes=INERTIA_PARAMETRISATIONS["barycentric"].magnitudes(inertia),
+                cad_sigma=parameters.parameters[int(order[0])].cad_prior,
+            )
+        )
+    return tuple(found)
+
+
+def _logcholesky(inertia: BodyInertia) -> Array | None:
+    """(10,) log-Cholesky coordinates; None where the inertia has none."""
+    try:
+        return INERTIA_PARAMETRISATIONS["logcholesky"].coordinates(inertia)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LinearCoordinates:
+    """The p parameters in linear coordinates x.
+
+    Attributes:
+        bodies: Bodies with barycentric coordinates in x.
+        lower: (p,) lower bounds of x.
+        upper: (p,) upper bounds of x.
+        sizes: (p,) sizes of x.
+    """
+
+    bodies: tuple[UnknownBody, ...]
+    lower: Array
+    upper: Array
+    sizes: Array
+
+    @staticmethod
+    def of(parameters: ParameterSet, theta: Array) -> LinearCoordinates:
+        """The linear coordinates of parameters.
+
+        Args:
+            parameters: The parameters.
+            theta: (p,) parameters at which a search starts; bodies that are not physical there do
+                not have to be physical.
+        """
+        sizes = np.array(parameters.magnitude)
+        bodies = tuple(
+            body
+            for body in unknown_bodies(parameters)
+            if body.is_physical(body.linear(theta[body.columns]))
+        )
+        for body in bodies:
+            sizes[body.columns] = body.linear_sizes
+        return LinearCoordinates(
+            bodies=bodies, lower=parameters.lower, upper=parameters.upper, sizes=sizes
+        )
+
+    def linear(self, theta: Array) -> Array:
+        """(p,) linear coordinates of parameters theta: (p,)."""
+        x = np.array(theta)
+        for body in self.bodies:
+            x[body.columns] = body.linear(theta[body.columns])
+        return x
+
+    def theta(self, x: Array) -> Array:
+        """(p,) parameters at linear coordinates x: (p,)."""
+        theta = np.array(x)
+        for body in self.bodies:
+            theta[body.columns] = body.values(x[body.columns])
+        return theta
+
+    def derivative(self, x: Array) -> Array:
+        """(p, p) derivatives of the parameters by the linear coordinates x: (p,)."""
+        blocks = np.eye(len(x))
+        for body in self.bodies:
+            blocks[np.ix_(body.columns, body.columns)] = body.derivative(x[body.columns])
+        return blocks
+
+    def are_physical(self, x: Array) -> bool:
+        """Whether all bodies are physical at x: (p,)."""
+        return all(body.is_physical(x[body.columns]) for body in self.bodies)
+
+    def slopes(self, differences: Array, moves: Array) -> Array:
+        """Slopes of rows by the linear coordinates from differences along moves.
+
+        They are exact for moves of any length where the rows are linear.
+
+        Args:
+            differences: (R, p) differences of the rows along each move.
+            moves: (p, p) moves of the linear coordinates, one in each column.
+
+        Returns:
+            (R, p) slopes.
+        """
+        slopes = np.array(differences)
+        plain = np.ones(len(moves), dtype=bool)
+        for body in self.bodies:
+            own = moves[np.ix_(body.columns, body.columns)]
+
+            # Rows and columns are scaled, since the coordinates differ in their units.
+            rows = np.abs(own).max(axis=1, keepdims=True)
+            columns = np.abs(own).max(axis=0, keepdims=True)
+            scaled = own / np.sqrt(rows * columns)
+            weighted = differences[:, body.columns] / np.sqrt(columns)
+            solved = scipy.linalg.solve(scaled.T, weighted.T).T
+            slopes[:, body.columns] = solved / np.sqrt(rows[:, 0])
+            plain[body.columns] = False
+        places = np.flatnonzero(plain)
+        slopes[:, places] /= moves[places, places]
+        return slopes

@@ -1,0 +1,74 @@
+"""Forces of actuators that are measured: outputs of sensors of actuators and of joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mjfim.experiment.system import System
+from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.model.elements import element_name
+
+# Sensors of forces of single actuators, and of all actuators on a joint.
+ACTUATOR_FORCE = int(mujoco.mjtSensor.mjSENS_ACTUATORFRC)
+JOINT_FORCE = int(mujoco.mjtSensor.mjSENS_JOINTACTFRC)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredForce:
+    """A measured force of actuators.
+
+    Attributes:
+        output: Index of the output.
+        actuator: Address of the force of a single actuator; -1 for the force on a joint.
+        dof: Degree of freedom on which all actuators act together; -1 for a single actuator.
+        name: Name of the actuator or joint.
+    """
+
+    output: int
+    actuator: int
+    dof: int
+    name: str
+
+    @property
+    def is_of_joint(self) -> bool:
+        """True for the force of all actuators on a joint."""
+        return self.dof >= 0
+
+
+def measured_forces(
+    system: System, recordings: Sequence[AlignedRecording]
+) -> tuple[MeasuredForce, ...]:
+    """Forces of actuators that are measured in a recording.
+
+    Those on joints come last: they take precedence over those of the joint's actuators.
+
+    Args:
+        system: The system.
+        recordings: Its recordings.
+    """
+    model = system.model
+    known = np.any([recording.measured.any(axis=0) for recording in recordings], axis=0)
+    by_address = {
+        output.sensor: i
+        for i, output in enumerate(system.outputs.outputs)
+        if output.sensor is not None and known[i]
+    }
+    found = []
+    for sensor in range(model.nsensor):
+        output = by_address.get(int(model.sensor_adr[sensor]))
+        kind, element = int(model.sensor_type[sensor]), int(model.sensor_objid[sensor])
+        if output is None:
+            continue
+        if kind == JOINT_FORCE:
+            dof = int(model.jnt_dofadr[element])
+            name = element_name(model, "joint", element)
+            found.append(MeasuredForce(output=output, actuator=-1, dof=dof, name=name))
+        elif kind == ACTUATOR_FORCE:
+            address = int(model.actuator_outadr[element])
+            name = element_name(model, "actuator", element)
+            found.append(MeasuredForce(output=output, actuator=address, dof=-1, name=name))
+    return tuple(sorted(found, key=lambda force: force.is_of_joint))

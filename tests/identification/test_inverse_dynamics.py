@@ -1,0 +1,334 @@
+"""Fits to the equation of motion: exact without noise, from any start, of every kind of log."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.identification.inverse_dynamics import inverse_dynamics
+from mjfim.records.inverse_dynamics import InverseDynamicsFit
+from mjfim.records.recording import Recording
+from mjfim.signals import multisine
+from tests.support.hinged_arm import arm_experiment, arm_log
+from tests.support.numerics import CART_PENDULUM, Array
+from tests.support.rescaling import Units, rescale
+
+CART = {
+    "m": {"target": "body/bob:mass", "unit": "kg"},
+    "l": {"target": "body/bob:pos[2]", "bounds": [0.05, 10.0], "unit": "m"},
+    "c": {"target": "joint/hinge:damping", "unit": "N m s/rad"},
+    "d": {"target": "joint/slide:damping", "unit": "N s/m"},
+}
+STATE = ("qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge")
+
+
+def cart(folder: Path, text: str = CART_PENDULUM, **tables: Any) -> Experiment:
+    """The cart-pendulum at 100 Hz."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = text.replace('damping="0.1"', 'damping="0.5"').format(integrator="RK4")
+    (folder / "cart.xml").write_text(text, encoding="utf-8")
+    defaults: dict[str, Any] = {
+        "parameters": CART,
+        "noise": dict.fromkeys(STATE, 0.01),
+        "initial": {"qpos": (0.1, 3.0), "qvel": (0.0, 0.4), "control": {"kind": "constant"}},
+    }
+    return Experiment(
+        model="cart.xml", directory=folder, source="cart", rate=100.0, **{**defaults, **tables}
+    )
+
+
+def cart_log(
+    experiment: Experiment,
+    sigma: float,
+    seed: int = 0,
+    seconds: float = 8.0,
+    theta: Array | None = None,
+    measured: tuple[str, ...] = STATE,
+) -> Recording:
+    """A log of the model at theta (default: the guess) under a multisine."""
+    system = System.resolve(experiment.replace(noise=dict.fromkeys(measured, 0.01)), threads=1)
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(100.0 * seconds) + 1) / 100.0
+    ctrl = 4.0 * multisine(t[:-1], 1, 0.3, 6, rng)
+    at = system.parameters.guess if theta is None else theta
+    y = system.plant.measure(at[None], ctrl)[0][0]
+    y = y + sigma * rng.standard_normal(y.shape)
+    return Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
+
+
+def errors(fit: InverseDynamicsFit, true: Array) -> Array:
+    """(p,) errors over the sizes of the parameters."""
+    return np.abs(fit.theta - true) / np.where(true != 0.0, np.abs(true), 1.0)
+
+
+def test_cart_pendulum_is_found_from_starts_wrong_by_ten(tmp_path: Path) -> None:
+    experiment = cart(tmp_path)
+    true = System.resolve(experiment).parameters.guess
+    log = cart_log(experiment, 1e-6)
+    signs = np.random.default_rng(5).choice([-1.0, 1.0], (3, len(true)))
+    for start in (true, *(true * 10.0**signs)):
+        fit = inverse_dynamics(experiment, [log], start=start)
+        assert fit.success
+        assert errors(fit, true).max() < 5e-3
+    assert fit.degrees_of_freedom == fit.equations
+    assert [each.name for each in fit.equations] == ["slide", "hinge"]
+    assert max(each.share for each in fit.equations) < 5e-3
+    assert not fit.undetermined
+
+
+@pytest.mark.parametrize(
+    "measured", [STATE[:2], ("qpos:slide", "qvel:hinge", "qpos:hinge"), STATE[2:]]
+)
+def test_positions_or_velocities_are_enough(measured: tuple[str, ...], tmp_path: Path) -> None:
+    experiment = cart(tmp_path, noise=dict.fromkeys(measured, 1e-3))
+    true = System.resolve(experiment).parameters.guess
+    fit = inverse_dynamics(experiment, [cart_log(experiment, 1e-3, measured=measured)])
+    assert errors(fit, true).max() < 0.03
+
+
+def test_errors_are_those_of_the_stated_accuracy(tmp_path: Path) -> None:
+    experiment = cart(tmp_path)
+    true = System.resolve(experiment).parameters.guess
+    fits = [
+        inverse_dynamics(experiment, [cart_log(experiment, 0.01, seed)], start=2.0 * true)
+        for seed in range(8)
+    ]
+    deviations = np.array([(fit.theta - true) / fit.std for fit in fits])
+    assert np.sqrt(np.mean(deviations**2)) == pytest.approx(1.0, abs=0.5)
+
+    # The bias is small beside the parameters, but the stated accuracy does not contain it.
+    bias = np.mean([fit.theta for fit in fits], axis=0) / true - 1.0
+    assert np.abs(bias).max() < 0.02
+
+
+def test_irregular_rows_missing_values_and_several_recordings(tmp_path: Path) -> None:
+    experiment = cart(tmp_path)
+    true = System.resolve(experiment).parameters.guess
+    logs = []
+    for seed in range(2):
+        log = cart_log(experiment, 0.005, seed)
+        rng = np.random.default_rng(seed)
+        y = np.array(log.y)
+        y[rng.random(y.shape) < 0.1] = np.nan
+        y[300:340, 1::2] = np.nan
+        rows = np.sort(rng.choice(len(log.t), 700, replace=False))
+        kept = np.zeros(len(log.t), dtype=bool)
+        kept[rows] = True
+        kept[[0, -1]] = True
+
+        # Between rows that were dropped, the control is the mean of what acted.
+        places = np.flatnonzero(kept)
+        means = [log.ctrl[a:b].mean(axis=0) for a, b in pairwise(places)]
+        logs.append(
+            Recording(
+                t=log.t[kept], ctrl=np.array(means), y=y[kept], outputs=STATE, name=f"{seed}.csv"
+            )
+        )
+    fit = inverse_dynamics(experiment, logs, start=3.0 * true)
+    assert errors(fit, true).max() < 0.05
+
+
+def test_dry_friction_needs_no_start(tmp_path: Path) -> None:
+    text = CART_PENDULUM.replace('damping="0.1"', 'damping="0.1" frictionloss="0.6"')
+    tables = {**CART, "f": {"target": "joint/slide:frictionloss", "scale": 1.0}}
+    experiment = cart(tmp_path, text, parameters=tables)
+    true = System.resolve(experiment).parameters.guess
+    log = cart_log(experiment, 0.002, seconds=12.0)
+    for start in (0.1 * true, 10.0 * true):
+        fit = inverse_dynamics(experiment, [log], start=start)
+        found = dict(zip(fit.parameters, errors(fit, true), strict=True))
+        assert found["f"] < 0.05
+        assert found["m"] < 0.05
+        assert found["d"] < 0.5
+
+
+def test_filtered_drives_and_delays(tmp_path: Path) -> None:
+    experiment = cart(tmp_path, nuisance={"delay": True})
+    parameters = System.resolve(experiment).parameters
+    true = np.array(parameters.guess)
+    true[parameters.names.index("delay")] = 0.013
+    fit = inverse_dynamics(experiment, [cart_log(experiment, 0.002, theta=true)])
+    assert errors(fit, true).max() < 0.05
+
+
+# ---- arms
+
+
+def arm_forces(joints: int, theta: Array, experiment: Experiment) -> Array:
+    """(30, joints) forces that random motions of the arm need with some parameters."""
+    system = System.resolve(experiment, threads=1)
+    model = system.model_at(theta)
+    model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_RK4)
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(8)
+    found = []
+    for _ in range(30):
+        data.qpos[:], data.qvel[:], data.qacc[:] = rng.uniform(-1.0, 1.0, (3, joints))
+        mujoco.mj_inverse(model, data)
+        found.append(np.array(data.qfrc_inverse))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("coordinates", ["logcholesky", "barycentric"])
+def test_base_parameters_of_an_arm_with_hardly_any_noise(coordinates: str, tmp_path: Path) -> None:
+    joints = 3
+    log, _ = arm_log(joints, 8.0, np.random.default_rng(1), sigma=1e-7)
+    experiment = arm_experiment(tmp_path, joints)
+    tables = {
+        name: {**spec.model_dump(exclude_none=True), "coordinates": coordinates}
+        for name, spec in experiment.parameters.items()
+        if spec.inertial
+    }
+    experiment = experiment.replace(parameters=tables)
+    true = System.resolve(experiment).parameters.guess
+
+    # The start is a heavier arm with other friction.
+    start = np.array(true)
+    names = System.resolve(experiment).parameters.names
+    for j, name in enumerate(names):
+        if name.endswith(".alpha"):
+            start[j] += 0.5 * np.log(4.0)
+        elif name.startswith(("damping", "armature")):
+            start[j] *= 6.0
+        elif coordinates == "barycentric":
+            start[j] *= 4.0
+    fit = inverse_dynamics(experiment, [log], start=start)
+    assert fit.success
+    assert fit.iterations == 1
+    assert fit.determined < len(true) - 10
+
+    # What the recording determines is right: the forces of other motions.
+    expected = arm_forces(joints, true, experiment)
+    error = np.abs(arm_forces(joints, fit.theta, experiment) - expected).max(axis=0)
+    assert (error < 0.01 * np.abs(expected).max(axis=0)).all()
+    assert np.abs(arm_forces(joints, start, experiment) - expected).max() > 10.0
+    assert not System.resolve(experiment).impossible(fit.theta)
+
+
+def test_seven_joints_with_friction(tmp_path: Path) -> None:
+    joints = 7
+    log, _ = arm_log(joints, 8.0, np.random.default_rng(2), friction=True, sigma=2e-5)
+    experiment = arm_experiment(tmp_path, joints, friction=True)
+    true = System.resolve(experiment).parameters.guess
+    fit = inverse_dynamics(experiment, [log])
+    expected = arm_forces(joints, true, experiment)
+    error = np.sqrt(np.mean((arm_forces(joints, fit.theta, experiment) - expected) ** 2, axis=0))
+    assert (error < 0.03 * np.abs(expected).max(axis=0)).all()
+    friction = [i for i, name in enumerate(fit.parameters) if name.startswith("friction")]
+    assert errors(fit, true)[friction].max() < 0.05
+    assert max(each.share for each in fit.equations) < 0.05
+
+
+def test_measured_torques_take_the_place_of_unknown_motors(tmp_path: Path) -> None:
+    joints = 2
+    log, _ = arm_log(joints, 15.0, np.random.default_rng(3), sigma=2e-5, torque_sigma=0.02)
+    noise = {"qpos:joint1": 2e-5, "qpos:joint2": 2e-5, "torque1": 0.06, "torque2": 0.06}
+    gains = {f"gain{i}": {"target": f"actuator/joint{i}:gainprm[0]"} for i in (1, 2)}
+    experiment = arm_experiment(tmp_path, joints, noise=noise)
+    experiment = experiment.replace(parameters=gains)
+    true = np.array(System.resolve(experiment).parameters.guess)
+
+    # The log holds currents, of which the gains are unknown.
+    true[-2:] = 0.25, 4.0
+    log = Recording(
+        t=log.t, ctrl=log.ctrl / true[-2:], y=log.y, outputs=log.outputs, name="currents"
+    )
+    fit = inverse_dynamics(experiment, [log])
+    assert [each.name for each in fit.equations][2:] == ["law of joint1", "law of joint2"]
+    assert errors(fit, true)[-2:].max() < 0.01
+    damping = [fit.parameters.index(f"damping{i}") for i in (1, 2)]
+    assert errors(fit, true)[damping].max() < 0.02
+
+
+def test_servo_laws_with_recorded_references(tmp_path: Path) -> None:
+    text = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+      <body><joint name="j" axis="0 1 0" damping="0.3"/>
+        <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
+      <actuator><position name="s" joint="j" kp="30" kv="2"/></actuator></mujoco>"""
+    tmp_path.mkdir(exist_ok=True)
+    (tmp_path / "servo.xml").write_text(text, encoding="utf-8")
+    experiment = Experiment(
+        model="servo.xml",
+        directory=tmp_path,
+        source="servo",
+        rate=500.0,
+        parameters={
+            "kp": {"target": "actuator/s:kp"},
+            "damping": {"target": "joint/j:damping"},
+            "armature": {"target": "joint/j:armature", "scale": 0.01},
+        },
+        noise={"qpos:j": 1e-4},
+    )
+    system = System.resolve(experiment, threads=1)
+    rng = np.random.default_rng(0)
+    t = np.arange(5001) / 500.0
+    reference = 0.6 * multisine(t[:-1], 1, 0.3, 8, rng)
+    y = system.plant.measure(system.parameters.guess[None], reference)[0][0]
+    y = y + 1e-4 * rng.standard_normal(y.shape)
+    log = Recording(t=t, ctrl=reference, y=y, outputs=system.outputs.names, name="servo")
+    fit = inverse_dynamics(experiment, [log], start=np.array([5.0, 2.0, 0.1]))
+    assert fit.theta[0] == pytest.approx(30.0, rel=0.02)
+    assert fit.theta[1] == pytest.approx(0.3, rel=0.2)
+    assert fit.theta[2] == pytest.approx(0.0, abs=2e-3)
+
+
+# ---- units and misuse
+
+
+@pytest.mark.parametrize(
+    "units", [Units(length=2.0**10), Units(mass=2.0**-20), Units(time=2.0**10)]
+)
+def test_a_robot_of_another_size_gives_the_same_numbers(units: Units, tmp_path: Path) -> None:
+    experiment = cart(tmp_path / "own")
+    log = cart_log(experiment, 0.005)
+    own = inverse_dynamics(experiment, [log])
+    rescaled = rescale(experiment, units, tmp_path / "rescaled")
+    other = inverse_dynamics(rescaled.experiment, [rescaled.recording(log)])
+    factors = [units.factor(unit) for unit in own.units]
+    np.testing.assert_allclose(other.theta / factors, own.theta, rtol=1e-5)
+    np.testing.assert_allclose(other.std / factors, own.std, rtol=1e-3)
+    assert [each.rows for each in other.equations] == [each.rows for each in own.equations]
+
+
+def test_misuse_is_explained(tmp_path: Path) -> None:
+    experiment = cart(tmp_path)
+    log = cart_log(experiment, 0.0, seconds=3.0)
+    with pytest.raises(RecordingError, match="at least one recording"):
+        inverse_dynamics(experiment, [])
+    with pytest.raises(ExperimentError, match=r"start: \(2,\) numbers; expected one per parameter"):
+        inverse_dynamics(experiment, [log], start=np.ones(2))
+    with pytest.raises(RecordingError, match="no measured position or velocity of hinge"):
+        inverse_dynamics(experiment, [_without(log, "hinge")])
+    with pytest.raises(RecordingError, match=r"part: a degree of freedom has only 6 measured"):
+        inverse_dynamics(experiment, [_first(log, 6)])
+    arm = arm_experiment(tmp_path, 2)
+    log, _ = arm_log(2, 1.0, np.random.default_rng(1))
+    with pytest.raises(RecordingError, match=r"part: the equation of motion has only \d+ rows for"):
+        inverse_dynamics(arm, [_first(log, 25)])
+
+
+def _first(log: Recording, rows: int) -> Recording:
+    """The first rows of a log."""
+    return Recording(
+        t=log.t[:rows], ctrl=log.ctrl[: rows - 1], y=log.y[:rows], outputs=log.outputs, name="part"
+    )
+
+
+def _without(log: Recording, joint: str) -> Recording:
+    """A log without the columns of a joint."""
+    kept = [i for i, name in enumerate(log.outputs) if not name.endswith(joint)]
+    return Recording(
+        t=log.t,
+        ctrl=log.ctrl,
+        y=log.y[:, kept],
+        outputs=tuple(log.outputs[i] for i in kept),
+        name="part",
+    )

@@ -1,0 +1,121 @@
+"""Motions from measured values against the motions that were measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjfim.errors import RecordingError
+from mjfim.excitation.task import DesignTask
+from mjfim.identification.aligned_recording import align
+from mjfim.identification.measured_motion import MeasuredMotion, measured_motion
+from mjfim.records.recording import Recording
+from tests.support.numerics import Array, body_task, cart_task
+
+MOST = 10_000
+ALL = ("qpos", "qvel")
+
+
+def motion_of(
+    task: DesignTask,
+    kinds: tuple[str, ...] = ALL,
+    hidden: tuple[str, ...] = (),
+    rows: Array | None = None,
+) -> tuple[MeasuredMotion, Array, Array]:
+    """Motion of a recording without noise, and (N+1, nq), (N+1, nv) what was measured."""
+    trajectory = task.plant.simulate(task.parameters.guess, task.control)
+    names = task.system.outputs.names
+    measured = np.array(task.plant.outputs(trajectory.state, None))
+    columns = [i for i, name in enumerate(names) if name.startswith(kinds) and name not in hidden]
+    rows = np.arange(len(measured)) if rows is None else rows
+    recording = Recording(
+        t=trajectory.t[rows],
+        ctrl=task.control[rows[:-1]],
+        y=measured[rows][:, columns],
+        outputs=tuple(names[i] for i in columns),
+        name="x.csv",
+    )
+    aligned = align(task.system, recording)
+    motion = measured_motion(task.system, aligned, task.parameters.guess, MOST)
+    return motion, trajectory.qpos, trajectory.qvel
+
+
+def inner(motion: MeasuredMotion, samples: Array, dt: float) -> tuple[Array, Array]:
+    """Values at the points of a motion away from its ends, and a mask of these points."""
+    inside = (motion.t > 0.2) & (motion.t < motion.t[-1] - 0.2)
+    times = dt * np.arange(len(samples))
+    columns = [np.interp(motion.t[inside], times, column) for column in samples.T]
+    return np.stack(columns, axis=1), inside
+
+
+@pytest.mark.parametrize("integrator", ["RK4", "implicitfast"])
+@pytest.mark.parametrize("kinds", [ALL, ("qpos",)])
+def test_states_of_a_simulation_are_found(
+    kinds: tuple[str, ...], integrator: str, tmp_path: Path
+) -> None:
+    task = cart_task(tmp_path, integrator=integrator, horizon=4.0)
+    motion, _, qvel = motion_of(task, kinds)
+    expected, inside = inner(motion, qvel, task.dt)
+
+    # Half a timestep, by which the velocities of implicit steps are earlier, is more.
+    size = np.abs(qvel).max()
+    assert np.abs(motion.qvel[inside] - expected).max() < 0.005 * size
+    assert 0.5 * np.abs(np.diff(qvel, axis=0)).max() > 0.015 * size
+    # The mean acceleration of the step that begins at a sample, or with RK4, whose steps have no
+    # mean that the equation of motion contains, that at the sample.
+    steps = np.diff(qvel, axis=0) / task.dt
+    if integrator == "RK4":
+        steps = np.gradient(qvel, task.dt, axis=0)
+    acceleration, _ = inner(motion, steps, task.dt)
+    error = motion.qacc[inside] - acceleration
+    assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(acceleration**2))
+
+
+@pytest.mark.parametrize("kinds", [ALL, ("qpos",)])
+def test_orientations_turn_with_the_angular_velocity_of_the_body(
+    kinds: tuple[str, ...], tmp_path: Path
+) -> None:
+    task = body_task(tmp_path, noise={"state": 0.01}, horizon=3.0)
+    motion, qpos, qvel = motion_of(task, kinds)
+    expected, inside = inner(motion, qvel, task.dt)
+    assert np.abs(motion.qvel[inside] - expected).max() < 0.02 * np.abs(qvel).max()
+    change = np.gradient(expected, motion.step, axis=0)
+    assert np.abs(motion.qacc[inside] - change).max() < 0.1 * np.abs(change).max()
+    for first in (3, 7):
+        norm = np.linalg.norm(motion.qpos[:, first : first + 4], axis=1)
+        np.testing.assert_allclose(norm, 1.0, rtol=1e-12)
+    places, _ = inner(motion, qpos, task.dt)
+    assert np.abs(motion.qpos[inside] - places).max() < 0.01
+
+
+def test_points_in_gaps_do_not_count(tmp_path: Path) -> None:
+    task = cart_task(tmp_path, horizon=4.0)
+    rows = np.concatenate([np.arange(150), np.arange(250, 401)])
+    motion, _, _ = motion_of(task, rows=rows)
+    middle = (motion.t > 1.6) & (motion.t < 2.4)
+    assert middle.any()
+    assert not motion.usable[middle].any()
+    assert motion.usable[(motion.t > 0.1) & (motion.t < 1.4)].all()
+
+
+def test_the_control_is_averaged_and_a_delay_shifts_it(tmp_path: Path) -> None:
+    task = cart_task(tmp_path, horizon=4.0)
+    motion, _, _ = motion_of(task)
+    t = task.dt * (np.arange(len(task.control)) + 0.5)
+    expected = np.interp(motion.t, t, task.control[:, 0])
+    inside = (motion.t > 0.1) & (motion.t < 3.8)
+    size = np.abs(task.control).max()
+    assert np.abs(motion.control(0.0)[inside, 0] - expected[inside]).max() < 0.01 * size
+    late = np.interp(motion.t - 0.05, t, task.control[:, 0])
+    assert np.abs(motion.control(0.05)[inside, 0] - late[inside]).max() < 0.01 * size
+
+
+def test_unmeasured_degrees_of_freedom_are_named(tmp_path: Path) -> None:
+    task = cart_task(tmp_path, horizon=4.0)
+    with pytest.raises(RecordingError, match=r"x\.csv: no measured position or velocity of hinge;"):
+        motion_of(task, hidden=("qpos:hinge", "qvel:hinge"))
+    body = body_task(tmp_path, noise={"state": 0.01}, horizon=1.0)
+    with pytest.raises(RecordingError, match=r"velocity of ball\.rx, ball\.ry, ball\.rz;"):
+        motion_of(body, hidden=("qpos:ball.qx",))

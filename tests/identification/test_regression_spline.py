@@ -1,0 +1,118 @@
+"""Regression splines: they follow the motion and not the noise, whatever is measured when."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mjfim.identification.regression_spline import Readings, RegressionSpline, fit_splines
+from tests.support.numerics import Array
+
+RATE, SECONDS = 200.0, 10.0
+
+
+def curve(t: Array, derivative: int = 0) -> Array:
+    """A sum of two sines, or its derivative."""
+    total = np.zeros(len(t))
+    for amplitude, frequency, phase in ((1.0, 0.4, 0.3), (0.3, 1.7, 1.0)):
+        omega = 2 * np.pi * frequency
+        total += amplitude * omega**derivative * np.sin(omega * t + phase + derivative * np.pi / 2)
+    return total
+
+
+def readings(
+    t: Array, sigma: float, derivative: int = 0, seed: int = 0, curves: int = 1
+) -> Readings:
+    """Noisy readings of the curve or of its slope."""
+    noise = np.random.default_rng(seed).standard_normal((len(t), curves))
+    values = curve(t, derivative)[:, None] + sigma * noise
+    sizes = np.full(curves, sigma or 1.0)
+    return Readings(t=t, values=values, sigma=sizes, derivative=derivative)
+
+
+def grid() -> Array:
+    return np.arange(int(SECONDS * RATE)) / RATE
+
+
+def inner_error(spline: RegressionSpline, derivative: int) -> float:
+    """Root mean square error of a derivative away from the ends."""
+    t = np.linspace(0.5, SECONDS - 0.5, 500)
+    error = spline.at(t, derivative) - curve(t, derivative)
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def test_values_without_noise_are_followed() -> None:
+    spline = fit_splines([readings(grid(), 1e-9)], np.zeros(1))[0]
+    assert inner_error(spline, 0) < 1e-8
+    assert inner_error(spline, 2) < 1e-4
+
+
+@pytest.mark.parametrize("sigma", [1e-4, 1e-2])
+def test_noise_is_averaged_and_its_size_found(sigma: float) -> None:
+    t = grid()
+    inner = np.linspace(0.5, SECONDS - 0.5, 300)
+    squares, splines = [], []
+    for seed in range(8):
+        noisy = fit_splines([readings(t, sigma, seed=seed)], np.zeros(1))[0]
+        exact = fit_splines([readings(t, 0.0)], np.zeros(1), spacing=noisy.spacing)[0]
+        squares.append(np.mean((noisy.at(inner, 1) - exact.at(inner, 1)) ** 2))
+        splines.append(noisy)
+    assert inner_error(splines[0], 0) < 0.5 * sigma
+    assert np.mean([spline.variance for spline in splines]) == pytest.approx(1.0, abs=0.1)
+
+    # The predicted noise of the slope is that of the fits.
+    predicted = np.mean([spline.slope_sigma for spline in splines])
+    assert np.sqrt(np.mean(squares)) == pytest.approx(predicted, rel=0.35)
+
+
+def test_velocities_improve_velocities() -> None:
+    t = grid()
+    positions = readings(t, 1e-2)
+    velocities = readings(t, 2e-2, derivative=1, seed=1)
+    alone = fit_splines([positions], np.zeros(1))[0]
+    both = fit_splines([positions, velocities], np.zeros(1))[0]
+    assert inner_error(both, 1) < 0.5 * inner_error(alone, 1)
+
+
+def test_velocities_alone_begin_at_the_anchor() -> None:
+    t = grid()
+    anchors = curve(t[:1])
+    spline = fit_splines([readings(t, 1e-9, derivative=1)], anchors)[0]
+    assert inner_error(spline, 0) < 1e-6
+    moved = fit_splines([readings(t, 1e-9, derivative=1)], anchors + 2.0)[0]
+    np.testing.assert_allclose(moved.at(t) - spline.at(t), 2.0, atol=1e-9)
+
+
+def test_irregular_times_gaps_and_outliers() -> None:
+    rng = np.random.default_rng(4)
+    t = np.sort(rng.uniform(0.0, SECONDS, 1500))
+    t = t[(t < 3.0) | (t > 3.4)]
+    given = readings(t, 1e-3)
+    values = np.array(given.values)
+    values[::200] += 5.0
+    spoiled = Readings(t=t, values=values, sigma=given.sigma, derivative=0)
+    spline = fit_splines([spoiled], np.zeros(1))[0]
+    inner = np.concatenate([np.linspace(0.5, 2.5, 100), np.linspace(4.0, 9.5, 100)])
+    assert np.abs(spline.at(inner) - curve(inner)).max() < 3e-3
+    assert np.isfinite(spline.at(np.linspace(3.0, 3.4, 50))).all()
+
+
+def test_curves_together_are_those_of_curves_alone() -> None:
+    t = grid()
+    together = readings(t, 1e-2, curves=3)
+    found = fit_splines([together], np.zeros(3))
+    for k, spline in enumerate(found):
+        alone = fit_splines([together.of_curve(k)], np.zeros(1))[0]
+        assert spline.spacing == alone.spacing
+        np.testing.assert_allclose(spline.coefficients, alone.coefficients, rtol=1e-9, atol=1e-12)
+
+
+def test_units_do_not_matter() -> None:
+    t, factor = grid(), 2.0**10
+    given = readings(t, 1e-2)
+    other = Readings(
+        t=factor * t, values=given.values / factor, sigma=given.sigma / factor, derivative=0
+    )
+    spline = fit_splines([given], np.zeros(1))[0]
+    scaled = fit_splines([other], np.zeros(1))[0]
+    np.testing.assert_allclose(factor * scaled.at(factor * t), spline.at(t), rtol=1e-9, atol=1e-9)

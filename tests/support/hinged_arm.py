@@ -1,0 +1,120 @@
+"""An arm of several hinges under its own small controller, logged with noise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.experiment.schema import Experiment
+from mjfim.records.recording import Recording
+from mjfim.signals import multisine
+from tests.support.numerics import Array
+
+# Axes of the hinges, lengths to the next one [m], masses [kg], sizes of torques, and the mean pose.
+AXES = ("0 0 1", "0 1 0", "0 0 1", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
+LENGTHS = (0.36, 0.21, 0.21, 0.20, 0.20, 0.07, 0.06)
+MASSES = (5.0, 5.0, 4.0, 3.5, 3.0, 2.0, 1.0)
+TORQUES = (3.0, 3.0, 1.7, 1.7, 1.0, 0.4, 0.4)
+POSE = (0.0, 0.6, 0.0, -1.4, 0.0, 1.0, 0.0)
+
+
+def arm_text(joints: int, *, friction: bool = False, timestep: float = 0.0005) -> str:
+    """MJCF of the arm, with motors and sensors of their torques."""
+    bodies, ends, motors, sensors = [], [], [], []
+    height = 0.0
+    for i in range(joints):
+        m, length = MASSES[i], LENGTHS[i]
+        loss = 0.3 * TORQUES[i] if friction else 0.0
+        across, along = m * (length**2 / 12 + 9e-4), m * 1.8e-3
+        bodies.append(
+            f'<body name="link{i + 1}" pos="0 0 {height:g}">'
+            f'<joint name="joint{i + 1}" axis="{AXES[i]}" damping="{0.5 * TORQUES[i]:g}" '
+            f'armature="0.05" frictionloss="{loss:g}"/>'
+            f'<inertial mass="{m:g}" pos="{0.01 + 0.004 * i:g} {0.005 * (i % 3):g} {length / 2:g}" '
+            f'fullinertia="{across:g} {1.05 * across:g} {along:g} '
+            f'{1e-4 * (i - 3):g} {2e-4 * (i % 2):g} {1e-4 * (i % 3 - 1):g}"/>'
+        )
+        ends.append("</body>")
+        motors.append(f'<motor name="joint{i + 1}" joint="joint{i + 1}"/>')
+        sensors.append(f'<jointactuatorfrc name="torque{i + 1}" joint="joint{i + 1}"/>')
+        height = length
+    return (
+        f'<mujoco><option timestep="{timestep:g}" integrator="implicitfast">'
+        '<flag contact="disable"/></option>'
+        f"<worldbody>{''.join(bodies)}{''.join(ends)}</worldbody>"
+        f"<actuator>{''.join(motors)}</actuator><sensor>{''.join(sensors)}</sensor></mujoco>"
+    )
+
+
+def arm_parameters(joints: int, *, friction: bool = False, **of_inertia: Any) -> dict[str, Any]:
+    """Inertias of all links, and damping, armature and dry friction of all joints."""
+    tables: dict[str, Any] = {}
+    for i in range(1, joints + 1):
+        tables[f"link{i}"] = {"inertial": f"link{i}", **of_inertia}
+        tables[f"damping{i}"] = {"target": f"joint/joint{i}:damping"}
+        tables[f"armature{i}"] = {"target": f"joint/joint{i}:armature"}
+        if friction:
+            tables[f"friction{i}"] = {"target": f"joint/joint{i}:frictionloss"}
+    return tables
+
+
+def arm_experiment(
+    folder: Path, joints: int, *, friction: bool = False, **tables: Any
+) -> Experiment:
+    """Experiment of the arm in a folder, at 500 Hz, positions measured."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "arm.xml").write_text(arm_text(joints, friction=friction), encoding="utf-8")
+    defaults: dict[str, Any] = {
+        "parameters": arm_parameters(joints, friction=friction),
+        "noise": {f"qpos:joint{i}": 1e-4 for i in range(1, joints + 1)},
+    }
+    return Experiment(
+        model="arm.xml", directory=folder, source="arm", rate=500.0, **{**defaults, **tables}
+    )
+
+
+def arm_log(
+    joints: int,
+    seconds: float,
+    rng: np.random.Generator,
+    *,
+    friction: bool = False,
+    sigma: float = 0.0,
+    torque_sigma: float = 0.0,
+    rate: float = 500.0,
+) -> tuple[Recording, Array]:
+    """Play a multisine with a controller, and log positions and torques.
+
+    Returns:
+        The recording with the columns `qpos:joint<i>` and `torque<i>`, and (M, joints) velocities.
+    """
+    model = mujoco.MjModel.from_xml_string(arm_text(joints, friction=friction))
+    data = mujoco.MjData(model)
+    substeps = round(1.0 / rate / model.opt.timestep)
+    count = round(seconds * rate)
+    t = np.arange(count + 1) / rate
+    size = np.array(TORQUES[:joints])
+    reference = np.array(POSE[:joints]) + 0.5 * multisine(t, joints, 0.2, 5, rng)
+    speed = np.gradient(reference, 1.0 / rate, axis=0)
+
+    q, v, u = np.zeros((3, count + 1, joints))
+    data.qpos[:], data.qvel[:] = reference[0], speed[0]
+    for k in range(count + 1):
+        q[k], v[k] = data.qpos, data.qvel
+        u[k] = 60.0 * size * (reference[k] - q[k]) + 6.0 * size * (speed[k] - v[k])
+        data.ctrl[:] = u[k]
+        for _ in range(substeps):
+            mujoco.mj_step(model, data)
+
+    y = np.concatenate(
+        [
+            q + sigma * rng.standard_normal(q.shape),
+            u + torque_sigma * size * rng.standard_normal(u.shape),
+        ],
+        axis=1,
+    )
+    names = [f"{kind}{i}" for kind in ("qpos:joint", "torque") for i in range(1, joints + 1)]
+    return Recording(t=t, ctrl=u[:-1], y=y, outputs=tuple(names), name="arm"), v
