@@ -19,6 +19,9 @@ from mjfim.arrays import Array, scaled_to_unit_diagonal
 # Rows of one batch in the first pass of a tall QR decomposition; a batch stays in the cache.
 QR_BATCH_ROWS = 128
 
+# Smallest number of rows of such a batch for each column, so that the first pass leaves fewer rows.
+BATCH_ROWS_PER_COLUMN = 4
+
 # Number of rows above which a QR decomposition takes two passes.
 TALL_ROWS = 512
 
@@ -481,9 +484,10 @@ def triangle(rows: Array) -> Array:
         (..., min(k, m), m) factor R.
     """
     k, m = rows.shape[-2:]
-    if rows.ndim == 2 and k > TALL_ROWS:
-        whole = k // QR_BATCH_ROWS * QR_BATCH_ROWS
-        batches = rows[:whole].reshape(-1, QR_BATCH_ROWS, m)
+    batch = max(QR_BATCH_ROWS, BATCH_ROWS_PER_COLUMN * m)
+    if rows.ndim == 2 and k > max(TALL_ROWS, 2 * batch):
+        whole = k // batch * batch
+        batches = rows[:whole].reshape(-1, batch, m)
         first_pass = np.asarray(np.linalg.qr(batches, mode="r"))
         return triangle(np.concatenate([first_pass.reshape(-1, m), rows[whole:]]))
 

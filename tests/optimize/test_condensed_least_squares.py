@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import lstsq
 from scipy.optimize import lsq_linear
 
-from mjfim.optimize.condensed_least_squares import Condensed, Step
+from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from tests.support.numerics import Array
 
 
@@ -468,3 +468,12 @@ def test_the_true_deviation_is_that_of_autocorrelated_residuals(correlation: flo
     # The variance of a mean is (1 + rho) / (1 - rho) times that of white noise.
     expected = np.sqrt((1.0 + correlation) / (1.0 - correlation))
     assert found == pytest.approx(expected if correlation else 1.0, rel=0.25)
+
+
+@pytest.mark.parametrize("columns", [3, 40, 200])
+def test_a_tall_triangle_has_the_inner_products_of_its_rows(columns: int) -> None:
+    """Also with more columns than a batch of the first pass has rows."""
+    rows = np.random.default_rng(0).standard_normal((2500, columns))
+    R = triangle(rows)
+    assert R.shape == (columns, columns)
+    np.testing.assert_allclose(R.T @ R, rows.T @ rows, atol=1e-9 * len(rows))
