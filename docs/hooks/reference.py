@@ -1,8 +1,8 @@
 """Hooks of mkdocs that write reference pages from the package.
 
-They write the keys of the experiment file, its JSON schema and the command line. A page asks for
-generated text by the comment `<!-- generated: experiment file -->` or
-`<!-- generated: command line -->`.
+They write the keys of the experiment file, its JSON schema, the command line and the library of
+terms. A page asks for generated text by the comment `<!-- generated: experiment file -->`,
+`<!-- generated: command line -->` or `<!-- generated: terms -->`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typer.main import get_command
 
 from mjfim.cli.main import app
 from mjfim.experiment.schema import json_schema
+from mjfim.model.terms.catalogue import NUMBERS, TERMS, CatalogueEntry
 
 SCHEMA_FILE = "reference/experiment.schema.json"  # Place of the JSON schema on the site.
 
@@ -37,6 +38,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     makers = {
         "<!-- generated: experiment file -->": experiment_reference,
         "<!-- generated: command line -->": command_line_reference,
+        "<!-- generated: terms -->": terms_reference,
     }
 
     for comment, make in makers.items():
@@ -54,6 +56,52 @@ def command_line_reference() -> str:
 
     # The page has a title already: drop that of typer.
     return text.partition("\n")[2]
+
+
+def terms_reference() -> str:
+    """Sections of the page of physical terms: the terms of the library, and numbers of the MJCF."""
+    numbers = ["## Numbers of the MJCF", "", "These terms need no table, only a parameter.", ""]
+    numbers += _table(
+        ("term", "equation", "paths", "source"),
+        [
+            (
+                f"{entry.name}: {entry.description}",
+                f"`{entry.equation}`",
+                ", ".join(f"`{path}`" for path in entry.paths),
+                "; ".join(entry.sources),
+            )
+            for entry in NUMBERS
+        ],
+    )
+    sections = ["## Terms of the library", "", *(line for e in TERMS for line in _term(e))]
+    return "\n".join([*sections, *numbers])
+
+
+def _term(entry: CatalogueEntry) -> Iterator[str]:
+    """Section of one term of the library."""
+    yield f"### `{entry.name}`"
+    yield ""
+    yield entry.description
+    yield ""
+    yield f"    {entry.equation}"
+    yield ""
+    acts_on = f"`{entry.acts_on}`" if entry.acts_on else "nothing, it acts on the base"
+    yield f"Names: {acts_on}. MuJoCo: {entry.elements}."
+    yield ""
+    yield from _table(
+        ("field", "meaning", "unit at a hinge"),
+        [(f"`{f.name}`", f.description, f.unit or "none") for f in entry.fields],
+    )
+    for source in entry.sources:
+        yield f"* {source}"
+    yield ""
+
+
+def _table(headings: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    """A table in Markdown, and an empty line."""
+    escaped = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    lines = [headings, ("---",) * len(headings), *escaped]
+    return [*(f"| {' | '.join(line)} |" for line in lines), ""]
 
 
 def experiment_reference() -> str:

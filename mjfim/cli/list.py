@@ -11,7 +11,7 @@ from mjfim.cli.common import AsJson, ModelFile, print_result, verb
 from mjfim.errors import ExperimentError
 
 # Kinds of entries, as in `mjfim.records.inventory.KINDS`.
-Kind = Literal["parameters", "outputs", "actuators", "keyframes", "limits"]
+Kind = Literal["parameters", "outputs", "actuators", "keyframes", "limits", "terms"]
 
 
 @verb
@@ -30,7 +30,7 @@ def list_(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the parameters, outputs, actuators, keyframes and limits of a model."""
+    """List the parameters, outputs, actuators, keyframes, limits and terms of a model."""
     from mjfim.output.summaries.inventory import describe_inventory
     from mjfim.studies.inventory import list_model
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 # Kinds of entries, the names of the fields of `Inventory` that hold them.
-KINDS = ("parameters", "outputs", "actuators", "keyframes", "limits")
+KINDS = ("parameters", "outputs", "actuators", "keyframes", "limits", "terms")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +94,24 @@ class ListedLimit:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ListedTerm:
+    """A kind of physical term that an experiment file can add to the model.
+
+    Attributes:
+        kind: Kind of the term.
+        description: One sentence about the physics.
+        elements: Elements on which it can act, such as `joint pivot`; `the base` for terms that
+            name none.
+        fields: Fields with their units, for paths `term/<name>:<field>`.
+    """
+
+    kind: str
+    description: str
+    elements: tuple[str, ...]
+    fields: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Inventory:
     """Everything that an experiment file can name in a model.
 
@@ -104,6 +122,7 @@ class Inventory:
         actuators: Actuators, in the order of the controls.
         keyframes: Keyframes.
         limits: Ranges of the MJCF that a design keeps.
+        terms: Physical terms that an experiment file can add.
         remarks: Sentences about elements that cannot be named or whose ranges are not kept.
     """
 
@@ -113,6 +132,7 @@ class Inventory:
     actuators: tuple[ListedActuator, ...]
     keyframes: tuple[ListedKeyframe, ...]
     limits: tuple[ListedLimit, ...]
+    terms: tuple[ListedTerm, ...]
     remarks: tuple[str, ...]
 
     def selected(self, matches: Callable[[str], bool]) -> Inventory:
@@ -133,6 +153,7 @@ class Inventory:
             limits=tuple(
                 entry for entry in self.limits if matches(f"{entry.quantity}/{entry.name}")
             ),
+            terms=tuple(entry for entry in self.terms if matches(entry.kind)),
         )
 
     def only(self, kind: str) -> Inventory:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from mjfim.excitation.limits import limits_of_model, unsupported_ranges
 from mjfim.model.elements import identifier, names_of, unique_names, unnamed_count
 from mjfim.model.loading import ModelSource
 from mjfim.model.paths import INERTIAL_FIELDS, MODEL_ARRAYS, fields_of, resolve, unit_of
+from mjfim.model.terms.library import KINDS
+from mjfim.model.terms.term import Term, TermTable
 from mjfim.model.units import control_unit, sensor_unit
 from mjfim.records.inventory import (
     Inventory,
@@ -22,6 +25,7 @@ from mjfim.records.inventory import (
     ListedLimit,
     ListedOutput,
     ListedParameter,
+    ListedTerm,
 )
 
 # Name of the body that does not move and has no parameters.
@@ -32,6 +36,10 @@ NAMED_KINDS = ("body", "joint", "actuator", "geom", "pair", "site", "tendon")
 
 # Fields of an actuator with many entries of which most are unused; entries that are 0 are left out.
 SPARSE_FIELDS = ("gear", "gainprm", "biasprm", "dynprm")
+
+# Name of a term that no model has, and timesteps of a sample, for terms that are only listed.
+FREE_NAME = "?"
+SAMPLE_STEPS = 10
 
 # Number of entries of the fields that are not arrays of MjModel.
 FURTHER_WIDTHS = {
@@ -71,6 +79,7 @@ def list_model(path: str | Path) -> Inventory:
         actuators=tuple(_actuators(source)),
         keyframes=tuple(_keyframes(model)),
         limits=tuple(_limits(source)),
+        terms=tuple(_terms(model)),
         remarks=tuple(_remarks(model)),
     )
 
@@ -187,6 +196,33 @@ def _limits(source: ModelSource) -> Iterator[ListedLimit]:
             lower=limit.lower,
             upper=limit.upper,
             unit=limit.unit,
+        )
+
+
+def _terms(model: Any) -> Iterator[ListedTerm]:
+    """Kinds of terms that the model can have, with the elements on which they can act."""
+    period = SAMPLE_STEPS * float(model.opt.timestep)
+    for name, kind in KINDS.items():
+        key = kind.acts_on
+        named = [(f"{key} {each}", ((key, each),)) for each in names_of(model, key)] if key else []
+
+        possible: dict[str, Term] = {}
+        base: list[tuple[str, tuple[tuple[str, str], ...]]] = [("the base", ())]
+        for words, element in named if key else base:
+            with suppress(ExperimentError):
+                table = TermTable(name=FREE_NAME, element=element)
+                possible[words] = kind.of(table, model, period)
+        if not possible:
+            continue
+
+        # Units differ between slides and hinges.
+        first = next(iter(possible.values()))
+        fields = tuple(
+            f"{field} [{quantity.unit}]" if quantity.unit else field
+            for field, quantity in first.quantities
+        )
+        yield ListedTerm(
+            kind=name, description=kind.description, elements=tuple(possible), fields=fields
         )
 
 

@@ -44,7 +44,7 @@ KRAUSE_2013 = (
     "P. Krause, O. Wasynczuk, S. Sudhoff and S. Pekarek, Analysis of Electric Machinery and Drive "
     "Systems, 3rd edition, IEEE Press, 2013"
 )
-MUJOCO_DCMOTOR = "MuJoCo DC Motor Model, technical note, Google DeepMind, 2026"
+MUJOCO_DCMOTOR = "MuJoCo DC Motor Model, technical note of MuJoCo 4.0"
 
 
 @dataclass(frozen=True, kw_only=True)

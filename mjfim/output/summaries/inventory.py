@@ -16,6 +16,9 @@ from mjfim.output.summary_parts import (
 )
 from mjfim.records.inventory import Inventory
 
+# Headings of columns of text.
+LEFT = ("name", "measured by", "drives", "unit", "qpos", "ctrl", "acts on", "fields")
+
 
 def describe_inventory(inventory: Inventory) -> Summary:
     """Describe what an experiment file can name in a model.
@@ -60,6 +63,12 @@ def describe_inventory(inventory: Inventory) -> Summary:
                 for limit in inventory.limits
             ],
         ),
+        _table(
+            "terms",
+            "Terms of the library: kinds for tables `[terms.<name>]`",
+            ("kind", "acts on", "fields"),
+            [(t.kind, ", ".join(t.elements), ", ".join(t.fields)) for t in inventory.terms],
+        ),
     )
     parts: list[Part] = [table for table in tables if table.rows]
     if inventory.remarks:
@@ -74,7 +83,7 @@ def _table(
     return SummaryTable(
         key=key,
         title=title,
-        columns=columns(*headings, left=("name", "measured by", "drives", "unit", "qpos", "ctrl")),
+        columns=columns(*headings, left=LEFT),
         rows=tuple(Row(cells=row) for row in rows),
     )
 
