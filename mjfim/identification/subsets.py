@@ -17,7 +17,7 @@ SUBSET_SAMPLES = 40_000
 # Largest share of the data on which the search begins, where that leaves enough samples and
 # segments.
 FIRST_SHARE = 0.25
-MIN_FIRST_SAMPLES = 5_000
+MIN_FIRST_SAMPLES = 2_000
 MIN_FIRST_SEGMENTS = 5
 
 # Number of samples, and least number of segments, that lead near enough to a minimum for a search

@@ -53,13 +53,17 @@ ABSOLUTE_STAGNATION = 1e-2
 PREDICTED_STAGNATION = 0.1
 
 # Number of consecutive stagnant iterations after which the search ends, and that number where the
-# true accuracy is much worse than the formal one.
+# true accuracy is much worse than the formal one, or where a linearisation takes long.
 MAX_STAGNANT_ITERATIONS = 3
 MAX_ROUGH_ITERATIONS = 2
 
 # Length of a step [standard deviations] that the roughness of a simulation can explain. Where a
 # predicted step is shorter and does not lower the cost, the search has converged.
 SHORT_STEP = 0.3
+
+# This length for the private unknowns [standard deviations]. They are no result, and where a joint
+# sticks, residuals are rough along them.
+SHORT_PRIVATE_STEP = 1.0
 
 # This length where the true accuracy is much worse than the formal one [true standard deviations]:
 # the model does not explain the data, and the residuals are rough besides.
@@ -237,7 +241,8 @@ class SearchSettings:
 
     Attributes:
         max_iterations: Largest number of iterations.
-        tolerance: Length of a step [standard deviations] below which the search has converged.
+        tolerance: Length of a step below which the search has converged: the root mean square over
+            the common unknowns [standard deviations].
         damped: True for Levenberg-Marquardt inside the bounds, False for Gauss-Newton without
             bounds.
         relinearise_at_end: Whether to linearise once more at the solution. False saves one
@@ -345,6 +350,9 @@ class _Search:
         self.callback = callback
 
         self.iteration = 0
+
+        # A length of many unknowns is compared with the root mean square of each.
+        self.unknowns_length = float(np.sqrt(max(len(problem.lower), 1)))
         self.damping = INITIAL_DAMPING if settings.damped else 0.0
         if settings.damped and settings.next_step_length is not None:
             self.damping = WEAK_DAMPING
@@ -501,24 +509,28 @@ class _Search:
     @property
     def _tolerance(self) -> float:
         """Length of a step [formal standard deviations] below which the search has converged."""
-        return self.settings.tolerance * self.unit
+        return self.settings.tolerance * self.unit * self.unknowns_length
 
     def _is_small(self, step: Step) -> bool:
         """Whether a step is below the tolerance."""
-        tolerance = self._tolerance
-        return (
-            step.common_length < tolerance and step.private_length < PRIVATE_TOLERANCE * tolerance
-        )
+        private_tolerance = PRIVATE_TOLERANCE * self.settings.tolerance * self.unit
+        is_short = step.common_length < self._tolerance
+        return is_short and step.private_length < private_tolerance
 
     def _stagnates(self, trial: _Trial, predicted: Step) -> bool:
         """Count consecutive iterations that hardly lower the cost; True after too many of them."""
-        negligible = min(RELATIVE_STAGNATION * self.cost, ABSOLUTE_STAGNATION)
+        absolute = ABSOLUTE_STAGNATION * self.unknowns_length**2
+        negligible = min(RELATIVE_STAGNATION * self.cost, absolute)
 
         # A search that converges slowly, but as predicted, goes on, unless what it can gain is far
         # below the true accuracy.
         most = MAX_STAGNANT_ITERATIONS
         if self.unit > 1.0:
             negligible *= self.unit**2
+            most = MAX_ROUGH_ITERATIONS
+        elif not self.settings.relinearise_at_end:
+            # Long iterations are not worth a small share of the standard deviations.
+            negligible = absolute
             most = MAX_ROUGH_ITERATIONS
         else:
             negligible = min(negligible, PREDICTED_STAGNATION * predicted.predicted_decrease)
@@ -646,7 +658,8 @@ class _Search:
         """Solution where no step lowers the cost: converged if the predicted step is short."""
         self._find_unit()
         short = SHORT_ROUGH_STEP * self.unit if self.unit > 1.0 else SHORT_STEP
-        if predicted.common_length < short and predicted.private_length < short:
+        is_short = predicted.common_length < short * self.unknowns_length
+        if is_short and predicted.private_length < max(short, SHORT_PRIVATE_STEP):
             return self._solution("converged: the residual stopped falling", success=True)
 
         solution = self._solution(

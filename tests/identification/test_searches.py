@@ -164,7 +164,7 @@ def of_segments(samples: int, count: int) -> Any:
     [
         pytest.param(24_800, 25, 6, id="a quarter"),
         pytest.param(24_800, 4, 4, id="too few segments"),
-        pytest.param(10_000, 100, 100, id="too few samples"),
+        pytest.param(4_000, 100, 100, id="too few samples"),
         pytest.param(4_000_000, 1000, 10, id="much data"),
     ],
 )

@@ -56,7 +56,7 @@ def test_activations_of_terms_are_no_unknowns_of_segments(tmp_path: Path, kind: 
     recording = log_of(system, 3)
     problem = FitProblem.of(system, [recording])
     assert problem.simulation.private_count == 2
-    assert len(problem.segments) == 6
+    assert len(problem.segments) == 4
 
     known = KnownActivations.of(system)
     assert known.addresses == [0]
