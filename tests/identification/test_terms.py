@@ -53,10 +53,10 @@ def test_activations_of_terms_are_no_unknowns_of_segments(tmp_path: Path, kind: 
     experiment = experiment_of(tmp_path, kind, fit={"segments": 0.5}, noise={"angle": 1e-5})
     true = {field: {"guess": value} for field, value in EXAMPLES[kind][1].items()}
     system = System.resolve(experiment.replace(parameters=true))
-    recording = log_of(system, 3)
+    recording = log_of(system, 3, duration=3.0)
     problem = FitProblem.of(system, [recording])
     assert problem.simulation.private_count == 2
-    assert len(problem.segments) == 4
+    assert len(problem.segments) == 6
 
     known = KnownActivations.of(system)
     assert known.addresses == [0]
