@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint, scalar_joints
 from mjfim.model.elements import element_name, names_of
@@ -21,6 +22,7 @@ from mjfim.model.paths import unit_of
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.terms.drives import SHORT_LAG
 from mjfim.model.terms.library import KINDS
+from mjfim.model.terms.term import TermTable
 from mjfim.records.missing_term import AddedTerm, TermParameter
 
 # Size at which the sensitivity of a term is taken where it is zero in the model, relative to the
@@ -133,6 +135,52 @@ def candidates_of(system: System, speeds: Array) -> Iterator[Candidate]:
             size=LINEARISATION_SIZE * period_of(system),
         )
         yield Candidate(description="a delay between controls and outputs", tested=(delay,))
+
+
+def load_candidates_of(system: System) -> Iterator[Candidate]:
+    """Friction that grows with the torque of a motor, at hinges that have dry friction.
+
+    It is simulated by contacts, so that these candidates are not tested together with others.
+
+    Args:
+        system: The system.
+    """
+    model: Any = system.model
+    kind = "load_dependent_friction"
+    targets = {target.path for p in system.parameters.parameters for target in p.targets}
+    for actuator in range(model.nactuator):
+        name = element_name(model, "actuator", actuator)
+        if not name or int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+            continue
+
+        number = int(model.actuator_trnid[actuator, 0])
+        joint = element_name(model, "joint", number)
+        rubs = bool(model.dof_frictionloss[int(model.jnt_dofadr[number])])
+        rubs = rubs or f"joint/{joint}:frictionloss" in targets
+        if not rubs or has_term(system, kind, name):
+            continue
+
+        # The term may be impossible at this actuator, at a servo for example.
+        table = TermTable(name=f"{name}_{kind}", element=(("actuator", name),))
+        try:
+            least = KINDS[kind].of(table, system.source.stated.model, period_of(system))
+        except ExperimentError:
+            continue
+        added = added_term(system, kind, name)
+        coefficient = CandidateParameter(
+            path=f"term/{added.name}:coefficient",
+            unit="",
+            positive=True,
+            value=0.0,
+            linearised_at=least.value("coefficient"),
+            size=LINEARISATION_SIZE,
+        )
+        yield Candidate(
+            description=f"friction that grows with the torque of {name}",
+            tested=(coefficient,),
+            added=added,
+            source=KINDS[kind].sources[0],
+        )
 
 
 def period_of(system: System) -> float:

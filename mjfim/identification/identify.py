@@ -25,7 +25,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.horizons import choose_horizon, with_length
-from mjfim.identification.inverse_dynamics import fit_equations
+from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equations
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import NEWTON, FitSearch
@@ -200,9 +200,9 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
     stated = search.task
     problem, held_out = _problems(stated, workers)
 
-    # A fit to the equation of motion gives the start where that is asked for.
-    dynamics = _inverse_dynamics(stated, problem)
-    search = _started_at(search, problem, dynamics)
+    # A fit to the equation of motion gives the start where that is asked for, or where the model
+    # diverges at the stated one.
+    search, dynamics = _begun(search, problem)
     task = search.task
 
     # With much data, the search begins on a subset of the segments.
@@ -329,32 +329,47 @@ def refit_task(search: FitSearch, near: FitResult, workers: FitWorkers | None = 
     )
 
 
-def _inverse_dynamics(task: FitTask, problem: FitProblem) -> InverseDynamicsFit | None:
-    """The fit to the equation of motion; None where the search does not start from it.
+def _begun(search: FitSearch, problem: FitProblem) -> tuple[FitSearch, InverseDynamicsFit | None]:
+    """The searches from a fit to the equation of motion, where that is asked for or needed.
+
+    It is needed where the model diverges at the start. Parameters that the equation of motion does
+    not contain keep their start.
+
+    Args:
+        search: The searches from the stated start.
+        problem: The problem of all recordings.
+
+    Returns:
+        The searches from where the model does not diverge, if there is such a start, and the fit
+        to the equation of motion from which they start, or None.
 
     Raises:
         RecordingError: A degree of freedom was not measured.
     """
-    if task.settings.start != "inverse_dynamics":
-        return None
-    begin_stage("fitting the equation of motion")
-    return fit_equations(problem.system, problem.recordings, task.start)
+    task = search.task
+    if task.settings.start == "inverse_dynamics":
+        begin_stage("fitting the equation of motion")
+        found: InverseDynamicsFit | None = fit_equations(
+            problem.system, problem.recordings, task.start
+        )
+    elif _is_finite(problem, task.start):
+        return search, None
+    else:
+        found = try_fit_equations(problem.system, problem.recordings, task.start)
+
+    if found is None or not _is_finite(problem, found.theta):
+        return search, found if task.settings.start == "inverse_dynamics" else None
+    return replace(search, task=replace(task, start=np.array(found.theta))), found
 
 
-def _started_at(
-    search: FitSearch, problem: FitProblem, dynamics: InverseDynamicsFit | None
-) -> FitSearch:
-    """The searches of a task from a fit to the equation of motion, if the model does not diverge.
-
-    Parameters that the equation of motion does not contain keep their start.
-    """
-    if dynamics is None:
-        return search
-    task = replace(search.task, start=np.array(dynamics.theta))
+def _is_finite(problem: FitProblem, theta: Array) -> bool:
+    """Whether the model does not diverge at parameters theta: (p,)."""
     subset = quick_subset(problem)
-    begin = of_subset(problem.begin(task.start), subset)
-    cost = completed(partial(problem.of_segments(subset).cost, begin))
-    return replace(search, task=task) if np.isfinite(cost) else search
+    begin = of_subset(problem.begin(theta), subset)
+
+    # The square of an extreme measured value is infinite.
+    with np.errstate(over="ignore"):
+        return bool(np.isfinite(completed(partial(problem.of_segments(subset).cost, begin))))
 
 
 def _problems(task: FitTask, workers: FitWorkers | None) -> tuple[FitProblem, FitProblem | None]:

@@ -21,7 +21,12 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
-from mjfim.identification.candidates import Candidate, CandidateParameter, candidates_of
+from mjfim.identification.candidates import (
+    Candidate,
+    CandidateParameter,
+    candidates_of,
+    load_candidates_of,
+)
 from mjfim.identification.extended_problems import extended_problem, with_residuals_of
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.screened_terms import screened_terms
@@ -107,22 +112,26 @@ def _by_score(
     problem: FitProblem, recordings: Sequence[Recording], at: UnknownValues, squares: float
 ) -> list[MissingTerm]:
     """Terms whose score tests are significant, in the order of the candidates."""
-    speeds = _typical_speeds(problem, at)
-    candidates = _affordable(list(candidates_of(problem.system, speeds)))
-    if not candidates:
-        return []
+    system = problem.system
+    together = _affordable(list(candidates_of(system, _typical_speeds(problem, at))))
 
-    linearisation = _linearise(problem, recordings, at, candidates)
-    if linearisation is None:
-        return []
+    # Contacts would slow down all simulations of the other candidates.
+    groups = (together, _affordable(list(load_candidates_of(system))))
+    count = sum(len(candidates) for candidates in groups)
 
     # Of the variants of one term, the most significant one stands for it.
     found: dict[str, MissingTerm] = {}
-    for index, candidate in enumerate(candidates):
-        term = _score_test(candidate, index, linearisation, squares, len(candidates))
-        key = candidate.variant_of or f"{index}"
-        if term is not None and (key not in found or term.sigmas > found[key].sigmas):
-            found[key] = term
+    for candidates in groups:
+        if not candidates:
+            continue
+        linearisation = _linearise(problem, recordings, at, candidates)
+        if linearisation is None:
+            continue
+        for index, candidate in enumerate(candidates):
+            term = _score_test(candidate, index, linearisation, squares, count)
+            key = candidate.variant_of or candidate.path
+            if term is not None and (key not in found or term.sigmas > found[key].sigmas):
+                found[key] = term
     return list(found.values())
 
 

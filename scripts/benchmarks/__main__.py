@@ -27,6 +27,7 @@ BENCHMARKS = {
     "scale_recordings": "how much memory and time do workers need that read many logs?",
     "scale": "do the verbs give the same on a cluster, and how well do they scale?",
     "rail": "how many passes over its data does a fit with dry friction take?",
+    "starts": "how often do fits find the optimum from starts wrong by factors of 3 to 10?",
     "prove_identification": "do the 95 % intervals hold the true values?",
     "selection": "does `identify --select` find the term that a model lacks, and no other?",
     "measured_data": "how well are measured data of other groups predicted, with added terms?",

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 
 import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import align
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.known_activations import KnownActivations
+from mjfim.identification.missing_terms import equivalent_sigmas, find_missing_terms
 from mjfim.model.terms.library import KINDS
-from tests.support.terms import EXAMPLES, experiment_of, motor_torque, recorded
+from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
+from mjfim.studies.selection import selected_term
+from tests.support.terms import (
+    EXAMPLES,
+    experiment_of,
+    motor_torque,
+    recorded,
+    write_pendulum,
+)
 
 RATE = 100.0
 
@@ -32,7 +45,12 @@ def log_of(system: System, seed: int, duration: float = 2.0) -> Any:
     return recorded(system, motor_torque(duration, RATE, seed), seed)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def some_fast(kinds: Iterable[str], fast: Collection[str]) -> list[Any]:
+    """Parameters of a test of which some are fast, and the others are marked slow."""
+    return [pytest.param(k, marks=[] if k in fast else pytest.mark.slow) for k in kinds]
+
+
+@pytest.mark.parametrize("kind", some_fast(KINDS, {"asymmetric_friction", "actuator_lag", "tilt"}))
 def test_a_term_is_identified_from_a_log(tmp_path: Path, kind: str) -> None:
     guesses = GUESSES.get(kind, {})
     parameters = {field: {"guess": value} for field, value in guesses.items()}
@@ -88,3 +106,88 @@ def test_a_log_with_wrong_scale_and_bias_gives_both(tmp_path: Path) -> None:
     found = mjfim.identify(experiment, [log_of(system, 4)])
     assert not found.misfit
     assert (np.abs(found.theta - system.parameters.true) < 5.0 * found.std).all()
+
+
+# ---- models that lack a term
+
+# Base parameters of the pendulum, which the term does not replace.
+BASE = {
+    "damping": {"target": "joint/pivot:damping"},
+    "inertia": {"target": "body/rod:inertia[1]"},
+    "friction": {"target": "joint/pivot:frictionloss"},
+}
+
+# Kind -> path of the main parameter of the candidate.
+MISSED = {
+    "stribeck": "term/pivot_stribeck:excess",
+    "asymmetric_friction": "term/pivot_asymmetric_friction:offset",
+    "actuator_lag": "term/motor_actuator_lag:time_constant",
+    "load_dependent_friction": "term/motor_load_dependent_friction:coefficient",
+    "joint_elasticity": "term/pivot_joint_elasticity:compliance",
+    "backlash": "term/pivot_backlash:gap",
+}
+
+
+def without_term(folder: Path, kind: str) -> tuple[mjfim.Experiment, Any]:
+    """An experiment without a term, and the system of a robot that has it."""
+    robot = experiment_of(folder, kind)
+    write_pendulum(folder, joint='frictionloss="0.02" armature="0.002"')
+    tables = {**robot.model_dump(exclude_unset=True), "fit": {"bootstrap": 0}}
+    stated = robot.restated({**tables, "terms": {}, "parameters": BASE})
+    return stated, System.resolve(robot)
+
+
+def solution_near(problem: FitProblem, theta: Any) -> Any:
+    """Nearly the best unknowns, which a few steps give."""
+    found = minimise(problem, problem.begin(np.array(theta)), SearchSettings(max_iterations=6))
+    assert found is not None
+    return found.unknowns
+
+
+@pytest.mark.parametrize("kind", some_fast(MISSED, {"stribeck", "joint_elasticity"}))
+def test_the_missing_term_of_the_library_is_named_first(tmp_path: Path, kind: str) -> None:
+    stated, robot = without_term(tmp_path, kind)
+    logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
+    system = System.resolve(stated)
+    problem = FitProblem.of(system, logs)
+    at = solution_near(problem, system.parameters.guess)
+    first = find_missing_terms(problem, logs, at)[0]
+    assert first.path == MISSED[kind]
+    assert first.added is not None
+    assert first.added.kind == kind
+    assert first.source in KINDS[kind].sources
+
+    # What the term needs can be added as it is said.
+    term = selected_term(first, system.parameters.names)
+    extended = System.resolve(stated.replace(parameters=term.parameters, terms=term.terms))
+    assert set(term.parameters) < set(extended.parameters.names)
+    tables = tomllib.loads("\n".join(part.replace("] ", "]\n", 1) for part in lines_of(term.toml)))
+    assert tables["terms"][first.added.name]["kind"] == kind
+
+
+def lines_of(toml: str) -> list[str]:
+    """The tables of a term, each key in a line of its own."""
+    return [re.sub(r", (\w+ = )", r"\n\1", part) for part in toml.split("; ")]
+
+
+def test_a_complete_model_with_terms_lacks_none(tmp_path: Path) -> None:
+    stated, robot = without_term(tmp_path, "actuator_lag")
+    table = {"kind": "actuator_lag", "actuator": "motor"}
+    whole = stated.replace(
+        terms={"lag": table},
+        parameters={"tau": {"target": "term/lag:time_constant", "guess": 0.02}},
+    )
+    logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
+    problem = FitProblem.of(System.resolve(whole), logs)
+    at = solution_near(problem, [0.01, 0.0105, 0.02, 0.03])
+    assert find_missing_terms(problem, logs, at) == ()
+
+
+def test_a_term_with_several_numbers_has_one_test() -> None:
+    """The probability of the chi-squared value is that of the normal variable."""
+    for explained, count in ((3.0, 1), (9.0, 2), (30.0, 3), (4000.0, 3)):
+        sigmas = equivalent_sigmas(explained, count)
+        expected = scipy.stats.chi2.logsf(explained, count)
+        assert scipy.special.log_ndtr(-sigmas) + np.log(2.0) == pytest.approx(expected, rel=1e-9)
+    assert equivalent_sigmas(25.0, 1) == 5.0
+    assert equivalent_sigmas(25.0, 3) < 5.0

@@ -1,0 +1,95 @@
+"""Fits that start from a fit to the equation of motion, stated or as a way out of a local minimum."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.experiment.system import System
+from mjfim.output.report.build import page_of
+from mjfim.output.summaries.estimate import describe_estimate
+from mjfim.records.estimate import Estimate
+from mjfim.records.recording import Recording
+from tests.identification.test_inverse_dynamics import STATE, cart, cart_log
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cart")
+
+
+@pytest.fixture(scope="module")
+def log(folder: Path) -> Recording:
+    return cart_log(cart(folder), 0.01, seconds=5.0)
+
+
+@pytest.fixture(scope="module")
+def estimate(folder: Path, log: Recording) -> Estimate:
+    experiment = cart(folder, fit={"start": "inverse_dynamics", "bootstrap": 0})
+    true = System.resolve(experiment).parameters.guess
+    wrong = true * np.array([8.0, 3.0, 9.0, 0.1])
+    return mjfim.identify(experiment, [log], start=wrong, progress=False)
+
+
+def test_the_estimate_starts_from_the_equation_of_motion(folder: Path, estimate: Estimate) -> None:
+    true = System.resolve(cart(folder)).parameters.guess
+    assert estimate.success and not estimate.misfit
+    assert (np.abs(estimate.theta - true) < 5.0 * estimate.std).all()
+    assert estimate.restart is None
+
+    # The guess remains the one that the user stated, and the search began elsewhere.
+    np.testing.assert_allclose(estimate.initial_theta, true * [8.0, 3.0, 9.0, 0.1])
+    fit = estimate.inverse_dynamics
+    assert fit is not None
+    np.testing.assert_array_equal(estimate.trace[1], fit.theta)
+    assert (np.abs(fit.theta / true - 1.0) < 0.1).all()
+
+
+def test_it_is_saved_shown_and_drawn(estimate: Estimate, tmp_path: Path) -> None:
+    estimate.save(tmp_path)
+    loaded = Estimate.load(tmp_path)
+    assert loaded.inverse_dynamics is not None and estimate.inverse_dynamics is not None
+    first, second = loaded.inverse_dynamics, estimate.inverse_dynamics
+    np.testing.assert_array_equal(first.equations[0].explained, second.equations[0].explained)
+    assert loaded.summary()["inverse_dynamics"]["equations"][1]["name"] == "hinge"
+
+    assert "equations" in [table.key for table in describe_estimate(loaded).tables]
+    assert "Equation of motion" in [section.title for section in page_of(loaded).sections]
+    assert "inverse_dynamics" in loaded.pictures
+    loaded.plot("inverse_dynamics", file=tmp_path / "forces.png")
+    assert (tmp_path / "forces.png").stat().st_size > 10_000
+    assert "The equation of motion holds" in first._repr_html_()
+
+
+def test_a_local_minimum_is_left_by_the_equation_of_motion(folder: Path, log: Recording) -> None:
+    experiment = cart(folder, fit={"bootstrap": 0})
+    true = System.resolve(experiment).parameters.guess
+    wrong = true * np.array([0.1, 6.0, 0.1, 10.0])
+    found = mjfim.identify(experiment, [log], start=wrong, progress=False)
+    assert (np.abs(found.theta - true) < 5.0 * found.std).all()
+    assert found.restart is not None
+    assert found.restart.by_dynamics
+    assert "began at a fit to the equation of motion" in str(found.restart)
+    assert found.inverse_dynamics is not None
+
+
+def test_what_it_needs_is_said(folder: Path, log: Recording) -> None:
+    experiment = cart(folder, fit={"start": "inverse_dynamics"})
+    kept = [i for i, name in enumerate(STATE) if not name.endswith("hinge")]
+    part = Recording(
+        t=log.t,
+        ctrl=log.ctrl,
+        y=log.y[:, kept],
+        outputs=tuple(STATE[i] for i in kept),
+        name="part.csv",
+    )
+    with pytest.raises(RecordingError, match=r"part\.csv: no measured position or velocity of h"):
+        mjfim.identify(experiment, [part], progress=False)
+
+    moved = experiment.replace(nuisance={"initial": 0.1})
+    with pytest.raises(ExperimentError, match=r'fit\.start = "inverse_dynamics" is stated'):
+        mjfim.identify(moved, [log], progress=False)
