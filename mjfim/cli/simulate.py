@@ -66,9 +66,11 @@ def simulate(
 ) -> None:
     """Simulate a recording of a design at the `true` parameter values, with noise.
 
-    Without a design it is a recording of the initial control, or of the motion of a model without
-    actuators from its initial state.
+    Without a design it is a recording of the initial control, of the references that it states for
+    the laws of `[controllers]`, or of the motion of a model without actuators from its initial
+    state.
     """
+    from mjfim.excitation.stated_inputs import stated_motion
     from mjfim.excitation.task import DesignTask
     from mjfim.excitation.task_parts import require_design_keys
     from mjfim.experiment.input_files import input_files
@@ -81,7 +83,9 @@ def simulate(
     inputs = input_files(system.experiment, [design_file])
     claim_video(video, inputs, force=force)
     claim_file(output, inputs, force=force)
-    if design_file is None:
+    if design_file is None and system.laws is not None:
+        trajectory = stated_motion(system)
+    elif design_file is None:
         require_design_keys(system, "simulate without a design")
         trajectory = DesignTask.of(system).initial
     else:

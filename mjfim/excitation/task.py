@@ -172,6 +172,10 @@ class DesignTask:
         if experiment.cost.control_about is not None:
             about = by_name("cost.control_about", experiment.cost.control_about, names, "actuator")
 
+        # References of control laws cost nothing, because no design chooses them.
+        if system.laws is not None:
+            weight = about = np.zeros(len(system.inputs))
+
         with ExitStack() as stack:
             files = [stack.enter_context(opened(experiment, path)) for path in experiment.earlier]
             prior = information_of(files, system.parameters.names)

@@ -33,6 +33,27 @@ def require_design_keys(system: System, work: str = "design") -> None:
         work: Name of the work that needs them, for the message.
 
     Raises:
+        ExperimentError: `horizon` or `initial.control` is missing, or control laws are stated.
+    """
+    experiment = system.experiment
+    if system.laws is not None:
+        raise ExperimentError(
+            f"{experiment.source}: controllers: {work} needs a control without a law, because "
+            "derivatives of single samples do not show what a law remembers; [controllers] serves "
+            "`identify`, `simulate` and `check RECORDING`. State a servo in the MJCF, such as "
+            '<position kp="..." kv="...">, and an experiment file without [controllers]'
+        )
+    require_horizon_and_control(system, work)
+
+
+def require_horizon_and_control(system: System, work: str) -> None:
+    """Check that the experiment states the duration and the control of a motion.
+
+    Args:
+        system: The system. A model without actuators needs no control.
+        work: Name of the work that needs them, for the message.
+
+    Raises:
         ExperimentError: `horizon` or `initial.control` is missing.
     """
     experiment = system.experiment

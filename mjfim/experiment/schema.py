@@ -12,6 +12,7 @@ from pydantic.json_schema import SkipJsonSchema
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
+from mjfim.experiment.controller_tables import ControllerSpec
 from mjfim.experiment.experiment_file import read_tables
 from mjfim.experiment.messages import explain, valid_keys
 from mjfim.experiment.system_tables import (
@@ -79,6 +80,14 @@ class Experiment(Section):
         description=(
             "Unknown parameters by name, one table each. Their order in the file is the order of "
             "theta."
+        ),
+    )
+    controllers: dict[str, ControllerSpec] = Field(
+        default_factory=dict,
+        description=(
+            "Laws with which the drivers of actuators compute their controls, one table by name of "
+            "the actuator. A log then holds the column `reference:<actuator>` instead of "
+            "`ctrl:<actuator>`. Default: logs hold the controls themselves."
         ),
     )
     noise: dict[str, PositiveWithUnit | NoiseSpec] = Field(

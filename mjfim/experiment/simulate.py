@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.errors import SimulationDivergedError
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.records.recording import Recording
@@ -13,7 +14,7 @@ from mjfim.records.trajectory import Trajectory
 
 def simulate(
     experiment: Experiment,
-    trajectory: Trajectory,
+    trajectory: Trajectory | Array,
     seed: int | np.random.Generator = 0,
     *,
     threads: int | None = None,
@@ -26,7 +27,8 @@ def simulate(
 
     Args:
         experiment: The experiment.
-        trajectory: The trajectory whose control is applied.
+        trajectory: The trajectory whose control is applied; or (N, nu) controls, with control laws
+            what they read of a log.
         seed: Seed of the noise, or a generator of random numbers.
         threads: Threads for the engine; default: one per core.
 
@@ -36,7 +38,17 @@ def simulate(
     Raises:
         SimulationDivergedError: The simulation diverges under this control.
     """
-    return simulate_system(System.resolve(experiment, threads=threads), trajectory, seed)
+    system = System.resolve(experiment, threads=threads)
+    if not isinstance(trajectory, Trajectory):
+        inputs = np.asarray(trajectory, dtype=np.float64)
+        if inputs.ndim != 2 or inputs.shape[1] != len(system.inputs):
+            raise ExperimentError(
+                f"{experiment.source}: simulate: controls of shape {inputs.shape}; expected a row "
+                f"for each sample with {len(system.inputs)} columns: {listed(system.inputs)}"
+            )
+        at_rest = np.tile(system.nominal_initial_state, (len(inputs) + 1, 1))
+        trajectory = system.plant.trajectory(at_rest, inputs)
+    return simulate_system(system, trajectory, seed)
 
 
 def simulate_system(

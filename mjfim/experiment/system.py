@@ -16,6 +16,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError
+from mjfim.experiment.controllers import resolve_controllers
 from mjfim.experiment.initial_state import initial_state, keyframe
 from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.packing import model_of
@@ -24,6 +25,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import require_units
 from mjfim.experiment.terms import terms_of
 from mjfim.experiment.time_grid import TimeGrid, noise_strides
+from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.loading import ModelSource
 from mjfim.model.parameters import ParameterSet
@@ -44,7 +46,9 @@ class System:
 
     Attributes:
         experiment: The experiment as the user states it.
-        source: The user's model, parsed once, with the terms of the experiment.
+        source: The user's model, parsed once, with the terms of the experiment and the numbers of
+            its control laws.
+        laws: Control laws of the drivers; None where logs hold the controls themselves.
         stated_grid: The time grid that the experiment states.
         parameters: The p unknown parameters.
         outputs: The ny measured outputs.
@@ -57,6 +61,7 @@ class System:
 
     experiment: Experiment
     source: ModelSource
+    laws: ControlLaws | None
     stated_grid: TimeGrid
     parameters: ParameterSet
     outputs: Outputs
@@ -101,6 +106,7 @@ class System:
             source = model_of(experiment)
         _require_supported(source)
         source = source.extended(terms_of(experiment, source.stated))
+        source, laws = resolve_controllers(experiment, source)
         require_units(experiment, source)
         model = source.model
 
@@ -138,11 +144,13 @@ class System:
             nominal_initial_state=start,
             substeps=grid.substeps,
             threads=threads,
+            laws=laws,
         )
 
         return cls(
             experiment=experiment,
             source=source,
+            laws=laws,
             stated_grid=grid,
             parameters=parameters,
             outputs=outputs,
@@ -188,6 +196,7 @@ class System:
                 substeps=grid.substeps,
                 threads=self.threads,
                 smooth=smooth,
+                laws=self.laws,
             )
 
         # If friction is smoothed for derivatives only, they are computed on a second plant.
@@ -290,6 +299,13 @@ class System:
         return self.source.coordinates.controls
 
     @property
+    def inputs(self) -> tuple[str, ...]:
+        """Columns of a log that drive a simulation: controls, and references of control laws."""
+        if self.laws is not None:
+            return self.laws.columns
+        return tuple(f"ctrl:{name}" for name in self.controls)
+
+    @property
     def coordinates(self) -> tuple[ScalarJoint, ...]:
         """All slide and hinge joints."""
         return self.source.coordinates.scalar_joints
@@ -346,6 +362,7 @@ class System:
         return Channels(
             model=self.model,
             controls=self.controls,
+            laws=self.laws,
             outputs=self.outputs.names,
             sigma=self.noise.sigma,
             spec=self.experiment.recording,

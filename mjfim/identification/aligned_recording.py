@@ -16,6 +16,7 @@ import numpy as np
 from mjfim.arrays import Array, freeze
 from mjfim.errors import RecordingError, listed, unknown
 from mjfim.experiment.system import System
+from mjfim.identification.law_inputs import inputs_of_laws
 from mjfim.model.variants import STATED
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.recordings.log_file import LogFile, file_of
@@ -48,7 +49,8 @@ class AlignedRecording:
         t: (M,) times of the rows since the first one [s].
         y: (M, ny) measured values in the order of the experiment's outputs [y-unit]; NaN where not
             measured.
-        ctrl: (N, nu) control held over each sample of the grid, which covers all rows [u-unit].
+        ctrl: (N, nu) control held over each sample of the grid, which covers all rows [u-unit], or
+            what control laws read (`mjfim.model.control_laws.ControlLaws`).
         dt: Sample period of the grid [s].
         on_grid: True where every time stamp lies on the grid.
         file: The file from which it was read; None where it was not read from one.
@@ -158,7 +160,7 @@ def align(system: System, recording: Recording) -> AlignedRecording:
     """
     dt = system.dt
     t = _times(recording)
-    ctrl = _control(system, recording)
+    rows = _control(system, recording)
     y = _outputs(system, recording)
 
     # Time stamps that nearly lie on the grid are moved onto it.
@@ -168,8 +170,11 @@ def align(system: System, recording: Recording) -> AlignedRecording:
         t = sample * dt
 
     # The control needs no resampling where there is one row per sample.
+    ctrl = rows
     if not on_grid or not np.array_equal(sample, np.arange(len(t))):
-        ctrl = resample_control(t, ctrl, dt)
+        ctrl = resample_control(t, rows, dt)
+    if system.laws is not None:
+        ctrl = inputs_of_laws(system, t, rows, ctrl, y)
 
     return AlignedRecording(
         name=recording.name,
@@ -210,10 +215,10 @@ def _control(system: System, recording: Recording) -> Array:
     """
     rows = len(recording.t) - 1
     ctrl = recording.ctrl[:rows]
-    if ctrl.shape != (rows, len(system.controls)):
+    if ctrl.shape != (rows, len(system.inputs)):
         raise RecordingError(
             f"{recording.name}: the control has shape {recording.ctrl.shape}; "
-            f"expected {rows} rows of {len(system.controls)} values"
+            f"expected {rows} rows of {len(system.inputs)} values"
         )
 
     finite = np.isfinite(ctrl).all(axis=1)
@@ -363,7 +368,8 @@ def measured_trajectory(
 ) -> Trajectory | None:
     """The recorded motion as a trajectory, for animations.
 
-    Missing positions are interpolated linearly. Velocities that were not measured are NaN.
+    Missing positions are interpolated linearly. Velocities that were not measured are NaN, and so
+    are controls that control laws have computed.
 
     Args:
         system: System that was recorded.
@@ -399,12 +405,15 @@ def measured_trajectory(
         qpos[:, q : q + 4] /= np.maximum(norms, SMALLEST_NORM)
 
     n = len(qpos)
+    ctrl = recording.ctrl
+    if system.laws is not None:
+        ctrl = np.full((n - 1, model.nu), np.nan)
     return Trajectory(
         t=recording.t,
         qpos=qpos,
         qvel=_measured_velocities(system, recording, measured),
         act=np.zeros((n, model.na)),
-        ctrl=recording.ctrl,
+        ctrl=ctrl,
     )
 
 

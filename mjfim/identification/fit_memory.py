@@ -67,6 +67,6 @@ def recordings_bytes(system: System, rows: int, *, fit: bool) -> float:
     simulated = float(rows) * (1 + 2 * directions) * system.grid.substeps * state
     block = min(simulated, MAX_NUMBERS_AT_ONCE)
 
-    recorded = float(rows) * (1 + len(system.outputs) + len(system.controls))
+    recorded = float(rows) * (1 + len(system.outputs) + len(system.inputs))
     copies = FIT_COPIES if fit else CHECK_COPIES
     return NUMBER_BYTES * (copies * block + RECORDED_COPIES * recorded)

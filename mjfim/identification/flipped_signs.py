@@ -34,6 +34,9 @@ EXPLAINED = 1.3
 # Signs whose sums of squares are within this factor explain the residuals equally well.
 TIE = 2.0
 
+# Beginnings of the names of inputs that have a sign.
+SIGNED_INPUTS = ("ctrl:", "reference:", "feedforward:")
+
 # Largest number of signs with which the fit is repeated, and iterations of such a fit.
 MAX_FITS = 4
 ITERATIONS = 15
@@ -154,8 +157,11 @@ def sentence_about_signs(signs: Sequence[str]) -> str:
 def _signs(task: FitTask) -> Iterator[Sign]:
     """All signs that may be flipped: of controls, joints, and single outputs."""
     system = task.system
-    for i, name in enumerate(system.controls):
-        yield Sign(description=f"control {name}", control=i)
+    for i, name in enumerate(system.inputs):
+        if not name.startswith(SIGNED_INPUTS):
+            continue
+        described = f"control {name.removeprefix('ctrl:')}" if name.startswith("ctrl:") else name
+        yield Sign(description=described, control=i)
 
     measured = set.intersection(*(set(recording.outputs) for recording in task.recordings))
     names = [name for name in system.outputs.names if name in measured]

@@ -48,6 +48,7 @@ from mjfim.optimize.levenberg_marquardt import (
 )
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
+from mjfim.plant.plant import UNSTABLE_LOOP
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
@@ -487,6 +488,8 @@ def _why_diverged(problem: FitProblem, theta: Array) -> str:
         theta: (p,) parameters [theta-unit].
     """
     plant = problem.system.plant
+    if plant.laws is not None:
+        return UNSTABLE_LOOP
     model = plant.model(theta)
     substeps = plant.simulator.substeps
 

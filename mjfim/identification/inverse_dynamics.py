@@ -91,8 +91,15 @@ def fit_equations(
         The fit.
 
     Raises:
+        ExperimentError: Control laws compute the controls.
         RecordingError: A degree of freedom was not measured, or too little can be used.
     """
+    if system.laws is not None:
+        raise ExperimentError(
+            f"{system.experiment.source}: controllers: the equation of motion needs the controls "
+            "of the log, and a law computes them from the motion; fit with `identify` and without "
+            'fit.start = "inverse_dynamics"'
+        )
     begun, steps = time.perf_counter(), system.plant.engine_steps
     parameters = system.parameters
     start = np.clip(start, parameters.lower, parameters.upper)

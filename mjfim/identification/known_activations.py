@@ -32,26 +32,39 @@ class KnownActivations:
     Attributes:
         model: The model at the guess (`mujoco.MjModel`).
         actuators: Actuators with such an activation, and its address among the activations.
+        columns: Columns of a recording that hold controls, by the address of the control.
     """
 
     model: Any
     actuators: tuple[tuple[int, int], ...]
+    columns: dict[int, int]
 
     @staticmethod
     def of(system: System) -> KnownActivations:
         """Activations of the terms of a system."""
         layout = system.source.layout
         if layout is None:
-            return KnownActivations(model=system.model, actuators=())
+            return KnownActivations(model=system.model, actuators=(), columns={})
 
         model = system.plant.model(system.parameters.guess)
+        columns = {i: i for i in range(model.nu)}
+        if system.laws is not None:
+            inputs, controls = system.laws.direct
+            columns = dict(zip(controls.tolist(), inputs.tolist(), strict=True))
+
+        # No recording shows the control that a law computes, so that its lag is an unknown.
+        def is_shown(actuator: int) -> bool:
+            """Whether the recording shows what moves the activation of an actuator."""
+            is_lag = int(model.actuator_dyntype[actuator]) in FILTERS
+            return not is_lag or int(model.actuator_ctrladr[actuator]) in columns
+
         stated = set(layout.act.tolist())
         found = [
             (actuator, int(model.actuator_actadr[actuator]))
             for actuator in np.flatnonzero(model.actuator_actnum).tolist()
-            if int(model.actuator_actadr[actuator]) not in stated
+            if int(model.actuator_actadr[actuator]) not in stated and is_shown(actuator)
         ]
-        return KnownActivations(model=model, actuators=tuple(found))
+        return KnownActivations(model=model, actuators=tuple(found), columns=columns)
 
     @property
     def addresses(self) -> list[int]:
@@ -80,7 +93,7 @@ class KnownActivations:
     def _filtered(self, actuator: int, recording: AlignedRecording, begins: np.ndarray) -> Array:
         """(n,) controls after the lag of an actuator, which is at rest at the first row."""
         control = int(self.model.actuator_ctrladr[actuator])
-        u = recording.ctrl[:, control]
+        u = recording.ctrl[:, self.columns[control]]
         if self.model.actuator_ctrllimited[control]:
             u = np.clip(u, *self.model.actuator_ctrlrange[control])
 

@@ -75,8 +75,11 @@ def unpredictable_motion(problem: FitProblem, at: UnknownValues) -> Unpredictabl
         at: The unknowns.
 
     Returns:
-        The amplification, and a better length; None if the segments suit the motion.
+        The amplification, and a better length; None if the segments suit the motion, and with
+        control laws, of whose memory a state shows nothing.
     """
+    if problem.system.laws is not None:
+        return None
     longest = max(problem.segments, key=lambda segment: segment.samples)
     samples = min(longest.samples, MAX_SAMPLES)
     motion = problem.motion(at, longest.recording, longest.begin + samples)

@@ -27,6 +27,7 @@ from mjfim.identification.flipped_signs import (
     sentence_about_signs,
     sufficient_squares,
 )
+from mjfim.identification.laws_in_loop import laws_in_loop
 from mjfim.identification.missing_terms import find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
@@ -331,10 +332,18 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         segments=_beginnings(problem),
         sizes=parameters.sizes(result.theta),
         restart=result.restart,
+        controllers=laws_in_loop(system, result.theta, _clipped_shares(result)),
         horizons=result.horizons,
         held=result.task.settings.hold,
         inverse_dynamics=result.inverse_dynamics,
     )
+
+
+def _clipped_shares(result: FitResult) -> dict[str, float]:
+    """Share of the samples at which limits of control laws act, by actuator."""
+    unknowns = result.solution.unknowns
+    at = replace(unknowns, private=unknowns.private[result.subset])
+    return result.problem.of_segments(result.subset).simulation.clipped_shares(at)
 
 
 def _covering(interval: Array, result: FitResult) -> Array:
@@ -443,10 +452,13 @@ def _warnings_of_data(findings: _Findings) -> Iterator[str]:
 
 def _warnings_of_rate(result: FitResult) -> Iterator[str]:
     """Warnings about recordings whose control changes inside the engine steps of the model."""
-    dt = result.problem.system.dt
+    system = result.problem.system
+    dt, held = system.dt, np.ones(len(system.inputs), dtype=bool)
+    if system.laws is not None:
+        held = system.laws.held
     for recording in result.task.recordings:
         count = len(recording.t) - 1
-        share = changes_within_samples(recording.t, recording.ctrl[:count], dt)
+        share = changes_within_samples(recording.t, recording.ctrl[:count, held], dt)
         if share < MIN_SHARE_WITHIN_SAMPLES:
             continue
 

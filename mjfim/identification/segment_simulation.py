@@ -14,7 +14,9 @@ from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.segments import Segment, batches
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.optimize.levenberg_marquardt import UnknownValues
+from mjfim.plant.batch import Rollouts
 from mjfim.plant.delay import OutputDelay
+from mjfim.plant.input_context import InputContext
 from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.trajectory import Trajectory
 
@@ -148,7 +150,8 @@ class SegmentSimulation:
     ) -> Trajectory | None:
         """The fitted motion of one recording on the sample grid.
 
-        It may jump from one segment to the next.
+        It may jump from one segment to the next. Its controls are those that act on the model, also
+        where control laws compute them.
 
         Args:
             at: The unknowns.
@@ -160,7 +163,8 @@ class SegmentSimulation:
         """
         plant = self.system.plant
         ctrl = self.recordings[recording].ctrl[:max_samples]
-        model = plant.model(self.layout.theta_of_recording(at, recording))
+        if plant.laws is not None:
+            ctrl = np.zeros((len(ctrl), len(self.system.controls)))
 
         states = np.full((len(ctrl) + 1, plant.nominal_initial_state.size), np.nan)
         for i in self.segments_of(recording):
@@ -168,11 +172,11 @@ class SegmentSimulation:
             samples = min(segment.samples, len(ctrl) - segment.begin)
             if samples <= 0:
                 continue
-            start = self._initial_state(at, i)
-            held = self._control(i, samples)
-            simulated = plant.simulator.rollout([model], start[None], held[None])
+            simulated = self._simulated(at, i, samples)
             if not simulated.finite[0]:
                 return None
+            if simulated.loop is not None:
+                ctrl[segment.begin : segment.begin + samples] = simulated.loop.controls[0]
 
             # Segments overlap where outputs are delayed; there, the earlier segment counts.
             part = states[segment.begin : segment.begin + samples + 1]
@@ -185,7 +189,47 @@ class SegmentSimulation:
             states[:] = plant.nominal_initial_state
         elif gap.any():
             states[gap] = states[np.flatnonzero(~gap)[0]]
-        return plant.trajectory(states, ctrl)
+        return replace(plant.trajectory(states, ctrl[:, :0]), ctrl=ctrl)
+
+    def clipped_shares(self, at: UnknownValues) -> dict[str, float]:
+        """Share of the samples at which the limits of control laws clip their controls.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            The share by name of the actuator; none without laws.
+        """
+        laws = self.system.laws
+        if laws is None:
+            return {}
+
+        counts = np.zeros(len(laws.laws))
+        for i, segment in enumerate(self.segments):
+            loop = self._simulated(at, i, segment.samples).loop
+            if loop is not None:
+                counts += loop.is_clipped[0].sum(axis=0)
+        shares = (counts / max(self.sample_count, 1)).tolist()
+        return {law.actuator: share for law, share in zip(laws.laws, shares, strict=True)}
+
+    def _simulated(self, at: UnknownValues, index: int, samples: int) -> Rollouts:
+        """One segment over some samples."""
+        plant, segment = self.system.plant, self.segments[index]
+        theta = self.layout.theta_of_recording(at, segment.recording)
+        start = self._initial_state(at, index)[None]
+        if plant.laws is None:
+            return plant.simulator.rollout(
+                [plant.model(theta)], start, self._control(index, samples, 0)[None]
+            )
+
+        lead = plant.lead(theta)
+        inputs = self._control(index, samples, lead)[None]
+        first = np.array([segment.begin - lead])
+        place = slice(lead, lead + samples)
+        context = InputContext.of_interval(inputs, first, place, lead, None)
+        return plant.simulator.rollout(
+            [plant.model(theta)], start, inputs[:, lead:], context=context
+        )
 
     def batches(
         self,
@@ -244,10 +288,14 @@ class SegmentSimulation:
         """
         theta = self.layout.theta_of_recording(at, batch.recording)
         longest = max(self.segments[i].samples for i in batch.segments)
+        lead = self.system.plant.lead(theta)
+        begins = np.array([self.segments[i].begin for i in batch.segments])
         responses = self.system.plant.derivatives.responses(
             theta,
             np.stack([self._initial_state(at, i) for i in batch.segments]),
-            np.stack([self._control(i, longest) for i in batch.segments]),
+            np.stack([self._control(i, longest, lead) for i in batch.segments]),
+            lead=lead,
+            samples=begins - lead,
             start_directions=self.start_directions if batch.derivatives else None,
             central=batch.central,
             step=batch.step,
@@ -306,18 +354,19 @@ class SegmentSimulation:
         theta[self.layout.private] = at.private[index]
         return space.plus(start, parameters.initial_state_derivative(space.nx) @ theta)
 
-    def _control(self, index: int, samples: int) -> Array:
-        """(samples, nu) control from the first sample of a segment on.
+    def _control(self, index: int, samples: int, lead: int) -> Array:
+        """(lead + samples, nu) control of a segment, from `lead` samples before its begin on.
 
-        Beyond the end of the recording, the last value is held.
+        Before the begin of the recording, the first value is held, and beyond its end the last one.
         """
         segment = self.segments[index]
         recorded = self.recordings[segment.recording].ctrl
-        ctrl = recorded[segment.begin : segment.begin + samples]
+        first, end = segment.begin - lead, segment.begin + samples
+        ctrl = recorded[max(first, 0) : end]
 
-        missing = samples - len(ctrl)
-        held = np.repeat(ctrl[-1:], missing, axis=0)
-        return np.concatenate([ctrl, held])
+        before = np.repeat(ctrl[:1], max(-first, 0), axis=0)
+        after = np.repeat(ctrl[-1:], lead + samples - len(before) - len(ctrl), axis=0)
+        return np.concatenate([before, ctrl, after])
 
     def _row_times(self, theta: Array, segment: Segment) -> Array:
         """(M,) times in the simulation of a segment that its rows measure.

@@ -134,11 +134,12 @@ def cut_into_segments(
         RecordingError: The length is too short.
     """
     segments = []
+    ticks = system.plant.tick_samples
     for i, recording in enumerate(recordings):
-        bounds = _segment_bounds(recording, length)
+        bounds = _on_ticks(_segment_bounds(recording, length), ticks)
 
         # The simulation of a segment begins earlier than its rows by the delay of the outputs.
-        lead_samples = int(np.ceil(lead / recording.dt - 1e-9))
+        lead_samples = ticks * int(np.ceil(lead / (ticks * recording.dt) - 1e-9))
         begins = np.maximum(bounds[:-1] - lead_samples, 0)
         starts = measured_initial_states(system, recording, begins)
 
@@ -176,6 +177,21 @@ def _segment_bounds(recording: AlignedRecording, length: float | None) -> np.nda
             f"a segment needs at least {MIN_SAMPLES} samples of {recording.dt:g} s"
         )
     return np.linspace(0, N, count + 1).astype(int)
+
+
+def _on_ticks(bounds: np.ndarray, ticks: int) -> np.ndarray:
+    """Samples at which segments begin, moved to evaluations of all control laws.
+
+    A segment that begins there needs no guess of the control that was held before, and segments
+    with common evaluations are simulated together. Segments that are too short stay as they are.
+
+    Args:
+        bounds: Samples at which segments begin, and the last sample.
+        ticks: Samples after which the evaluations repeat; 1 without laws.
+    """
+    if np.diff(bounds).min() < MIN_SAMPLES + ticks:
+        return bounds
+    return np.append(np.rint(bounds[:-1] / ticks).astype(int) * ticks, bounds[-1])
 
 
 def measured_initial_states(

@@ -301,7 +301,9 @@ def _single_step_null_space(
     """
     parameters = test.parameters
     inside = parameters.interest[parameters.changes_model[parameters.interest]]
-    if not len(inside):
+
+    # Control laws remember what happened before a sample, so that only whole motions are tested.
+    if not len(inside) or test.plant.laws is not None:
         return _SingleSteps(few=None, directions=None)
 
     # A few samples are tested first. Another sample may show an effect of the directions that have

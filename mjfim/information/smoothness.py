@@ -98,7 +98,7 @@ def roughness(
             parameter=listed(names),
             sample=0,
             time=0.0,
-            causes=active_constraints(model, trajectory, range(trajectory.samples)),
+            causes=_causes(plant, model, theta, trajectory, range(trajectory.samples)),
         )
 
     G = noise.whiten(fine.G)
@@ -129,7 +129,7 @@ def roughness(
         parameter=names[visible[worst]],
         sample=first,
         time=float(trajectory.t[first]),
-        causes=active_constraints(model, trajectory, nearby),
+        causes=_causes(plant, model, theta, trajectory, nearby),
     )
 
 
@@ -164,3 +164,16 @@ def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:
     length = np.linalg.norm(G, axis=(0, 1)) * parameters.magnitude
     strongest = length.max(initial=0.0)
     return np.asarray((length > LEAST_EFFECT) & (length > LEAST_RELATIVE_EFFECT * strongest))
+
+
+def _causes(
+    plant: Plant, model: Any, theta: Array, trajectory: Trajectory, samples: range
+) -> tuple[str, ...]:
+    """What acts at some samples of a trajectory, the limits of control laws among it."""
+    if plant.laws is None:
+        return active_constraints(model, trajectory, samples)
+
+    played, is_clipped = plant.applied(theta, trajectory)
+    clipped = np.flatnonzero(is_clipped[list(samples)].any(axis=0)).tolist()
+    laws = [f"limit of the law of {plant.laws.laws[i].actuator}" for i in clipped]
+    return (*active_constraints(model, played, samples), *laws)

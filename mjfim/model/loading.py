@@ -182,6 +182,11 @@ class ModelSource:
         self._stated: ModelSource | None = None
         self._extended: WeakValueDictionary[tuple[Term, ...], ModelSource] = WeakValueDictionary()
 
+        # Copies of this model with custom numbers that are in use.
+        self._numbered: WeakValueDictionary[
+            tuple[tuple[str, tuple[float, ...]], ...], ModelSource
+        ] = WeakValueDictionary()
+
         # Several threads of a worker process may use the same model. The edit of a spec may ask for
         # another compiled model.
         self._lock = threading.RLock()
@@ -234,6 +239,28 @@ class ModelSource:
     def _loaded(path: Path, files: Any) -> Any:
         """The parsed model from the disk, or from a virtual file system."""
         return load_spec(path) if files is None else load_packed_spec(path, files)
+
+    def with_numbers(self, numbers: tuple[tuple[str, tuple[float, ...]], ...]) -> ModelSource:
+        """This model with custom numbers, compiled once as long as it is in use.
+
+        Args:
+            numbers: Names of `numeric` elements of MJCF, each with its numbers; MuJoCo ignores
+                them.
+
+        Returns:
+            The model; it has the terms of this one, and the same model of the file.
+        """
+        with self._lock:
+            found = self._numbered.get(numbers)
+            if found is None:
+                spec = self.spec.copy()
+                for name, data in numbers:
+                    spec.add_numeric(name=name, size=len(data), data=list(data))
+                found = ModelSource(self.path, spec, self._files)
+                found.terms, found.layout = self.terms, self.layout
+                found._stated = self.stated
+                self._numbered[numbers] = found
+            return found
 
     @cached_property
     def contents(self) -> dict[Path, bytes]:

@@ -15,6 +15,8 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
+from mjfim.model.control_laws import FIELDS as LAW_FIELDS
+from mjfim.model.control_laws import controllers_of, law_field, law_unit
 from mjfim.model.coordinates import (
     joint_dofs,
     tangent_components,
@@ -112,7 +114,7 @@ INITIAL_STATE_FIELDS = ("qpos", "qvel", "act")
 OUTPUT_FIELDS = ("bias", "scale", "delay")
 
 # All kinds of paths.
-KINDS = (*MODEL_ARRAYS, "term", "initial", "output")
+KINDS = (*MODEL_ARRAYS, "controller", "term", "initial", "output")
 
 # A model without terms.
 NO_TERMS: Mapping[str, Term] = MappingProxyType({})
@@ -125,7 +127,7 @@ class ParameterPath:
     Attributes:
         text: The path.
         kind: Kind of the element: `body`, `joint`, `actuator`, `geom`, `pair`, `site`, `tendon`,
-            `option`, `term`, `initial`, `output`.
+            `option`, `controller`, `term`, `initial`, `output`.
         name: Name of the element; empty where the path has none.
         field: Field of the element.
         index: Index of the component; None where the path has none.
@@ -187,6 +189,7 @@ def fields_of(kind: str) -> list[str]:
         "site": ["rot"],
         "geom": list(COMPILED_FIELDS["geom"]),
         "actuator": list(SERVO_FIELDS),
+        "controller": list(LAW_FIELDS),
         "initial": list(INITIAL_STATE_FIELDS),
         "output": list(OUTPUT_FIELDS),
     }
@@ -231,6 +234,8 @@ def resolve(
         return _option_field(model, path)
     if path.kind == "output":
         return _output_field(path, outputs)
+    if path.kind == "controller":
+        return _law_field(model, path)
     if path.kind == "initial":
         return _initial_state_field(model, path)
     return _element_field(model, path, decoration)
@@ -260,6 +265,9 @@ def unit_of(model: Any, text: str, terms: Mapping[str, Term] = NO_TERMS) -> str:
         # Coordinates with one component may have the index [0].
         plain = text.removesuffix("[0]")
         return next((c.unit for c in tangent_components(model) if c.path == plain), "")
+
+    if path.kind == "controller":
+        return law_unit(model, path.name, path.field)
 
     if path.kind == "joint":
         joint = identifier(model, "joint", path.name)
@@ -328,6 +336,20 @@ def _output_field(path: ParameterPath, outputs: Sequence[str]) -> TargetField:
         raise path.error(unknown("output", path.name, list(outputs)))
     output = list(outputs).index(path.name)
     return OutputBiasField(output) if path.field == "bias" else OutputScaleField(output)
+
+
+def _law_field(model: Any, path: ParameterPath) -> TargetField:
+    """Number of the control law of an actuator."""
+    laws = controllers_of(model)
+    if path.name not in laws:
+        hint = "" if laws else "; the experiment file states no law in [controllers]"
+        raise path.error(f"{unknown('controller', path.name, laws)}{hint}")
+
+    component = path.component_of(len(LAW_FIELDS[path.field]))
+    try:
+        return law_field(model, path.name, path.field, component)
+    except ExperimentError as error:
+        raise path.error(str(error)) from None
 
 
 def _initial_state_field(model: Any, path: ParameterPath) -> InitialStateField:

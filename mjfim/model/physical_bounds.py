@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from mjfim.model.control_laws import FIELDS as LAW_FIELDS
 from mjfim.model.parameters import Target
 from mjfim.model.paths import ParameterPath
 
@@ -17,6 +18,7 @@ NOT_NEGATIVE = {
     "geom": ("mass", "density", "size", "friction"),
     "pair": ("friction",),
     "option": ("density", "viscosity"),
+    "controller": tuple(name for name in LAW_FIELDS if name not in ("saturation", "integral")),
 }
 
 

@@ -26,14 +26,15 @@ def write_element(spec: Any, compiled: Any, wanted: Any, text: str, value: float
         compiled: The model of this spec. Where the inertia of a body comes from geoms, it is stated
             explicitly before it is changed.
         wanted: The model at the values, from which inertias and orientations are taken as a whole.
-        text: The parameter path. Paths of the initial state and of the measurement write nothing.
+        text: The parameter path. Paths of control laws, of the initial state and of the
+            measurement write nothing.
         value: The value of the number.
 
     Raises:
         ExperimentError: The element cannot be moved in the spec.
     """
     path = ParameterPath.parse(text)
-    if path.kind in ("initial", "output"):
+    if path.kind in ("controller", "initial", "output"):
         return
 
     element = spec.option if path.kind == "option" else getattr(spec, path.kind)(path.name)

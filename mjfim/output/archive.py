@@ -139,8 +139,8 @@ def write_control(path: Path, control: Array, system: System) -> None:
 def write_recording(path: Path, recording: Recording, system: System) -> None:
     """Write a recording as CSV.
 
-    The columns are `t`, `ctrl:<actuator>` and the outputs. A field is empty where nothing was
-    measured.
+    The columns are `t`, the controls `ctrl:<actuator>` or what control laws read, and the outputs.
+    A field is empty where nothing was measured.
 
     Args:
         path: CSV file to write.
@@ -152,8 +152,8 @@ def write_recording(path: Path, recording: Recording, system: System) -> None:
     ctrl = np.concatenate([recording.ctrl, no_control])
 
     columns = {"t": recording.t}
-    for i, name in enumerate(system.controls):
-        columns[f"ctrl:{name}"] = ctrl[:, i]
+    for i, name in enumerate(system.inputs):
+        columns[name] = ctrl[:, i]
     for i, name in enumerate(recording.outputs):
         columns[name] = recording.y[:, i]
     write_table(path, columns)

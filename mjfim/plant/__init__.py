@@ -8,6 +8,8 @@ Modules:
     mixed_derivatives: Mixed second derivatives of F and h.
     difference_steps: Steps of the differences.
     batch: Many MuJoCo simulations in one call, and observations at their engine steps.
+    closed_loop: The same with control laws that compute controls from a log and from the state.
+    running_law: Control laws at their ticks, and what they remember.
     state_space: Differences and moves of states on the configuration space.
     outputs: Which components of the state and which sensors are measured.
     noise: Covariance and sampling of the measurements, whitening.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -18,6 +18,9 @@ from mjfim.arrays import Array
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.parallel import cores
 from mjfim.plant.state_space import StateSpace
+
+if TYPE_CHECKING:
+    from mjfim.plant.input_context import InputContext, LoopTrace
 
 # Components of MuJoCo's state that a rollout records after every engine step: the time, then qpos,
 # qvel and act.
@@ -216,12 +219,14 @@ class Rollouts:
         finite: (m,) False where a simulation diverged.
         observed: (m, N, rows, w) observations at every engine step of a sample, and then the
             further rows of `SubstepObservations.force_rows`; None if not requested.
+        loop: What control laws have done; None without laws.
     """
 
     states: Array
     sensors: Array | None
     finite: np.ndarray
     observed: Array | None = None
+    loop: LoopTrace | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -274,7 +279,10 @@ class BatchSimulator:
         substeps: `mj_step` calls per sample.
         sensors: True if sensor data are requested.
         threads: Number of threads.
+        is_open_loop: True where the inputs of a simulation are the controls themselves.
     """
+
+    is_open_loop: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -369,6 +377,7 @@ class BatchSimulator:
         start: Array,
         ctrl: Array,
         observations: SubstepObservations | None = None,
+        context: InputContext | None = None,
     ) -> Rollouts:
         """Simulate many curves in open loop.
 
@@ -377,6 +386,7 @@ class BatchSimulator:
             start: (m, ns) initial states.
             ctrl: (m, N, nu) controls, each held over its sample.
             observations: Quantities to observe at every engine step, or None.
+            context: Inputs before and after the curves, which matter to control laws only.
 
         Returns:
             The simulated curves.
@@ -400,7 +410,7 @@ class BatchSimulator:
 
         finite = self._on_time(rows[:, -1, 0], engine_steps)
         finite &= np.isfinite(states).all(axis=(1, 2))
-        finite &= _is_accepted(ctrl).all(axis=(1, 2))
+        finite &= is_accepted(ctrl).all(axis=(1, 2))
 
         sensors = observed = None
         if self.sensors:
@@ -502,7 +512,7 @@ class BatchSimulator:
 
         finite = (
             np.isfinite(states).all()
-            and _is_accepted(used).all()
+            and is_accepted(used).all()
             and self._on_time(np.array(data.time), N * substeps, model)
         )
         return states, used, bool(finite)
@@ -575,7 +585,7 @@ class BatchSimulator:
         names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
         after = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)
         on_time = self._on_time(batch.bind("time").reshape(-1)[:count], self.substeps)
-        after[~on_time | ~_is_accepted(ctrl).all(axis=1)] = np.nan
+        after[~on_time | ~is_accepted(ctrl).all(axis=1)] = np.nan
         return SampleSteps(
             states=after, sensors=sensors, observed=np.stack(observed, axis=1) if observed else None
         )
@@ -758,6 +768,6 @@ def _with_force_rows(observations: SubstepObservations, observed: Array, forces:
     return np.concatenate([observed, further], axis=2)
 
 
-def _is_accepted(ctrl: Array) -> np.ndarray:
+def is_accepted(ctrl: Array) -> np.ndarray:
     """True for controls that MuJoCo applies unchanged."""
     return np.asarray(np.abs(ctrl) <= MAX_CONTROL)

@@ -98,7 +98,8 @@ class ClosedFormMemory:
 
     def __init__(self, simulator: BatchSimulator, parameters: ParameterSet) -> None:
         """Begin with nothing computed."""
-        self.tree = None if simulator.sensors else closed_form_tree(simulator.model)
+        has_form = simulator.is_open_loop and not simulator.sensors
+        self.tree = closed_form_tree(simulator.model) if has_form else None
         self.covered = np.array(
             [is_inertial(p) or acts_on_joints(p) for p in parameters.parameters], dtype=bool
         )

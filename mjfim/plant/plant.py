@@ -6,18 +6,22 @@ Differences of states are vectors of the tangent space, along which states are m
 from __future__ import annotations
 
 import copy
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, SimulationDivergedError
+from mjfim.model.control_laws import ControlLaws
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import PlantModel
 from mjfim.optimize.lq import TangentCurve
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.plant.calibration import Calibration
 from mjfim.plant.closed_form_derivatives import ClosedFormMemory
+from mjfim.plant.closed_loop import ClosedLoopSimulator, input_sizes
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.derivatives import Derivatives
 from mjfim.plant.divergence import explain_divergence
@@ -25,6 +29,12 @@ from mjfim.plant.outputs import Outputs
 from mjfim.plant.state_sizes import StateSizes
 from mjfim.plant.written_models import WrittenModels
 from mjfim.records.trajectory import Trajectory
+
+# Why a simulation with control laws diverges, as a clause of a message.
+UNSTABLE_LOOP = (
+    "the loop of the model and the control laws is unstable; smaller gains, a smaller latency or "
+    "other signs may help"
+)
 
 # Largest number of compiled models at single parameter values that a plant keeps.
 MAX_CACHED_MODELS = 64
@@ -44,7 +54,10 @@ class Plant:
         initial_state_derivative: (nx, p) derivative of the initial state by theta [x-unit /
             theta-unit].
         calibration: Scale errors and biases of the outputs as functions of theta.
-        nu: Number of controls.
+        laws: Control laws that compute controls from the inputs; None where the inputs are the
+            controls. A state does not show what laws remember, so that plants with laws have
+            derivatives of whole rollouts only.
+        nu: Number of controls, or with laws of inputs.
         dt: Sample period [s].
         closed_form_memory: What derivatives in closed form keep from call to call.
     """
@@ -59,6 +72,7 @@ class Plant:
         substeps: int,
         threads: int | None = None,
         smooth: Plant | None = None,
+        laws: ControlLaws | None = None,
     ) -> None:
         """Build the plant.
 
@@ -71,20 +85,22 @@ class Plant:
             threads: Threads of the simulator; None takes all cores.
             smooth: Plant on which mixed second differences are taken, if the derivatives of this
                 one jump; None for this one.
+            laws: Control laws, whose numbers the model holds; None without any.
         """
         self.source = source
         self.parameters = parameters
         self.outputs = outputs
-        self.simulator = BatchSimulator(
-            source.model, substeps=substeps, sensors=outputs.needs_sensors, threads=threads
-        )
+        self.laws = laws
+        self.simulator = _simulator(source.model, laws, outputs.needs_sensors, substeps, threads)
         self.space = self.simulator.space
         self.nominal_initial_state = np.array(nominal_initial_state, dtype=np.float64)
         self.initial_state_derivative = parameters.initial_state_derivative(self.space.nx)
         self.calibration = Calibration.of(parameters, len(outputs))
-        self.nu = int(source.model.nu)
+        self.nu = int(source.model.nu) if laws is None else len(laws.inputs)
         self.dt = substeps * float(source.model.opt.timestep)
         self.sizes = StateSizes.of(source.model, self.space, self.dt)
+        if laws is not None:
+            self.sizes = replace(self.sizes, control=input_sizes(laws, self.sizes))
 
         self._step_factors: Array | None = None
         self._smooth = smooth
@@ -275,19 +291,41 @@ class Plant:
                 compiled[i] = False
         return models, compiled
 
+    @property
+    def tick_samples(self) -> int:
+        """Samples after which the evaluations of all control laws repeat; 1 without laws."""
+        if self.laws is None:
+            return 1
+        substeps = self.simulator.substeps
+        return math.lcm(self.laws.period, substeps) // substeps
+
+    def lead(self, theta: Array) -> int:
+        """Number of samples before a curve whose inputs still have an effect on it.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+
+        Returns:
+            The number; 0 without control laws.
+        """
+        simulator = self.simulator
+        if not isinstance(simulator, ClosedLoopSimulator):
+            return 0
+        return simulator.lead([self.model(theta)])
+
     def trajectory(self, states: Array, ctrl: Array) -> Trajectory:
         """Record of a simulated curve.
 
         Args:
             states: (N+1, ns) states.
-            ctrl: (N, nu) controls.
+            ctrl: (N, nu) controls; of the inputs of control laws, the columns of the log are kept.
 
         Returns:
             The trajectory; its time begins at zero.
         """
         qpos, qvel, act = self.space.split(states)
         t = np.arange(len(states), dtype=np.float64) * self.dt
-        return Trajectory(t=t, qpos=qpos, qvel=qvel, act=act, ctrl=ctrl)
+        return Trajectory(t=t, qpos=qpos, qvel=qvel, act=act, ctrl=ctrl[:, : self.nu])
 
     def difference(self, new: Trajectory, old: Trajectory) -> TangentCurve:
         """Tangent curve (x_new - x_old, u_new - u_old) from one trajectory to another."""
@@ -315,6 +353,24 @@ class Plant:
             )
         return self.trajectory(out.states[0], ctrl)
 
+    def applied(self, theta: Array, trajectory: Trajectory) -> tuple[Trajectory, np.ndarray]:
+        """The trajectory of control laws with the controls that they apply in place of inputs.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            trajectory: A trajectory from the begin of a recording, under inputs of the laws.
+
+        Returns:
+            The trajectory with (N, nu) controls at the begin of each sample, and (N, laws) True
+            where the limits of a law have clipped its control.
+        """
+        out = self.simulator.rollout(
+            [self.model(theta)], trajectory.state[:1], trajectory.ctrl[None]
+        )
+        if out.loop is None:
+            return trajectory, np.zeros((len(trajectory.ctrl), 0), dtype=bool)
+        return replace(trajectory, ctrl=out.loop.controls[0]), out.loop.is_clipped[0]
+
     def why_diverged(self, theta: Array, ctrl: Array) -> str:
         """Explain why an open-loop simulation from the initial state diverges.
 
@@ -325,6 +381,8 @@ class Plant:
         Returns:
             MuJoCo's warning and what may help, as a clause for a message.
         """
+        if self.laws is not None:
+            return UNSTABLE_LOOP
         start = self.initial_state(theta)
         return explain_divergence(
             self.model(theta), start, np.asarray(ctrl), self.simulator.substeps
@@ -406,3 +464,12 @@ class Plant:
 
         states, ctrl, finite = self.simulator.closed_loop(model, alpha, mu, K)
         return self.trajectory(states, ctrl) if finite else None
+
+
+def _simulator(
+    model: Any, laws: ControlLaws | None, sensors: bool, substeps: int, threads: int | None
+) -> BatchSimulator:
+    """The simulator of a plant, see `Plant`."""
+    if laws is None:
+        return BatchSimulator(model, substeps=substeps, sensors=sensors, threads=threads)
+    return ClosedLoopSimulator(model, laws, substeps=substeps, sensors=sensors, threads=threads)

@@ -12,6 +12,7 @@ from mjfim.plant.batch import Rollouts
 from mjfim.plant.closed_form_derivatives import ClosedFormDerivatives
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.difference_steps import TINY
+from mjfim.plant.input_context import InputContext
 from mjfim.plant.lumped_parameters import LumpedParameters
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -399,6 +400,8 @@ class RolloutDerivatives(ClosedFormDerivatives):
         central: bool = True,
         step: float = SENSITIVITY_STEP,
         wanted: np.ndarray | None = None,
+        lead: int = 0,
+        samples: np.ndarray | None = None,
         max_numbers: int = MAX_NUMBERS_AT_ONCE,
     ) -> Iterator[Response | None]:
         """Simulate S curves, with derivatives by theta and by the initial state.
@@ -409,13 +412,16 @@ class RolloutDerivatives(ClosedFormDerivatives):
         Args:
             theta: (p,) parameters [theta-unit].
             initial_states: (S, ns) initial states.
-            ctrl: (S, N, nu) controls.
+            ctrl: (S, lead + N, nu) controls, or inputs of control laws.
             start_directions: (nx, k) directions of the initial state by which to differentiate;
                 None for no derivatives, neither by the initial state nor by theta.
             central: True for two-sided differences.
             step: Difference step relative to `parameter_scale`.
             wanted: (p,) True for parameters by which to differentiate; None for all. Biases are
                 always included, because they need no simulation.
+            lead: Number of samples of `ctrl` before the curves, which matter to control laws.
+            samples: (S,) samples from the begin of the recordings to the first ones of `ctrl`; None
+                for 0.
             max_numbers: Largest number of state values of one interval.
 
         Yields:
@@ -432,19 +438,30 @@ class RolloutDerivatives(ClosedFormDerivatives):
             models = [model for model in models for _ in range(S)]
 
         numbers_per_sample = J * S * plant.simulator.substeps * (1 + state_size)
-        interval = int(np.clip(max_numbers / numbers_per_sample, 1, ctrl.shape[1]))
-        for first in range(0, ctrl.shape[1], interval):
+        interval = int(np.clip(max_numbers / numbers_per_sample, 1, ctrl.shape[1] - lead))
+        begun = np.zeros(S, dtype=np.intp) if samples is None else samples
+        memory = None
+        for first in range(lead, ctrl.shape[1], interval):
             held = ctrl[:, first : first + interval]
             every = np.broadcast_to(held, (J, *held.shape)).reshape(J * S, *held.shape[1:])
-            out = plant.simulator.rollout(models, current.reshape(J * S, -1), every)
+            context = None
+            if plant.laws is not None:
+                place = slice(first, first + interval)
+                context = InputContext.of_interval(ctrl, begun, place, lead, memory).repeated(J)
+            out = plant.simulator.rollout(
+                models, current.reshape(J * S, -1), every, context=context
+            )
+            memory = None if out.loop is None else out.loop.memory
             if not (out.finite.all() and compiled.all()):
                 yield None
                 return
 
-            samples = held.shape[1] + 1
-            states = out.states.reshape(J, S, samples, -1)
-            sensors = None if out.sensors is None else out.sensors.reshape(J, S, samples, -1)
-            yield self._response(theta, first, states, sensors, moves, start_directions is not None)
+            count = held.shape[1] + 1
+            states = out.states.reshape(J, S, count, -1)
+            sensors = None if out.sensors is None else out.sensors.reshape(J, S, count, -1)
+            yield self._response(
+                theta, first - lead, states, sensors, moves, start_directions is not None
+            )
             current = states[:, :, -1]
 
     def _response_moves(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mjfim.arrays import Array
+from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import measurable_columns
 from mjfim.recordings.spec import RecordingSpec
 
@@ -17,6 +18,7 @@ class Channels:
     Attributes:
         model: The compiled MuJoCo model (`mujoco.MjModel`) at its nominal parameters.
         controls: nu names of the controls, in the order of the model's actuators.
+        laws: Control laws, which read other columns instead of controls; None without any.
         outputs: Names of the m outputs that the experiment measures.
         sigma: (m,) standard deviations of the outputs' measurement noise [output unit].
         spec: The `[recording]` table of the experiment file.
@@ -25,6 +27,7 @@ class Channels:
 
     model: Any
     controls: tuple[str, ...]
+    laws: ControlLaws | None
     outputs: tuple[str, ...]
     sigma: Array
     spec: RecordingSpec
@@ -32,7 +35,12 @@ class Channels:
 
     @property
     def control_columns(self) -> tuple[str, ...]:
-        """Column names of the controls in a recording, `ctrl:<actuator>`."""
+        """Columns of a recording that drive a simulation.
+
+        They are the controls, `ctrl:<actuator>`, or what a law reads, `reference:<actuator>`.
+        """
+        if self.laws is not None:
+            return self.laws.columns
         return tuple(f"ctrl:{name}" for name in self.controls)
 
     @property

@@ -79,11 +79,13 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
     """Remarks about controls ctrl: (M-1, nu) that are outside their range or look like noise."""
     model = channels.model
 
-    for i, name in enumerate(channels.controls):
-        u = ctrl[:, i]
-        if not _moves(u):
+    for column, u in zip(channels.control_columns, ctrl.T, strict=True):
+        # References of control laws jump where the user commands it, and have no range.
+        if not column.startswith("ctrl:") or not _moves(u):
             continue
 
+        name = column.removeprefix("ctrl:")
+        i = channels.controls.index(name)
         if model.actuator_ctrllimited[i]:
             yield from _range_remarks(name, u, model.actuator_ctrlrange[i])
 

@@ -20,8 +20,14 @@ from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.column_units import check_unit, convert, units_of
 from mjfim.recordings.formats.table import Table
+from mjfim.recordings.law_columns import (
+    check_references,
+    require_law,
+    require_one_source,
+    units_of_inputs,
+)
 from mjfim.recordings.log_file import FileState, remember_file
-from mjfim.recordings.spec import ColumnSpec, RecordingSpec
+from mjfim.recordings.spec import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
 from mjfim.recordings.summary import LogSummary, summarize
 from mjfim.recordings.validity import (
     SECONDS,
@@ -111,6 +117,7 @@ def read_log(path: Path, channels: Channels) -> Log:
         check_angles(str(path), channels.model, t, columns, stated)
     except RecordingError as error:
         raise RecordingError(f"{error}. {table.unit_hint}" if table.unit_hint else error) from None
+    check_references(path, channels, columns, stated)
 
     column_names = {name: source.column for name, source in sources.items()}
     summary = summarize(str(path), t, columns, column_names, dropped=len(stamps) - len(t))
@@ -188,9 +195,11 @@ def check_spec(channels: Channels) -> None:
     where = f"{channels.source}: recording.columns"
     units = units_of(channels.model)
     units.update(dict.fromkeys(channels.control_columns, "any"))
+    units.update(units_of_inputs(channels))
 
     for name in channels.spec.columns:
         if name not in units:
+            require_law(where, name, channels)
             raise ExperimentError(f"{where}: {unknown_coordinate('column', name, list(units))}")
 
     for name, source in channels.spec.sources.items():
@@ -230,6 +239,8 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     """
     stated = channels.spec.sources
     default = _columns_by_default_name(table, channels)
+    if channels.laws is not None:
+        require_one_source(table.source, table.names, channels)
 
     controls = {
         name: stated.get(name) or ColumnSpec(column=default.get(name, name))
@@ -241,6 +252,8 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
         if name not in stated:
             key = f'[recording.columns] "{name}"'
             off = f"; if the motor was off or its control constant, state the value: {key} = 0.0"
+            if not name.startswith("ctrl:"):
+                off = f"; where it is constant, state the value, for example {key} = 1.0"
             _require_default(table, name, source.column, key=key, otherwise=off)
         table.column(source.column)
 
@@ -295,7 +308,8 @@ def _check_names(table: Table, channels: Channels) -> None:
     """
     known = (*channels.control_columns, *channels.measurable)
     for name in table.names:
-        if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
+        if name.startswith(("ctrl:", "qpos:", "qvel:", *LAW_PREFIXES)) and name not in known:
+            require_law(table.source, name, channels)
             fault = unknown_coordinate("column", name, ["t", *known])
             raise RecordingError(f"{table.source}: {fault}")
 
@@ -355,8 +369,8 @@ def _names_of_lerobot_column(name: str) -> list[str]:
         coordinate = LEROBOT_STATES.get(f"{dot}{ending}")
         return [f"{coordinate}{stem}"] if coordinate else [f"qpos:{component}"]
     if feature == "action":
-        is_stem = f"{dot}{ending}" in LEROBOT_CONTROLS
-        return [f"ctrl:{stem}" if is_stem else f"ctrl:{component}"]
+        actuator = stem if f"{dot}{ending}" in LEROBOT_CONTROLS else component
+        return [f"ctrl:{actuator}", f"reference:{actuator}"]
     return []
 
 
@@ -370,10 +384,10 @@ def _matrices(channels: Channels) -> dict[str, list[str]]:
     nq = channels.model.nq
 
     matrices = {}
-    if all(name.startswith("ctrl:") for name in stated):
+    if all(name.startswith(INPUT_PREFIXES) for name in stated):
         matrices["qpos"] = state[:nq]
         matrices["qvel"] = state[nq:]
-    if any(name not in stated for name in channels.control_columns):
+    if channels.laws is None and any(name not in stated for name in channels.control_columns):
         matrices["ctrl"] = list(channels.control_columns)
     return matrices
 
@@ -415,16 +429,17 @@ def _columns(
 
     for name, source in sources.items():
         # Truth values may switch a control or a factor on and off.
-        if not name.startswith("ctrl:"):
+        if not name.startswith(INPUT_PREFIXES):
             table.measurement(source.column)
 
         for raw in (source.column, *source.multiply_by):
             check_finite(f"{table.source}: column {raw!r}", table.column(raw)[rows], rows.start)
 
         values = convert(table, source)
-        if name.startswith("ctrl:"):
+        if name.startswith(INPUT_PREFIXES):
             values, age = hold_last_value(t, values)
-            where = f"{table.source}: column {source.column!r} (the control {name!r})"
+            kind = "control" if name.startswith("ctrl:") else "input"
+            where = f"{table.source}: column {source.column!r} (the {kind} {name!r})"
             check_held(where, t[rows][:-1], values[rows][:-1], age[rows][:-1], spec.gap)
 
         # Finite raw numbers may become infinite by the conversion.

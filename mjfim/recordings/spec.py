@@ -56,6 +56,12 @@ LogUnit = Literal[
 ]
 
 
+# Beginnings of the names of columns that control laws read, and of all columns that drive a
+# simulation.
+LAW_PREFIXES = ("reference:", "reference_velocity:", "feedforward:", "gain:", "enable:")
+INPUT_PREFIXES = ("ctrl:", *LAW_PREFIXES)
+
+
 class Section(BaseModel):
     """A table of the experiment file; it is immutable and refuses unknown keys.
 
@@ -153,7 +159,8 @@ class RecordingSpec(Section):
         default={},
         description=(
             "Sources of the columns of the recording, by `ctrl:<actuator>`, `qpos:<joint>`, "
-            "`qvel:<joint>` or sensor: the name of a column of the log, or a table; for a control "
+            "`qvel:<joint>` or sensor, and with a law in `controllers` by `reference:<actuator>` "
+            "and what else it reads: the name of a column of the log, or a table; for a control "
             "also a number, its constant value (0.0 for a motor that is off). Default: the "
             "columns of the log have these names."
         ),

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array, freeze
 from mjfim.records.combinations import join_names
+from mjfim.records.control_law import ControlLawInLoop
 from mjfim.records.horizons import HorizonStudy
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
@@ -89,6 +90,8 @@ class Estimate(ShownRecord):
             whole vector or tensor of an entry [theta-unit].
         selection: How the model was extended by terms that it lacked; None where that was not
             asked for.
+        controllers: Control laws in the loop with which the recordings were simulated; none where
+            they hold the controls themselves.
         held: Names of the parameters that kept their guess, whose standard deviation is 0.
         horizons: Lengths of segments that were compared, because the model does not explain whole
             recordings; None where they were not.
@@ -139,6 +142,7 @@ class Estimate(ShownRecord):
     segments: tuple[Array, ...] = ()
     sizes: Array = field(default_factory=lambda: np.zeros(0))
     selection: Selection | None = None
+    controllers: tuple[ControlLawInLoop, ...] = ()
     horizons: HorizonStudy | None = None
     held: tuple[str, ...] = ()
     inverse_dynamics: InverseDynamicsFit | None = None
@@ -242,6 +246,7 @@ class Estimate(ShownRecord):
             "combinations": list(self.combinations),
             "restart": None if self.restart is None else self.restart.summary(),
             "selection": None if self.selection is None else self.selection.summary(),
+            "controllers": [law.summary() for law in self.controllers],
             "held": list(self.held),
             "horizons": None if self.horizons is None else self.horizons.summary(),
             "inverse_dynamics": (

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from mjfim.records.control_law import ControlLawInLoop
+
 
 @dataclass(frozen=True, kw_only=True)
 class StatedParameter:
@@ -74,6 +76,7 @@ class StatedExperiment:
         outputs: The measured outputs.
         controls: Names of the controls.
         limits: The limits of a design, the ranges of the MJCF among them.
+        controllers: The control laws, at the guess.
         missing: Keys that `check` and `design` need and that the file does not state.
         warnings: Numbers that are possible but probably not meant, in words.
     """
@@ -86,6 +89,7 @@ class StatedExperiment:
     outputs: tuple[StatedOutput, ...]
     controls: tuple[str, ...]
     limits: tuple[StatedLimit, ...]
+    controllers: tuple[ControlLawInLoop, ...]
     missing: tuple[str, ...]
     warnings: tuple[str, ...]
 

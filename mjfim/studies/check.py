@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -48,6 +49,7 @@ from mjfim.records.trajectory import Trajectory
 from mjfim.studies.derivative_test import self_test
 from mjfim.studies.design_outlook import DesignOutlook
 from mjfim.studies.probe_workers import ProbeWorkers
+from mjfim.studies.random_references import random_references
 
 # Target standard deviation where none is stated, relative to the size of the parameter.
 DEFAULT_RELATIVE_STD = 0.05
@@ -196,6 +198,8 @@ def _identifiability_test(
 ) -> IdentifiabilityTest:
     """The test of a task; an executor differentiates its random motions."""
     test = task.identifiability_test
+    if task.system.laws is not None:
+        test = replace(test, probes=partial(random_references, task))
     if executor is None:
         return test
     workers = ProbeWorkers(executor=executor, task=task, stop=stop)

@@ -7,6 +7,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
+from mjfim.identification.laws_in_loop import laws_in_loop
 from mjfim.records.stated_experiment import (
     StatedExperiment,
     StatedLimit,
@@ -35,7 +36,7 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
         missing.append("initial.control")
 
     # A file for recordings alone needs no task of a design.
-    if missing:
+    if missing or system.laws is not None:
         limits = limits_of(system.model, system.controls, experiment.limits, system.dt)
     else:
         limits = DesignTask.of(system).limits
@@ -71,6 +72,7 @@ def stated_experiment(experiment: Experiment) -> StatedExperiment:
             )
             for limit in limits
         ),
+        controllers=laws_in_loop(system, system.parameters.guess, {}),
         missing=tuple(missing),
         warnings=probable_degrees(experiment, system.source),
     )

@@ -252,7 +252,9 @@ def test_every_field_is_tested() -> None:
         (p.split("/")[0].split(":")[0], re.split(r"[:\[]", p.rsplit(":", 1)[1])[0])
         for p in (*STATED, *OUTSIDE)
     }
-    every = {(kind, field) for kind in KINDS for field in fields_of(kind)}
+    # Control laws need tables of their own: tests/identification/test_control_laws.py.
+    kinds = [kind for kind in KINDS if kind != "controller"]
+    every = {(kind, field) for kind in kinds for field in fields_of(kind)}
     assert tried == every
 
 

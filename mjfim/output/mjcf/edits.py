@@ -101,6 +101,9 @@ class ParameterEdits:
                 raise ModelError(f"parameters.{parameter.name} is a Python function of the MjSpec")
 
             for target in parameter.targets:
+                # MJCF has no discrete control laws.
+                if ParameterPath.parse(target.path).kind == "controller":
+                    continue
                 for path, target_field in self._numbers_of(target):
                     as_matrix = isinstance(target_field, InertiaField)
 

@@ -19,6 +19,7 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, first_ones, listed
 from mjfim.experiment.system import System
+from mjfim.model.control_laws import remove_numbers
 from mjfim.model.loading import compile_spec, load_written_model
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS, resolve
@@ -118,6 +119,12 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
             "softer or stiffer than in the fit, where MuJoCo could not treat these bodies as "
             "'simple' (body_invweight0)"
         )
+    if system.laws is not None:
+        names = first_ones([law.actuator for law in system.laws.laws], longest=REMARK_TEXT)
+        remarks.append(
+            f"it holds the model without the control laws of {names}, because MJCF has no laws "
+            "with a rate; estimate.json holds their numbers"
+        )
     return f"{path.name}: {'; '.join(remarks)}" if remarks else None
 
 
@@ -156,6 +163,7 @@ def _write_printed(path: Path, system: System, theta: Array, wanted: Any) -> Non
     # If the plain values are refused or give another model, derived numbers are stated as well.
     for states_derived in (False, True):
         spec = system.source.spec.copy()
+        remove_numbers(spec)
         if states_derived:
             state_derived_values(spec, system.model)
 

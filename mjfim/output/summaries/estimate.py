@@ -77,6 +77,10 @@ def describe_estimate(estimate: Estimate) -> Summary:
         )
     )
 
+    for law in estimate.controllers:
+        parts.append(Paragraph(text=str(law)))
+        parts.append(Paragraph(text=f"In the experiment file: {law.toml}", detail=True))
+
     # Parameters that differ between recordings: the table shows the first value only.
     for name, values in estimate.per_recording.items():
         if len(values) > 1:

@@ -22,6 +22,8 @@ def describe_experiment(stated: StatedExperiment) -> Summary:
         stated: What the file states.
     """
     parts: list[Part] = [_parameters(stated), _outputs(stated)]
+    if stated.controllers:
+        parts.append(_controllers(stated))
     if stated.limits:
         parts.append(_limits(stated))
     return Summary(
@@ -66,6 +68,33 @@ def _outputs(stated: StatedExperiment) -> SummaryTable:
     )
 
 
+def _controllers(stated: StatedExperiment) -> SummaryTable:
+    """The control laws."""
+    return SummaryTable(
+        key="controllers",
+        title="Control laws in the loop",
+        columns=columns(
+            "actuator",
+            "rate [Hz]",
+            "columns of the log",
+            "numbers",
+            left=("columns of the log", "numbers"),
+            details=("columns of the log",),
+        ),
+        rows=tuple(
+            Row(
+                cells=(
+                    law.actuator,
+                    Quantity(value=law.rate),
+                    ", ".join(law.columns),
+                    law.numbers_in_words,
+                )
+            )
+            for law in stated.controllers
+        ),
+    )
+
+
 def _limits(stated: StatedExperiment) -> SummaryTable:
     """The limits of a design."""
     return SummaryTable(
@@ -97,7 +126,10 @@ def _verdict(stated: StatedExperiment) -> str:
     )
     if stated.missing:
         keys = " and ".join(f"`{key}`" for key in stated.missing)
-        return f"{found}. It serves `identify`; `check` and `design` also need {keys}"
+        work = "`simulate` also needs" if stated.controllers else "`check` and `design` also need"
+        return f"{found}. It serves `identify`; {work} {keys}"
+    if stated.controllers:
+        return f"{found}, {stated.horizon:g} s. It serves `identify` and `simulate`, not `design`"
     return f"{found}, {stated.horizon:g} s"
 
 

@@ -234,6 +234,11 @@ def _modifier(system: System, theta: Array, j: int) -> Callable[[Any, Any], None
 def _check_expressible(system: System) -> None:
     """Check that sysid can state this problem; raise ExperimentError if it cannot."""
     experiment, parameters = system.experiment, system.parameters
+    if system.laws is not None:
+        raise ExperimentError(
+            f"{experiment.source}: controllers: sysid applies the control of a log; remove the "
+            "laws, and use a log that holds the controls"
+        )
     if parameters.outside_model.any():
         name = parameters.names[int(np.argmax(parameters.outside_model))]
         raise ExperimentError(

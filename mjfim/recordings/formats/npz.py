@@ -18,7 +18,7 @@ from mjfim.recordings.formats.table import (
     length_fault,
     one_line,
 )
-from mjfim.recordings.spec import RecordingSpec
+from mjfim.recordings.spec import INPUT_PREFIXES, RecordingSpec
 from mjfim.records.unpacked_size import (
     DAMAGED_ARCHIVE,
     Header,
@@ -89,7 +89,7 @@ def _table(
 
     rows = time[0]
     needed = set(columns_to_read(itertools.chain.from_iterable(labels.values()), spec))
-    controls = {s.column for key, s in spec.sources.items() if key.startswith("ctrl:")}
+    controls = {s.column for key, s in spec.sources.items() if key.startswith(INPUT_PREFIXES)}
 
     columns: dict[str, Array] = {}
     faults: dict[str, str] = {}
@@ -97,7 +97,7 @@ def _table(
     truth_values: set[str] = set()
     for name, parts in labels.items():
         shape, dtype = headers[name]
-        is_control = name.startswith("ctrl") or not controls.isdisjoint(parts)
+        is_control = name.startswith(("ctrl", *INPUT_PREFIXES)) or not controls.isdisjoint(parts)
 
         if dtype.kind == "b":
             truth_values.update(parts)

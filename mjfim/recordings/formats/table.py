@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, listed
-from mjfim.recordings.spec import RecordingSpec
+from mjfim.recordings.spec import INPUT_PREFIXES, RecordingSpec
 
 # Longest quotation of another library's error message [characters].
 MAX_QUOTATION = 200
@@ -112,17 +112,18 @@ def columns_to_read(names: Iterable[str], spec: RecordingSpec) -> list[str]:
 
     Returns:
         All names if the table states no measured column. Otherwise the stated columns, the time,
-        and all columns that may be a control under its default name.
+        and all columns that may be a control, or what a law reads, under its default name.
     """
     sources = spec.sources
-    if all(key.startswith("ctrl:") for key in sources):
+    if all(key.startswith(INPUT_PREFIXES) for key in sources):
         return list(names)
 
     stated = {spec.time}
     for source in sources.values():
         stated.update((source.column, *source.multiply_by))
 
-    return [name for name in names if name in stated or name.startswith("ctrl")]
+    inputs = ("ctrl", *INPUT_PREFIXES)
+    return [name for name in names if name in stated or name.startswith(inputs)]
 
 
 def length_fault(length: int, time: str, rows: int) -> str:

@@ -1,0 +1,352 @@
+"""Control laws in the loop: what they remember, and their controls from one evaluation to the next.
+
+At a tick k, with the measured position q and velocity v, and the commands of the log,
+
+    I_k = I_k-1 + g ki T (r_k - q),      clipped to the limit of the integral
+    u_k = g (kp (r_k - q) + kd (rdot_k - v)) + I_k + f_k
+
+is clipped to the range of the control, then to the largest change since the last tick. The factor g
+and the feed-forward f come from the log. The measurement is that of the model, late by the latency
+of the feedback: positions between two ticks follow the cubic polynomial through their positions and
+velocities, velocities a straight line, so that they depend continuously on the latency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.model.control_laws import ControlLaw
+from mjfim.plant.law_commands import LawCommands, Ticks
+from mjfim.plant.law_numbers import LawNumbers, filter_shares
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LawMemory:
+    """What c laws with one period remember from one evaluation to the next, for m curves.
+
+    Attributes:
+        held: (m, c) controls that the laws hold [u-unit].
+        integral: (m, c) integrals [u-unit].
+        velocity: (m, c) filtered velocities [m/s or rad/s].
+        measured: (m, c) measured positions at the latest evaluation [m or rad].
+        positions: (D, m, c) positions at the latest D evaluations, the latest one first.
+        velocities: (D, m, c) velocities at these evaluations.
+    """
+
+    held: Array
+    integral: Array
+    velocity: Array
+    measured: Array
+    positions: Array
+    velocities: Array
+
+    def of_curves(self, chosen: np.ndarray) -> LawMemory:
+        """The memory of some of the curves.
+
+        Args:
+            chosen: Indices of the curves.
+        """
+        return LawMemory(
+            held=self.held[chosen],
+            integral=self.integral[chosen],
+            velocity=self.velocity[chosen],
+            measured=self.measured[chosen],
+            positions=self.positions[:, chosen],
+            velocities=self.velocities[:, chosen],
+        )
+
+    @staticmethod
+    def joined(parts: Sequence[LawMemory], places: np.ndarray) -> LawMemory:
+        """Put the memories of all curves together.
+
+        Args:
+            parts: Memories of some curves each.
+            places: (m,) place of each curve among those of all parts.
+        """
+        return LawMemory(
+            held=np.concatenate([part.held for part in parts])[places],
+            integral=np.concatenate([part.integral for part in parts])[places],
+            velocity=np.concatenate([part.velocity for part in parts])[places],
+            measured=np.concatenate([part.measured for part in parts])[places],
+            positions=np.concatenate([part.positions for part in parts], axis=1)[:, places],
+            velocities=np.concatenate([part.velocities for part in parts], axis=1)[:, places],
+        )
+
+
+class RunningLaws:
+    """C laws with one period, which compute the controls of m curves at successive ticks.
+
+    Attributes:
+        held: (m, c) controls that the laws hold now [u-unit].
+        is_clipped: (m, c) True where the range or the largest change has clipped them.
+        has_limits: True where something may clip them.
+    """
+
+    def __init__(
+        self,
+        laws: Sequence[ControlLaw],
+        numbers: LawNumbers,
+        commands: LawCommands,
+        ticks: Ticks,
+        memory: LawMemory,
+        *,
+        begins: bool,
+        first: int,
+    ) -> None:
+        """Prepare the laws.
+
+        Args:
+            laws: The c laws.
+            numbers: Their numbers.
+            commands: Commands of the log at the ticks.
+            ticks: The ticks.
+            memory: What the laws remember at the begin.
+            begins: True where no control was held before the first tick, so that its change is not
+                limited.
+            first: Index of the first tick among the commands.
+        """
+        self._numbers = numbers
+        self._commands = commands
+        self._drive = commands.drive(numbers)
+        self._next = first
+
+        seconds = ticks.seconds
+        self._seconds = seconds
+        self._integral_step = numbers.ki * seconds
+        self._largest_change = numbers.slew * seconds
+        self._velocity_share = filter_shares(numbers.velocity_time_constant, seconds)
+        self._differs = np.array([law.differences for law in laws])
+        self._has_differences = bool(self._differs.any())
+
+        # Parts of the law without an effect are left out of the loop.
+        self._integrates = bool(numbers.ki.any() or memory.integral.any())
+        limits = (numbers.saturation_low, numbers.saturation_high, numbers.slew)
+        self.has_limits = any(bool(np.isfinite(limit).any()) for limit in limits)
+        self._is_slow = bool(np.isfinite(numbers.slew).any())
+        self._filters = bool((self._velocity_share < 1.0).any())
+        self._is_late = bool(numbers.feedback_latency.any())
+
+        self.held = memory.held
+        self.is_clipped = np.zeros(memory.held.shape, dtype=bool)
+        self._has_held = not begins
+        self._integral = memory.integral
+        self._velocity = memory.velocity
+        self._measured = memory.measured
+
+        self._positions = memory.positions.copy()
+        self._velocities = memory.velocities.copy()
+        self._latest = 0
+        self._interpolation = _PastInterpolation(numbers.feedback_latency, seconds)
+
+    @property
+    def memory(self) -> LawMemory:
+        """What the laws remember now."""
+        order = (self._latest + np.arange(len(self._positions))) % len(self._positions)
+        return LawMemory(
+            held=self.held,
+            integral=self._integral,
+            velocity=self._velocity,
+            measured=self._measured,
+            positions=self._positions[order],
+            velocities=self._velocities[order],
+        )
+
+    def evaluate(self, q: Array, v: Array) -> Array:
+        """Controls of the next tick, which are held until the one after it.
+
+        Args:
+            q: (m, c) positions of the joints now [m or rad].
+            v: (m, c) velocities of the joints now [m/s or rad/s].
+
+        Returns:
+            (m, c) controls [u-unit].
+        """
+        tick = self._next
+        self._next += 1
+        q, v = self._measure(q, v)
+
+        control = self._proportional(tick, q, v)
+        if self._integrates:
+            control += self._integrate(tick, q)
+        if self.has_limits:
+            control = self._limited(control)
+
+        # A driver that is off forgets its integral.
+        if self._commands.enabled is not None:
+            enabled = self._commands.enabled[tick]
+            control *= enabled
+            self._integral = self._integral * enabled
+
+        self.held = control
+        self._has_held = True
+        return control
+
+    def _limited(self, control: Array) -> Array:
+        """(m, c) controls inside their ranges and near the controls before."""
+        numbers = self._numbers
+        limited = _clipped(control, numbers.saturation_low, numbers.saturation_high)
+        if self._is_slow and self._has_held:
+            change = self._largest_change
+            limited = _clipped(limited, self.held - change, self.held + change)
+        self.is_clipped = limited != control
+        return limited
+
+    def _proportional(self, tick: int, q: Array, v: Array) -> Array:
+        """(m, c) controls at a tick without the integral, for measured positions and velocities."""
+        feedback = self._numbers.kp * q + self._numbers.kd * v
+        if self._commands.gain is not None:
+            feedback *= self._commands.gain[tick]
+        return np.asarray(self._drive[tick] - feedback)
+
+    def _integrate(self, tick: int, q: Array) -> Array:
+        """(m, c) integrals after a tick with measured positions q."""
+        step = self._integral_step * (self._commands.reference[tick] - q)
+        if self._commands.gain is not None:
+            step *= self._commands.gain[tick]
+        limit = self._numbers.integral_limit
+        self._integral = _clipped(self._integral + step, -limit, limit)
+        return self._integral
+
+    def _measure(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Positions and velocities that the driver uses, from those of the joints now."""
+        if self._is_late:
+            self._latest = (self._latest - 1) % len(self._positions)
+            self._positions[self._latest] = q
+            self._velocities[self._latest] = v
+            q, v = self._interpolation.past(self._positions, self._velocities, self._latest)
+
+        if self._has_differences:
+            v = np.where(self._differs, (q - self._measured) / self._seconds, v)
+        self._measured = q
+
+        if self._filters:
+            self._velocity = self._velocity + self._velocity_share * (v - self._velocity)
+            v = self._velocity
+        return q, v
+
+
+class _PastInterpolation:
+    """Positions and velocities some time ago, between those at the latest ticks.
+
+    Args:
+        latency: (m, c) times ago [s].
+        period: Time from one tick to the next [s].
+    """
+
+    def __init__(self, latency: Array, period: float) -> None:
+        ticks = latency / period
+        self._lag = np.floor(ticks).astype(np.intp)
+        m, c = latency.shape
+        self._curve, self._law = np.arange(m)[:, None], np.arange(c)
+
+        # Weights of Hermite's polynomial on the way s from the earlier tick to the later one.
+        s = 1.0 - (ticks - self._lag)
+        self._later = s
+        self._q_later = s * s * (3.0 - 2.0 * s)
+        self._v_later = s * s * (s - 1.0) * period
+        self._v_earlier = s * (s - 1.0) ** 2 * period
+
+    def past(self, positions: Array, velocities: Array, latest: int) -> tuple[Array, Array]:
+        """(m, c) positions and velocities.
+
+        Args:
+            positions: (D, m, c) positions at the latest ticks, in a ring.
+            velocities: (D, m, c) velocities at the latest ticks.
+            latest: Place of the latest tick in the ring; earlier ones follow.
+        """
+        later = (latest + self._lag) % len(positions)
+        earlier = (later + 1) % len(positions)
+        q1, v1 = (each[later, self._curve, self._law] for each in (positions, velocities))
+        q0, v0 = (each[earlier, self._curve, self._law] for each in (positions, velocities))
+
+        q = q0 + self._q_later * (q1 - q0) + self._v_later * v1 + self._v_earlier * v0
+        return q, v0 + self._later * (v1 - v0)
+
+
+def memory_at_begin(
+    laws: Sequence[ControlLaw],
+    numbers: LawNumbers,
+    commands: LawCommands,
+    ticks: Ticks,
+    state: tuple[Array, Array],
+    sums: Array | None,
+) -> LawMemory:
+    """What laws remember where a curve begins.
+
+    Before it, the joints count as moving with their velocity at the begin. The control that is held
+    up to the first tick is that of the law at the tick before, without a limit of its change.
+
+    Args:
+        laws: The c laws.
+        numbers: Their numbers.
+        commands: Commands of the log at the ticks.
+        ticks: The ticks.
+        state: (m, c) positions and velocities of the joints at the begin.
+        sums: (m, c, 4) `MEASURED_SUMS` of each law at the begin; NaN, or None for all curves, where
+            the integral is that of the begin of a recording.
+    """
+    q, v = state
+    latency, period = numbers.feedback_latency, ticks.seconds
+    latest = ticks.first * ticks.timestep - period
+    size = int(np.floor(latency.max(initial=0.0) / period)) + 2
+    times = latest - period * np.arange(size)
+
+    memory = LawMemory(
+        held=np.zeros_like(q),
+        integral=_integral_at_begin(numbers, commands, state, sums, period),
+        velocity=v,
+        measured=q + v * (latest - latency),
+        positions=q + v * times[:, None, None],
+        velocities=np.repeat(v[None], size, axis=0),
+    )
+    if ticks.first == 0:
+        return memory
+
+    # The law at the tick before the begin, whose error the integral contains already.
+    step = v * period
+    earlier = replace(memory, measured=memory.measured - step, positions=memory.positions - step)
+    frozen = replace(numbers, ki=np.zeros_like(numbers.ki))
+    first = commands.before - 1
+    before = RunningLaws(laws, frozen, commands, ticks, earlier, begins=True, first=first)
+    return replace(memory, held=before.evaluate(q + v * latest, v))
+
+
+def _integral_at_begin(
+    numbers: LawNumbers,
+    commands: LawCommands,
+    state: tuple[Array, Array],
+    sums: Array | None,
+    period: float,
+) -> Array:
+    """(m, c) integrals before the first tick, from the errors that were measured before it.
+
+    The log holds neither the late reference nor the late measurement, whose effects on the sum are
+    known: latency and filter keep back an integral of the reference, and a late measurement one of
+    the position. They are accurate to the second order of the latency, where the reference was at
+    rest at the begin of the sum; a step of it between two ticks counts with an error of up to half
+    a period.
+    """
+    if sums is None:
+        return numbers.integral
+
+    q, v = state
+    errors, reference, position, share = np.moveaxis(sums, -1, 0)
+    latency = numbers.feedback_latency
+    kept_back = commands.lag - commands.lag_time * reference
+    measured_late = latency * (q - 0.5 * (latency + period) * v - position)
+
+    late = numbers.ki * (measured_late - kept_back)
+    if commands.gain is not None:
+        late = late * commands.gain[commands.before]
+    integral = share * numbers.integral + numbers.ki * errors + late
+    limited = _clipped(integral, -numbers.integral_limit, numbers.integral_limit)
+    return np.asarray(np.where(np.isnan(share), numbers.integral, limited))
+
+
+def _clipped(values: Array, low: Array, high: Array) -> Array:
+    """Values inside ranges of the same shape."""
+    return np.asarray(np.minimum(np.maximum(values, low), high))

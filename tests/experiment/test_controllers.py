@@ -1,0 +1,286 @@
+"""The table `[controllers]`: what it states, messages about misuse, and columns of logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError, MjfimError, RecordingError
+from mjfim.excitation.stated_inputs import stated_inputs
+from mjfim.experiment.system import System
+from mjfim.model.control_laws import Quantity
+from mjfim.recordings.read import read_recording
+from mjfim.recordings.spec import LAW_PREFIXES
+from mjfim.studies.stated_experiment import stated_experiment
+from tests.support.closed_loop import arm_experiment
+from tests.support.paths import MODELS
+
+PD = {"kp": 60.0, "kd": 4.0}
+
+# Tables of an experiment, and parts of the message that refuses them.
+FAULTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "actuator": (
+        {"controllers": {"shouldr": PD}},
+        ("controllers: unknown actuator 'shouldr'", "did you mean 'shoulder'", "elbow, shoulder"),
+    ),
+    "joint": (
+        {"controllers": {"shoulder": PD | {"joint": "wrist"}}},
+        ("controllers.shoulder.joint", "'wrist'", "valid: elbow, shoulder"),
+    ),
+    "rate": (
+        {"controllers": {"shoulder": PD | {"rate": 300.0}}},
+        ("controllers.shoulder.rate: 300 Hz does not divide", "1000 Hz", "500, 250, 200"),
+    ),
+    "negative gain": (
+        {"controllers": {"shoulder": {"kp": -1.0}}},
+        ("controllers.shoulder.kp", "greater than or equal to 0", "-1"),
+    ),
+    "negative latency": (
+        {"controllers": {"shoulder": PD | {"latency": "-2 ms"}}},
+        ("controllers.shoulder.latency", "greater than or equal to 0"),
+    ),
+    "unit of the latency": (
+        {"controllers": {"shoulder": PD | {"latency": "2 m"}}},
+        ("controllers.shoulder.latency", "m"),
+    ),
+    "nothing": (
+        {"controllers": {"shoulder": {"rate": 500.0}}},
+        ("controllers.shoulder: the law computes nothing", "kp, kd, ki or feedforward"),
+    ),
+    "range": (
+        {"controllers": {"shoulder": PD | {"saturation": (2.0, -2.0)}}},
+        ("controllers.shoulder: saturation [2.0, -2.0] needs lower < upper",),
+    ),
+    "key": (
+        {"controllers": {"shoulder": PD | {"kv": 1.0}}},
+        ("controllers.shoulder.kv: unknown key 'kv'", "kd"),
+    ),
+    "parameter without a law": (
+        {"parameters": {"k": {"target": "controller/elbow:kp"}}},
+        ("parameters.k", "unknown controller 'elbow'", "valid: shoulder"),
+    ),
+    "field of a parameter": (
+        {"parameters": {"k": {"target": "controller/shoulder:kv"}}},
+        ("unknown controller field 'kv'", "velocity_time_constant"),
+    ),
+    "index of a parameter": (
+        {"parameters": {"k": {"target": "controller/shoulder:saturation[2]"}}},
+        ("index 2 is out of range", "valid: 0 to 1"),
+    ),
+    "limit that is not stated": (
+        {"parameters": {"k": {"target": "controller/shoulder:slew"}}},
+        ("the law states no slew", "state `slew` in [controllers.shoulder]"),
+    ),
+    "gain without a size": (
+        {"parameters": {"k": {"target": "controller/shoulder:ki"}}},
+        ("parameters.k.scale: the guess", "is 0"),
+    ),
+    "two owners": (
+        {
+            "parameters": {
+                "a": {"target": "controller/shoulder:kp"},
+                "b": {"target": "controller/shoulder:kp"},
+            }
+        },
+        ("parameters.b: target 'controller/shoulder:kp' already belongs to parameters.a",),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_are_named(name: str) -> None:
+    tables, fragments = FAULTS[name]
+    with pytest.raises(ExperimentError) as caught:
+        System.resolve(arm_experiment(**{"controllers": {"shoulder": PD}, **tables}))
+    message = str(caught.value)
+    assert [part for part in fragments if part not in message] == []
+    assert "\n" not in message
+
+
+def test_without_laws_the_message_about_a_path_says_so() -> None:
+    with pytest.raises(ExperimentError, match=r"states no law in \[controllers\]"):
+        System.resolve(arm_experiment({}, parameters={"k": {"target": "controller/shoulder:kp"}}))
+
+
+@pytest.mark.parametrize("verb", ["design", "check", "compare"])
+def test_designs_are_refused(verb: str) -> None:
+    control = {"kind": "multisine", "amplitude": 0.3}
+    experiment = arm_experiment({"shoulder": PD}, horizon=1.0, initial={"control": control})
+    with pytest.raises(ExperimentError) as caught:
+        getattr(mjfim, verb)(experiment, progress=False)
+    assert "a control without a law" in str(caught.value)
+    assert "<position" in str(caught.value)
+
+
+def test_laws_follow_the_experiment() -> None:
+    """Names, units and numbers; another experiment on the same model has its own laws."""
+    law = PD | {"feedforward": True, "latency": "3 ms", "slew": 100.0, "kind": "voltage"}
+    experiment = arm_experiment({"shoulder": law})
+    system = System.resolve(experiment)
+
+    assert system.inputs == ("reference:shoulder", "feedforward:shoulder", "ctrl:elbow")
+    assert system.laws is not None
+    assert system.laws.period == 2
+    paths = {"kp": "V/rad", "kd": "V s/rad", "latency": "s", "slew": "V/s", "saturation[1]": "V"}
+    for path, unit in paths.items():
+        parameters = {"x": {"target": f"controller/shoulder:{path}"}}
+        found = System.resolve(experiment.replace(parameters=parameters), source=system.source)
+        assert found.parameters.parameters[1].unit == unit
+    assert found.parameters.guess[1] == 20.0
+
+    # Laws with these numbers need no other model.
+    assert System.resolve(experiment, source=system.source).source is system.source
+
+    # The model of another experiment holds no law any more.
+    plain = System.resolve(arm_experiment({}), source=system.source)
+    assert plain.inputs == ("ctrl:shoulder", "ctrl:elbow")
+    assert plain.model.nnumeric == 0
+    assert experiment.packed().controllers == experiment.controllers
+
+
+def test_validation_lists_the_laws() -> None:
+    found = stated_experiment(arm_experiment({"shoulder": PD | {"rate": 250.0}}))
+    (law,) = found.controllers
+    assert (law.actuator, law.rate, law.columns) == ("shoulder", 250.0, ("reference:shoulder",))
+    assert law.is_servo
+
+
+def test_the_names_of_columns_are_those_of_laws() -> None:
+    assert tuple(f"{quantity}:" for quantity in get_args(Quantity)) == LAW_PREFIXES
+
+
+# ---- logs
+
+COLUMNS = ("t", "reference:shoulder", "ctrl:elbow", "qpos:shoulder", "qpos:elbow")
+
+
+def log(folder: Path, names: tuple[str, ...] = COLUMNS, scale: float = 1.0) -> Path:
+    """A log with columns of these names."""
+    t = np.arange(60) * 0.002
+    values = [t, *(scale * np.sin(7.0 * t + i) for i in range(1, len(names)))]
+    path = folder / "log.csv"
+    np.savetxt(path, np.column_stack(values), delimiter=",", header=",".join(names), comments="")
+    return path
+
+
+def test_a_log_with_references_is_read(tmp_path: Path) -> None:
+    system = System.resolve(arm_experiment({"shoulder": PD | {"enable": True}}))
+    spec = {
+        "reference:shoulder": {"column": "goal", "unit": "deg"},
+        "enable:shoulder": 1.0,
+        "qpos:shoulder": "qpos:shoulder",
+    }
+    system = System.resolve(system.experiment.replace(recording={"columns": spec}))
+    names = ("t", "goal", "ctrl:elbow", "qpos:shoulder")
+    found = read_recording(log(tmp_path, names), system.channels)
+
+    t = np.arange(59) * 0.002
+    np.testing.assert_allclose(found.ctrl[:, 0], np.deg2rad(np.sin(7.0 * t + 1)))
+    np.testing.assert_allclose(found.ctrl[:, 1], 1.0)
+    np.testing.assert_allclose(found.ctrl[:, 2], np.sin(7.0 * t + 2))
+    assert found.outputs == ("qpos:shoulder",)
+
+
+# Columns of a log or of the table [recording.columns], and parts of the message.
+LOG_FAULTS: dict[str, tuple[tuple[str, ...], dict[str, Any], tuple[str, ...]]] = {
+    "missing": (
+        ("t", "ctrl:elbow", "qpos:shoulder"),
+        {},
+        ("column 'reference:shoulder' is missing", '[recording.columns] "reference:shoulder"'),
+    ),
+    "both": (
+        (*COLUMNS, "ctrl:shoulder"),
+        {},
+        ("it holds 'ctrl:shoulder' and 'reference:shoulder'", "[controllers.shoulder]"),
+    ),
+    "not read": (
+        (*COLUMNS, "feedforward:shoulder"),
+        {},
+        ("the law of this actuator does not read it", "feedforward = true"),
+    ),
+    "no law": (
+        (*COLUMNS, "reference:elbow"),
+        {},
+        ("states no law for this actuator", "[controllers.elbow]"),
+    ),
+    "stated control": (
+        COLUMNS,
+        {"ctrl:shoulder": "torque"},
+        ("[controllers.shoulder] computes this control", "<actuatorfrc>"),
+    ),
+    "unit": (
+        COLUMNS,
+        {"reference:shoulder": {"column": "reference:shoulder", "unit": "m"}},
+        ("recording.columns.reference:shoulder.unit", "valid: deg, rad, rev"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LOG_FAULTS)
+def test_faults_of_logs_are_named(name: str, tmp_path: Path) -> None:
+    names, columns, fragments = LOG_FAULTS[name]
+    experiment = arm_experiment({"shoulder": PD}, recording={"columns": columns})
+    with pytest.raises((RecordingError, ExperimentError)) as caught:
+        read_recording(log(tmp_path, names), System.resolve(experiment).channels)
+    message = str(caught.value)
+    assert [part for part in fragments if part not in message] == []
+
+
+def test_a_reference_in_degrees_is_refused(tmp_path: Path) -> None:
+    t = np.arange(60) * 0.002
+    wave = np.sin(9.0 * t)
+    values = np.column_stack([t, 57.3 * wave, wave, 0.9 * wave, 0.2 * wave])
+    path = tmp_path / "log.csv"
+    np.savetxt(path, values, delimiter=",", header=",".join(COLUMNS), comments="")
+    experiment = arm_experiment({"shoulder": PD})
+    with pytest.raises(RecordingError, match=r"'reference:shoulder' moves .* probably in deg"):
+        read_recording(path, System.resolve(experiment).channels)
+
+    columns = {"reference:shoulder": {"column": "reference:shoulder", "unit": "rad"}}
+    believed = experiment.replace(recording={"columns": columns})
+    assert read_recording(path, System.resolve(believed).channels).ctrl[:, 0].max() > 20.0
+
+
+# ---- references that an experiment states
+
+
+def test_a_signal_states_references_and_controls() -> None:
+    law = PD | {"reference_velocity": "column", "enable": True, "gain": True, "feedforward": True}
+    control = {"kind": "sine", "amplitude": {"shoulder": 0.3, "elbow": 2.0}, "frequency": 1.0}
+    experiment = arm_experiment(
+        {"shoulder": law}, horizon=1.0, initial={"qpos": (0.2, 0.0), "control": control}
+    )
+    system = System.resolve(experiment)
+    inputs = dict(zip(system.inputs, stated_inputs(system).T, strict=True))
+
+    t = np.arange(500) * 0.002
+    np.testing.assert_allclose(inputs["reference:shoulder"], 0.2 + 0.3 * np.sin(2 * np.pi * t))
+    velocity = 0.6 * np.pi * np.cos(2 * np.pi * t)
+    np.testing.assert_allclose(inputs["reference_velocity:shoulder"], velocity, atol=2e-2)
+    np.testing.assert_allclose(inputs["ctrl:elbow"], 2.0 * np.sin(2.34 * np.pi * t))
+    assert (inputs["enable:shoulder"] == 1.0).all()
+    assert (inputs["gain:shoulder"] == 1.0).all()
+    assert (inputs["feedforward:shoulder"] == 0.0).all()
+
+
+def test_simulate_refuses_inputs_of_another_width() -> None:
+    with pytest.raises(MjfimError, match="expected a row for each sample with 2 columns"):
+        mjfim.simulate(arm_experiment({"shoulder": PD}), np.zeros((10, 3)))
+
+
+def test_an_actuator_without_a_joint_needs_one(tmp_path: Path) -> None:
+    text = (MODELS / "two_joint_arm.xml").read_text()
+    text = text.replace('<geom name="fore"', '<site name="tip"/><geom name="fore"')
+    text = text.replace('<motor name="elbow" joint="elbow"/>', '<motor name="elbow" site="tip"/>')
+    path = tmp_path / "arm.xml"
+    path.write_text(text)
+    with pytest.raises(ExperimentError, match=r"controllers\.elbow\.joint = 'shoulder'"):
+        System.resolve(arm_experiment({"elbow": PD}, model=str(path)))
+
+    system = System.resolve(arm_experiment({"elbow": PD | {"joint": "elbow"}}, model=str(path)))
+    assert system.laws is not None
+    assert system.laws.laws[0].joint == "elbow"

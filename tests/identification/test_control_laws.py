@@ -1,0 +1,497 @@
+"""Fits of closed loops from logs that hold references: laws, gains and latencies as unknowns."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.experiment.system import System
+from mjfim.identification import segment_simulation
+from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_workers import FitWorkers
+from mjfim.identification.identify import least_squares
+from mjfim.output.mjcf.write import write_identified
+from mjfim.recordings.read import read_recording
+from mjfim.records.recording import Recording
+from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
+from tests.support.executors import LosingThreads
+from tests.support.paths import MODELS, SHARED_DATA, SHARED_MODELS
+from tests.support.shared_models import PANDA
+
+NOISE = {"qpos:shoulder": 1e-3, "qpos:elbow": 1e-3}
+
+# Laws of both joints; the driver of the elbow takes commands faster than that of the shoulder.
+SHOULDER = {"kp": 50.0, "kd": 3.0, "rate": 250.0, "saturation": (-15.0, 15.0)}
+ELBOW = {"kp": 25.0, "kd": 1.0, "rate": 500.0}
+
+# The plant and nuisance gains, with guesses that are wrong by some ten percent.
+PLANT = {
+    "mass": {"target": "body/fore:mass", "true": 1.2, "guess": 1.0},
+    "damping": {"target": "joint/elbow:damping", "true": 0.3, "guess": 0.5},
+}
+GAINS: dict[str, Any] = {
+    "kp1": {"target": "controller/shoulder:kp", "true": 60.0, "guess": 50.0, "nuisance": True},
+    "kp2": {"target": "controller/elbow:kp", "true": 30.0, "guess": 25.0, "nuisance": True},
+    "kd2": {"target": "controller/elbow:kd", "true": 1.5, "guess": 1.0, "nuisance": True},
+    "latency": {
+        "targets": (
+            {"path": "controller/shoulder:latency"},
+            {"path": "controller/elbow:latency"},
+        ),
+        "true": 0.0063,
+        "guess": 0.003,
+        "nuisance": True,
+    },
+}
+
+
+def references(samples: int, seed: int, width: int = 2, steps: float = 0.3) -> np.ndarray:
+    """(samples, width) smooth references with steps of this size, at 500 Hz [rad]."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(samples)[:, None] / 500.0
+    waves = sum(np.sin(2 * np.pi * 0.7 * k * t + rng.uniform(0, 6, width)) / k for k in range(1, 6))
+    jumps = t > rng.uniform(0.1, 0.9, width) * samples / 500.0
+    return np.asarray(0.25 * waves + jumps * rng.uniform(-steps, steps, width))
+
+
+def recorded(experiment: mjfim.Experiment, samples: int, seed: int) -> Recording:
+    """A noisy log of a closed loop at the true parameters."""
+    width = len(System.resolve(experiment).inputs)
+    return mjfim.simulate(experiment, references(samples, seed, width), seed)
+
+
+def exact(system: System, inputs: np.ndarray) -> Recording:
+    """A log of a closed loop at the true parameters, without noise."""
+    y, finite = system.plant.measure(system.parameters.true[None], inputs)
+    assert finite.all()
+    t = np.arange(len(inputs) + 1) * system.dt
+    return Recording(t=t, ctrl=inputs, y=y[0], outputs=system.outputs.names, name="exact")
+
+
+def test_plant_gains_and_latency_are_found_from_references_alone() -> None:
+    laws = {"shoulder": SHOULDER, "elbow": ELBOW}
+    experiment = arm_experiment(
+        laws, parameters={**PLANT, **GAINS}, noise=NOISE, fit={"bootstrap": 0}
+    )
+    true = System.resolve(experiment).parameters.true
+
+    found = mjfim.identify(experiment, [recorded(experiment, 700, 1)], progress=False)
+
+    assert found.success
+    assert not found.misfit
+    assert np.abs((found.theta - true) / found.std).max() < 4.0
+    assert (found.std < 0.05 * np.abs(true))[[0, 2, 3, 5]].all()
+
+    # The estimate says which laws ran in the loop, with the identified numbers.
+    shoulder, elbow = found.controllers
+    assert shoulder.rate == 250.0
+    assert shoulder.numbers["kp"] == found.theta[2]
+    assert shoulder.estimated == ("kp", "latency")
+    assert elbow.columns == ("reference:elbow",)
+    assert "latency" in shoulder.toml
+    assert found.summary()["controllers"][0]["numbers"]["kp"] == found.theta[2]
+
+
+def test_the_law_at_another_rate_does_not_explain_a_log() -> None:
+    """The rate matters: a slow law brakes less, and the plant would be blamed for it."""
+    laws = {"shoulder": {**SHOULDER, "rate": 50.0}, "elbow": ELBOW}
+    experiment = arm_experiment(laws, parameters=PLANT, noise=NOISE)
+    log = recorded(experiment, 500, 2)
+    wrong = experiment.replace(controllers={"shoulder": {**SHOULDER, "rate": 500.0}})
+
+    costs = []
+    for stated in (experiment, wrong):
+        problem = FitProblem.of(System.resolve(stated), [log])
+        costs.append(least_squares(problem, problem.system.parameters.guess).cost)
+
+    count = 2 * len(log.t)
+    assert 2.0 * costs[0] < 1.1 * count
+    assert 2.0 * costs[1] > 1.5 * count
+
+
+@pytest.mark.parametrize("of_a_fit", [False, True])
+def test_derivatives_agree_with_differences_of_a_plain_loop(of_a_fit: bool) -> None:
+    """By gains and all times of the law, of a simulation and of a fit."""
+    law = {
+        "kp": 60.0,
+        "kd": 4.0,
+        "rate": 250.0,
+        "latency": 0.0051,
+        "time_constant": 0.011,
+        "feedback_latency": 0.0057,
+        "velocity": "difference",
+        "velocity_time_constant": 0.004,
+        "saturation": (-40.0, 40.0),
+    }
+    names = ("kp", "kd", "latency", "time_constant", "feedback_latency", "velocity_time_constant")
+    parameters = {name: {"target": f"controller/shoulder:{name}"} for name in names}
+    experiment = arm_experiment({"shoulder": law}, parameters=parameters, noise=NOISE)
+    system = System.resolve(experiment)
+    inputs = references(200, 3)
+    guess = system.parameters.guess
+    model = system.plant.model(guess)
+
+    def plain(values: np.ndarray) -> np.ndarray:
+        """(samples + 1, 2) positions by the plain loop."""
+        made = PlainLaw(joint="shoulder", tick=4, low=-40.0, high=40.0, difference=True)
+        for name, value in zip(names, values, strict=True):
+            setattr(made, name, value)
+        columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
+        states, _ = simulate(model, {0: made}, columns, system.dt, len(inputs), np.zeros(4))
+        return states[:, :2]
+
+    expected = np.empty((len(inputs) + 1, 2, len(names)))
+    for j in range(len(names)):
+        step = np.zeros(len(names))
+        step[j] = 1e-4 * guess[j]
+        expected[..., j] = (plain(guess + step) - plain(guess - step)) / (2 * step[j])
+
+    if not of_a_fit:
+        predicted = system.plant.derivatives.predict(guess, inputs)
+        assert predicted is not None
+        found = predicted[1]
+    else:
+        problem = FitProblem.of(system, [exact(system, inputs)])
+        batch = next(problem.simulation.batches(derivatives=True))
+        (rows,) = problem.simulation.rows_of_batch(problem.begin(guess), batch)
+        assert rows is not None
+        found = rows.jacobians[0]
+    size = np.abs(expected).max(axis=(0, 1))
+    assert (size * guess > 1e-4).all()
+    np.testing.assert_allclose(found / size, expected / size, atol=2e-4)
+
+
+@pytest.mark.parametrize(("off", "tolerance"), [(0, 4e-4), (50, 2e-3)])
+def test_segments_know_the_integral_of_the_law(off: int, tolerance: float) -> None:
+    """The log shows the integral at the begin of a segment: errors, latencies and the first one.
+
+    What is left is the acceleration during the latency of the feedback before a segment, and
+    that references count as at rest before the law was switched on.
+    """
+    law = {
+        "kp": 40.0,
+        "kd": 3.0,
+        "ki": 150.0,
+        "integral": 1.2,
+        "rate": 250.0,
+        "latency": 0.006,
+        "time_constant": 0.012,
+        "feedback_latency": 0.003,
+        "enable": True,
+    }
+    parameters = {"ki": {"target": "controller/shoulder:ki"}, **PLANT}
+    experiment = arm_experiment({"shoulder": law}, parameters=parameters, noise=NOISE)
+    system = System.resolve(experiment.replace(fit={"segments": 0.2}))
+    inputs = references(1000, 4, 3, steps=0.0)
+    inputs[:, 1] = 1.0
+    inputs[400 : 400 + off, 1] = 0.0
+    log = exact(system, inputs)
+
+    problem = FitProblem.of(system, [log])
+    states = system.plant.simulate(system.parameters.true, inputs).state
+    segments = tuple(replace(each, start=states[each.begin]) for each in problem.segments)
+    assert len(segments) == 10
+
+    def error(recording: AlignedRecording) -> float:
+        """Largest error of the prediction from the true states at the begins."""
+        simulation = replace(problem.simulation, segments=segments, recordings=(recording,))
+        known = replace(problem, simulation=simulation)
+        predicted = known.predict(known.begin(system.parameters.true))
+        assert predicted is not None
+        return float(np.abs(predicted[0] - log.y).max())
+
+    (recording,) = problem.recordings
+    assert error(recording) < tolerance
+
+    # Without the integral at their begins, segments would not follow.
+    forgotten = np.array(recording.ctrl)
+    forgotten[:, 3:] = 0.0
+    assert error(replace(recording, ctrl=forgotten)) > 0.02
+
+
+@pytest.mark.parametrize("fit", [{}, {"segments": 0.25}], ids=["whole", "segments"])
+def test_a_fit_on_workers_is_the_same_to_the_last_digit(
+    fit: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(segment_simulation, "MAX_NUMBERS_AT_ONCE", 20_000)
+    laws = {"shoulder": {**SHOULDER, "ki": 20.0, "time_constant": 0.01}, "elbow": ELBOW}
+    experiment = arm_experiment(laws, parameters={**PLANT, **GAINS}, noise=NOISE, fit=fit)
+    logs = [recorded(experiment, 300, seed) for seed in range(3)]
+    problem = FitProblem.of(System.resolve(experiment, threads=1), logs)
+    at = problem.begin(problem.system.parameters.guess)
+    cost, condensed = problem.cost(at), problem.condense(at)
+
+    with LosingThreads() as threads:
+        divided = problem.on_workers(FitWorkers(threads))
+        divided_cost, found = divided.cost(at), divided.condense(at)
+
+    assert threads.submitted > 4
+    assert divided_cost == cost
+    assert condensed is not None
+    assert found is not None
+    assert np.array_equal(found.blocks, condensed.blocks)
+
+
+def test_a_check_of_a_log_knows_the_law() -> None:
+    """Gain of the motor and gains of the law have one effect, which no reference tells apart."""
+    motor = {"target": "actuator/shoulder:gainprm[0]", "guess": 1.0}
+    kp = {"target": "controller/shoulder:kp"}
+    kd = {"target": "controller/shoulder:kd"}
+    experiment = arm_experiment(
+        {"shoulder": {**SHOULDER, "saturation": (-90.0, 90.0), "gain": True}},
+        parameters={"motor": motor, "kp": kp, "kd": kd, **PLANT},
+        noise=NOISE,
+    )
+    inputs = 0.2 * references(400, 5, 3, steps=0.0)
+    inputs[:, 1] = 1.0
+    found = mjfim.check(experiment, [mjfim.simulate(experiment, inputs)], progress=False)
+
+    (group,) = found.not_separable
+    assert set(group.members) == {"motor", "kp", "kd"}
+    assert found.self_test.passed
+    mass = next(row for row in found.rows if row.name == "mass")
+    assert np.isfinite(mass.std)
+
+
+def test_the_identified_model_has_no_law(tmp_path: Path) -> None:
+    experiment = arm_experiment(
+        {"shoulder": SHOULDER}, parameters={**PLANT, "kp": {"target": "controller/shoulder:kp"}}
+    )
+    system = System.resolve(experiment)
+    remark = write_identified(tmp_path / "identified.xml", system, np.array([1.1, 0.4, 55.0]))
+
+    assert remark is not None
+    assert "without the control laws of shoulder" in remark
+    text = (tmp_path / "identified.xml").read_text()
+    assert "numeric" not in text
+    assert 'mass="1.1"' in text
+
+
+def test_an_unstable_loop_is_explained(tmp_path: Path) -> None:
+    path = tmp_path / "strong.xml"
+    path.write_text(ARM.read_text().replace('<motor ctrlrange="-20 20"/>', ""))
+    law = {"kp": 1.0, "kd": 1e4}
+    experiment = arm_experiment({"shoulder": law}, parameters=PLANT, model=str(path))
+    with pytest.raises(SimulationDivergedError, match=r"loop of the model and the control laws"):
+        mjfim.simulate(experiment, references(100, 7))
+
+
+def servo_experiments() -> tuple[mjfim.Experiment, mjfim.Experiment]:
+    """The XL330 servo with three controls that a log yields, and with the law of its firmware."""
+    linear = mjfim.Experiment.from_file(MODELS / "bam_xl330.toml")
+    values = linear.model_dump(exclude_unset=True)
+    values["parameters"]["gain"] = {
+        "target": "actuator/pull:gainprm[0]",
+        "bounds": (0.01, 0.3),
+        "unit": "N m/V",
+    }
+    values["controllers"] = {
+        "pull": {
+            "kind": "voltage",
+            "kp": 0.02129259351647504,
+            "rate": 1000.0,
+            "saturation": (-7.4, 7.4),
+            "gain": True,
+            "enable": True,
+        }
+    }
+    values["recording"]["columns"] = {
+        "ctrl:stiffness": 0.0,
+        "reference:pull": "goal_position",
+        "gain:pull": "kp",
+        "enable:pull": "torque_enable",
+        "ctrl:brake": "torque_enable",
+        "angle": "position",
+    }
+    return linear, linear.restated(values)
+
+
+def servo_log(folder: Path, enabled: slice) -> Path:
+    """A log with the columns of BAM, whose rows lie on the engine's steps."""
+    t = np.arange(0, 1000, 5) / 1000.0
+    rows = {
+        "timestamp": t,
+        "position": 0.1 * np.sin(9.0 * t),
+        "goal_position": 0.6 * np.sin(9.0 * t) * np.sin(2.0 * t),
+        "torque_enable": np.isin(np.arange(len(t)), np.arange(len(t))[enabled]).astype(float),
+        "kp": np.full(len(t), 400.0),
+    }
+    path = folder / "log.csv"
+    lines = [
+        ",".join(rows),
+        *(",".join(map(repr, row)) for row in zip(*rows.values(), strict=True)),
+    ]
+    path.write_text("\n".join(lines).replace("np.float64(", "").replace(")", "") + "\n")
+    return path
+
+
+@pytest.mark.parametrize("enabled", [slice(0, None), slice(0, 120)], ids=["on", "switched off"])
+def test_a_duty_law_equals_the_same_law_as_three_controls(tmp_path: Path, enabled: slice) -> None:
+    """The firmware's law on volts, and affine actuators of MJCF whose controls a log yields."""
+    path = servo_log(tmp_path, enabled)
+    outputs = []
+    for stated in servo_experiments():
+        stated = stated.replace(recording={"records": None})
+        system = System.resolve(stated)
+        problem = FitProblem.of(system, [read_recording(path, system.channels)])
+        predicted = problem.predict(problem.begin(system.parameters.guess))
+        assert predicted is not None
+        outputs.append(predicted[0][:, 0])
+
+    np.testing.assert_allclose(outputs[1], outputs[0], atol=1e-12)
+    assert np.ptp(outputs[0]) > 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="measured recordings are not here")
+def test_a_duty_law_predicts_measured_logs_as_three_controls() -> None:
+    """Where the torque is switched off inside an engine step, both differ by this step."""
+    logs = sorted((SHARED_DATA / "bam_xl330" / "raw").glob("*.json"))[:3]
+    differences = []
+    for log in logs:
+        outputs = []
+        for stated in servo_experiments():
+            system = System.resolve(stated)
+            problem = FitProblem.of(system, [read_recording(log, system.channels)])
+            predicted = problem.predict(problem.begin(system.parameters.guess))
+            assert predicted is not None
+            outputs.append(predicted[0])
+        differences.append(np.abs(outputs[1] - outputs[0]).max())
+    assert sorted(differences)[1] < 1e-10
+    assert max(differences) < 2e-3
+
+
+@pytest.mark.slow
+def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
+    """Repetitions with whole recordings, and intervals of fits over segments."""
+    experiment = arm_experiment(
+        {"shoulder": SHOULDER, "elbow": ELBOW}, parameters={**PLANT, **GAINS}, noise=NOISE
+    )
+    system = System.resolve(experiment)
+    true = system.parameters.true
+    trajectory = system.plant.simulate(true, references(400, 11))
+
+    study = mjfim.monte_carlo(experiment, trajectory, trials=200, seed=1, progress=False)
+
+    found = study.sets["final"]
+    assert found.failed == 0
+    spread = np.sqrt(np.diag(found.covariance) / found.trials)
+    assert np.abs((found.mean - true) / spread).max() < 4.0
+    assert (found.efficiency > 0.6).all()
+    assert (found.efficiency < 1.4).all()
+
+    inside = []
+    for seed in range(20):
+        log = recorded(experiment, 400, 100 + seed)
+        settings = {"segments": 0.2, "bootstrap": 200}
+        estimate = mjfim.identify(experiment.replace(fit=settings), [log], progress=False)
+        low, high = estimate.interval.T
+        inside.append((low < true) & (true < high))
+    assert np.mean(inside) > 0.87
+
+
+def panda_with_motors(folder: Path) -> Path:
+    """The Panda with motors in place of servos, rotors and viscous friction, at 1 kHz."""
+    text = (SHARED_MODELS / "menagerie_panda" / "panda_nohand_nomesh.xml").read_text()
+    ranges = [87] * 4 + [12] * 3
+    motors = [
+        f'<motor name="{joint}" joint="{joint}" ctrlrange="{-force} {force}"/>'
+        for joint, force in zip(PANDA, ranges, strict=True)
+    ]
+    block = f"<actuator>{''.join(motors)}</actuator>"
+    text = re.sub(r"<actuator>.*?</actuator>", block, text, flags=re.DOTALL)
+    text = re.sub(r"<keyframe>.*?</keyframe>", "", text, flags=re.DOTALL)
+    text = text.replace("<option ", '<option timestep="0.001" ')
+    joint = '<joint range="-2.8973 2.8973"'
+    text = text.replace(joint, f'{joint} armature="0.1" damping="1"', 1)
+    path = folder / "panda.xml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SHARED_MODELS.is_dir(), reason="the models of others are not here")
+def test_a_seven_joint_arm_with_feedforward(tmp_path: Path) -> None:
+    """Payload, friction, all gains and the latency of the Panda's drivers, from references."""
+    path = panda_with_motors(tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    home = np.array([0.0, -0.4, 0.0, -1.9, 0.0, 1.57, -0.785])
+    kp, kd = (600, 600, 600, 600, 250, 150, 50), (50, 50, 50, 30, 30, 25, 15)
+    mass = float(model.body("link7").mass[0])
+
+    parameters: dict[str, Any] = {"mass": {"target": "body/link7:mass", "true": 1.4 * mass}}
+    controllers, noise = {}, {}
+    for i, joint in enumerate(PANDA):
+        law = {"kp": 0.85 * kp[i], "kd": float(kd[i]), "feedforward": True, "rate": 1000.0}
+        controllers[joint] = law
+        noise[f"qpos:{joint}"] = 2e-4
+        damping = {"target": f"joint/{joint}:damping", "true": 1.0 + 0.1 * i}
+        gain = {"target": f"controller/{joint}:kp", "true": float(kp[i]), "nuisance": True}
+        parameters |= {f"damping{i}": damping, f"kp{i}": gain}
+    times = tuple({"path": f"controller/{joint}:latency"} for joint in PANDA)
+    parameters["latency"] = {"targets": times, "guess": 0.002, "true": 0.0047, "nuisance": True}
+    experiment = mjfim.Experiment(
+        model=str(path),
+        rate=250.0,
+        initial={"qpos": tuple(home)},
+        parameters=parameters,
+        noise=noise,
+        controllers=controllers,
+    )
+
+    # Commands of a robot: smooth references, and the torque of gravity along them.
+    t = np.arange(500)[:, None] / 250.0
+    phases = np.random.default_rng(0).uniform(0, 6, (5, 7))
+    waves = [(np.sin(np.pi * k * t + p) - np.sin(p)) / k for k, p in enumerate(phases, 1)]
+    reference = home + 0.25 * sum(waves)
+    data = mujoco.MjData(model)
+    inputs = np.zeros((len(t), 14))
+    for row, position in zip(inputs, reference, strict=True):
+        data.qpos[:], data.qvel[:] = position, 0.0
+        mujoco.mj_forward(model, data)
+        row[0::2], row[1::2] = position, data.qfrc_bias
+
+    log = mjfim.simulate(experiment, inputs, seed=1)
+    found = mjfim.identify(experiment, [log], progress=False)
+
+    true = System.resolve(experiment).parameters.true
+    assert not found.misfit
+    assert np.abs((found.theta - true) / found.std).max() < 4.0
+    assert found.std[0] < 0.01 * true[0]
+    assert len(found.controllers) == 7
+
+
+def test_a_law_acts_on_a_motor_with_a_lag() -> None:
+    """No log shows what a law commands, so that the state of the lag is free in every segment."""
+    terms = {"lag": {"kind": "actuator_lag", "actuator": "shoulder"}}
+    lag = {"target": "term/lag:time_constant", "true": 0.02, "guess": 0.01}
+    experiment = arm_experiment(
+        {"shoulder": SHOULDER}, terms=terms, parameters={**PLANT, "lag": lag}, noise=NOISE
+    )
+    log = recorded(experiment, 500, 8)
+    problem = FitProblem.of(System.resolve(experiment.replace(fit={"segments": 0.25})), [log])
+    assert problem.simulation.private_count == 5
+
+    found = least_squares(problem, problem.system.parameters.guess)
+
+    theta = problem.theta(found.unknowns)
+    true = problem.system.parameters.true
+    assert np.abs(theta / true - 1.0).max() < 0.2
+    assert abs(theta[2] - 0.02) < 1e-3
+    assert 2.0 * found.cost < 1.15 * problem.value_count
+
+
+def test_the_equation_of_motion_is_refused() -> None:
+    """It needs the controls, which the log of a closed loop does not hold."""
+    experiment = arm_experiment({"shoulder": SHOULDER}, parameters=PLANT, noise=NOISE)
+    with pytest.raises(ExperimentError, match="a law computes them from the motion"):
+        mjfim.inverse_dynamics(experiment, [recorded(experiment, 100, 9)])

@@ -1,0 +1,307 @@
+"""Control laws in the loop, against a plain loop over engine steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.experiment.system import System
+from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.plant.input_context import InputContext
+from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
+
+# The arm with a sensor of the torque of the shoulder's motor.
+SENSED_ARM = ARM.read_text().replace(
+    "<keyframe>",
+    '<sensor><actuatorfrc name="torque" actuator="shoulder" noise="0.1"/></sensor><keyframe>',
+)
+
+SAMPLES = 120
+START = np.array([0.3, -0.2, 0.5, -0.8])
+
+# Laws of the shoulder, with the keys of the experiment file.
+LAWS: dict[str, dict[str, Any]] = {
+    "pd": {"kp": 60.0, "kd": 4.0},
+    "slow": {"kp": 30.0, "kd": 2.0, "rate": 100.0},
+    "unequal": {"kp": 30.0, "kd": 2.0, "rate": 1000.0 / 3.0},
+    "late": {"kp": 60.0, "kd": 4.0, "rate": 250.0, "latency": 0.0137},
+    "linear": {"kp": 60.0, "kd": 4.0, "rate": 1000.0, "latency": 0.0031, "interpolation": "linear"},
+    "shaped": {"kp": 60.0, "kd": 4.0, "time_constant": 0.02, "latency": 0.005},
+    "late feedback": {"kp": 40.0, "kd": 1.0, "rate": 250.0, "feedback_latency": 0.0063},
+    "differences": {
+        "kp": 40.0,
+        "kd": 2.0,
+        "rate": 250.0,
+        "velocity": "difference",
+        "velocity_time_constant": 0.006,
+        "feedback_latency": 0.0013,
+        "reference_velocity": "difference",
+    },
+    "integral": {"kp": 40.0, "kd": 3.0, "ki": 200.0, "integral": 1.5, "integral_limit": 4.0},
+    "limited": {"kp": 60.0, "kd": 4.0, "saturation": (-3.0, 5.0), "slew": 150.0, "rate": 250.0},
+    "columns": {
+        "kp": 20.0,
+        "kd": 2.0,
+        "ki": 50.0,
+        "feedforward": True,
+        "gain": True,
+        "enable": True,
+        "reference_velocity": "column",
+        "latency": 0.0027,
+        "time_constant": 0.01,
+    },
+}
+
+
+def plain(law: dict[str, Any], joint: str) -> PlainLaw:
+    """The law of a table for the plain loop."""
+    values = dict(law)
+    low, high = values.pop("saturation", (-20.0, 20.0))
+    made = PlainLaw(joint=joint, tick=round(1000.0 / values.pop("rate", 500.0)), low=low, high=high)
+    made.linear = values.pop("interpolation", "held") == "linear"
+    made.difference = values.pop("velocity", "model") == "difference"
+    made.reference_difference = values.pop("reference_velocity", "none") == "difference"
+    for name in ("feedforward", "gain", "enable"):
+        values.pop(name, None)
+    for name, value in values.items():
+        assert hasattr(made, name)
+        setattr(made, name, value)
+    return made
+
+
+def signals(system: System, seed: int = 0) -> np.ndarray:
+    """(SAMPLES, w) inputs that change all the time: references with steps, factors, controls."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(SAMPLES) * system.dt
+    inputs = np.zeros((SAMPLES, len(system.inputs)))
+    for i, name in enumerate(system.inputs):
+        quantity = name.partition(":")[0]
+        wave = 0.3 * np.sin(2 * np.pi * rng.uniform(2.0, 5.0) * t) + 0.4 * (
+            t > rng.uniform(0.05, 0.15)
+        )
+        inputs[:, i] = wave
+        if quantity == "gain":
+            inputs[:, i] = 1.0 + 0.5 * (t > 0.1)
+        if quantity == "enable":
+            inputs[:, i] = (t < 0.08) | (t > 0.14)
+    return inputs
+
+
+def oracle(system: System, law: dict[str, Any], inputs: np.ndarray) -> np.ndarray:
+    """(SAMPLES + 1, ns) states by the plain loop."""
+    theta = system.parameters.guess
+    columns: dict[int, dict[str, np.ndarray]] = {0: {}, 1: {}}
+    for name, column in zip(system.inputs, inputs.T, strict=True):
+        quantity, _, actuator = name.partition(":")
+        columns[("shoulder", "elbow").index(actuator)][quantity] = column
+    states, _ = simulate(
+        system.plant.model(theta), {0: plain(law, "shoulder")}, columns, system.dt, SAMPLES, START
+    )
+    return states
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_equals_a_plain_loop(name: str) -> None:
+    system = System.resolve(arm_experiment({"shoulder": LAWS[name]}))
+    inputs = signals(system)
+    model = system.plant.model(system.parameters.guess)
+
+    found = system.plant.simulator.rollout([model], START[None], inputs[None])
+
+    assert found.finite.all()
+    expected = oracle(system, LAWS[name], inputs)
+    np.testing.assert_allclose(found.states[0], expected, atol=1e-11)
+
+    # The law has an effect, so that a wrong law would be seen.
+    assert np.abs(expected - oracle(system, {"kp": 0.0}, inputs)).max() > 0.05
+
+
+def test_simulations_of_one_batch_have_their_own_numbers() -> None:
+    """Gains, latencies and start states of one batch differ, and so do the results."""
+    law = LAWS["late feedback"] | {"latency": 0.003, "time_constant": 0.01, "ki": 20.0}
+    system = System.resolve(arm_experiment({"shoulder": law, "elbow": LAWS["slow"]}))
+    numbers = [{}, {"kp": 55.0}, {"latency": 0.0081}, {"feedback_latency": 0.0139, "ki": 40.0}]
+    models, expected = [], []
+    inputs = np.stack([signals(system, seed) for seed in range(4)])
+    for i, changed in enumerate(numbers):
+        other = System.resolve(arm_experiment({"shoulder": law | changed, "elbow": LAWS["slow"]}))
+        models.append(other.plant.model(other.parameters.guess))
+        columns = {0: {"reference": inputs[i, :, 0]}, 1: {"reference": inputs[i, :, 1]}}
+        laws = {0: plain(law | changed, "shoulder"), 1: plain(LAWS["slow"], "elbow")}
+        start = START * (1.0 + 0.1 * i)
+        states, _ = simulate(models[i], laws, columns, system.dt, SAMPLES, start)
+        expected.append(states)
+
+    starts = np.stack([START * (1.0 + 0.1 * i) for i in range(4)])
+    found = system.plant.simulator.rollout(models, starts, inputs)
+
+    np.testing.assert_allclose(found.states, expected, atol=1e-11)
+    assert np.abs(np.diff(found.states, axis=0)).max(axis=(1, 2)).min() > 1e-3
+
+
+def test_a_law_on_the_voltage_of_a_motor_with_a_current(tmp_path: Path) -> None:
+    """A <dcmotor> turns the voltage into a torque, with back-EMF and inductance."""
+    motor = (
+        '<dcmotor name="shoulder" joint="shoulder" motorconst="0.8 0.8" resistance="2" '
+        'inductance="0.01 0" ctrlrange="-24 24"/>'
+    )
+    path = tmp_path / "electric.xml"
+    path.write_text(ARM.read_text().replace('<motor name="shoulder" joint="shoulder"/>', motor))
+    law = {"kp": 80.0, "kd": 2.0, "rate": 250.0}
+    stated = {"shoulder": {**law, "kind": "voltage"}}
+    system = System.resolve(arm_experiment(stated, model=str(path)))
+    inputs = signals(system)
+    model = system.plant.model(system.parameters.guess)
+    assert model.na == 1
+    start = np.append(START, 0.4)
+
+    found = system.plant.simulator.rollout([model], start[None], inputs[None])
+
+    made = plain({**law, "saturation": (-24.0, 24.0)}, "shoulder")
+    columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
+    states, _ = simulate(model, {0: made}, columns, system.dt, SAMPLES, start)
+    np.testing.assert_allclose(found.states[0], states, atol=1e-11)
+
+
+def test_parameters_that_need_a_compile_keep_the_law(tmp_path: Path) -> None:
+    """The numbers of the law are in the model that is compiled anew."""
+    geom = '<geom name="rod" type="box" size="0.02 0.02 0.1" pos="0 0 -0.1" mass="1.2"/>'
+    text = ARM.read_text()
+    first = text.index('<inertial pos="0 0 -0.15"')
+    text = text[:first] + geom + text[text.index('<joint name="elbow"') :]
+    path = tmp_path / "rod.xml"
+    path.write_text(text)
+    parameters = {
+        "size": {"target": "geom/rod:size[2]"},
+        "kp": {"target": "controller/shoulder:kp"},
+    }
+    experiment = arm_experiment({"shoulder": LAWS["pd"]}, parameters=parameters, model=str(path))
+    plant = System.resolve(experiment).plant
+    models = plant.models(np.array([[0.1, 60.0], [0.12, 40.0]]))
+    inputs = signals(System.resolve(experiment))
+    found = plant.simulator.rollout(models, np.stack([START] * 2), np.stack([inputs] * 2))
+    for i, kp in enumerate((60.0, 40.0)):
+        columns = {0: {"reference": inputs[:, 0]}, 1: {"ctrl": inputs[:, 1]}}
+        laws = {0: plain({**LAWS["pd"], "kp": kp}, "shoulder")}
+        states, _ = simulate(models[i], laws, columns, plant.dt, SAMPLES, START)
+        np.testing.assert_allclose(found.states[i], states, atol=1e-11)
+
+
+def test_measured_forces_are_those_of_the_law(tmp_path: Path) -> None:
+    """A force sensor shows the control that the law has computed at the same instant."""
+    path = tmp_path / "sensed.xml"
+    path.write_text(SENSED_ARM)
+    experiment = arm_experiment({"shoulder": LAWS["pd"]}, noise={"state": 1e-4, "torque": 0.1})
+    system = System.resolve(experiment.replace(model=str(path)))
+    inputs = signals(system)
+    found = system.plant.simulator.rollout(
+        [system.plant.model(system.parameters.guess)], START[None], inputs[None]
+    )
+    assert found.sensors is not None
+    q, v = found.states[0, :-1, 0], found.states[0, :-1, 2]
+    expected = np.clip(60.0 * (inputs[:, 0] - q) - 4.0 * v, -20.0, 20.0)
+    np.testing.assert_allclose(found.sensors[0, :-1, 0], expected, atol=1e-11)
+    assert np.ptp(expected) > 10.0
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_intervals_equal_one_rollout(name: str) -> None:
+    """Long curves are simulated in intervals, between which laws remember everything."""
+    system = System.resolve(arm_experiment({"shoulder": LAWS[name], "elbow": LAWS["slow"]}))
+    plant, theta = system.plant, system.parameters.guess
+    inputs = signals(system)
+    whole = plant.simulator.rollout([plant.model(theta)], START[None], inputs[None])
+
+    # An interval of 7 samples is no whole number of ticks of the slower law.
+    numbers = 7 * system.grid.substeps * (1 + len(START))
+    padded = np.concatenate([np.repeat(inputs[:1], plant.lead(theta), axis=0), inputs])
+    parts = list(
+        plant.derivatives.responses(
+            theta,
+            START[None],
+            padded[None],
+            lead=plant.lead(theta),
+            samples=np.array([-plant.lead(theta)]),
+            max_numbers=numbers,
+        )
+    )
+
+    assert len(parts) == -(-SAMPLES // 7)
+    for part in parts:
+        assert part is not None
+        expected = whole.states[0, part.first : part.first + part.y.shape[1]]
+        np.testing.assert_allclose(part.y[0], expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["pd", "slow", "late", "linear", "shaped", "columns"])
+def test_a_curve_may_begin_inside_a_recording(name: str) -> None:
+    """A curve that begins at a tick continues the motion; laws here remember commands only."""
+    law = {**LAWS[name], "ki": 0.0}
+    system = System.resolve(arm_experiment({"shoulder": law}))
+    plant, theta = system.plant, system.parameters.guess
+    inputs = signals(system)
+    model = plant.model(theta)
+    whole = plant.simulator.rollout([model], START[None], inputs[None]).states[0]
+
+    begin, lead = 55, plant.lead(theta)
+    before = max(begin - lead, 0)
+    context = InputContext(
+        before=inputs[None, before:begin], after=inputs[None, :0], samples=np.array([begin])
+    )
+    found = plant.simulator.rollout(
+        [model], whole[None, begin], inputs[None, begin:], context=context
+    )
+    np.testing.assert_allclose(found.states[0], whole[begin:], atol=1e-9)
+
+
+def test_curves_that_begin_between_ticks_hold_the_control_of_the_tick_before() -> None:
+    """Their order in a batch does not matter, and the error is that of the state at the tick."""
+    law = {"kp": 30.0, "kd": 2.0, "rate": 50.0}
+    system = System.resolve(arm_experiment({"shoulder": law}))
+    plant = system.plant
+    model = plant.model(system.parameters.guess)
+    inputs = signals(system)
+    whole = plant.simulator.rollout([model], START[None], inputs[None]).states[0]
+
+    begins = np.array([40, 43, 47, 50])
+    context = InputContext(
+        before=np.stack([inputs[b - 20 : b] for b in begins]),
+        after=inputs[None, :0].repeat(4, axis=0),
+        samples=begins,
+    )
+    ctrl = np.stack([inputs[b : b + 40] for b in begins])
+    found = plant.simulator.rollout([model], whole[begins], ctrl, context=context)
+
+    error = [np.abs(found.states[i] - whole[b : b + 41]).max() for i, b in enumerate(begins)]
+    assert max(error[0], error[3]) < 1e-11
+    assert 1e-6 < max(error[1], error[2]) < 0.1
+    alone = plant.simulator.rollout(
+        [model], whole[None, 43], ctrl[1:2], context=context.of_curves(np.array([1]))
+    )
+    np.testing.assert_array_equal(alone.states[0], found.states[1])
+
+
+def test_a_diverging_loop_is_found() -> None:
+    """A gain that is too large for the period of the law makes one of two loops unstable."""
+    law = {"kp": 1.0, "kd": 1e4, "saturation": (-1e9, 1e9)}
+    system = System.resolve(arm_experiment({"shoulder": law}))
+    stable = System.resolve(arm_experiment({"shoulder": LAWS["pd"]}))
+    models = [each.plant.model(each.parameters.guess) for each in (system, stable)]
+    for model in models:
+        model.actuator_ctrllimited[:] = 0
+    inputs = np.stack([signals(system)] * 2)
+    starts = np.stack([START] * 2)
+    with silence_mujoco_log():
+        found = stable.plant.simulator.rollout(models, starts, inputs)
+    assert found.finite.tolist() == [False, True]
+
+
+def test_single_samples_are_refused() -> None:
+    """A law remembers what happened before a sample."""
+    system = System.resolve(arm_experiment({"shoulder": LAWS["pd"]}))
+    model = system.plant.model(system.parameters.guess)
+    with pytest.raises(NotImplementedError, match="memory"):
+        system.plant.simulator.step([model], START[None], np.zeros((1, 2)))
