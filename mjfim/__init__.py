@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mjfim.identification.cross_validation import predict
     from mjfim.identification.identify import identify
     from mjfim.identification.inverse_dynamics import inverse_dynamics
+    from mjfim.identification.parameter_draws import draw_parameters
     from mjfim.output.live import live
     from mjfim.output.robot.export import export_design
     from mjfim.output.video.results import save_video
@@ -37,11 +38,13 @@ if TYPE_CHECKING:
     from mjfim.records.inverse_dynamics import InverseDynamicsFit
     from mjfim.records.monte_carlo import MonteCarloStudy
     from mjfim.records.recording import Recording
+    from mjfim.records.robot_comparison import RobotComparison
     from mjfim.records.trajectory import Trajectory
     from mjfim.studies.campaign import run_campaign
     from mjfim.studies.check import check
     from mjfim.studies.compare import compare
     from mjfim.studies.monte_carlo import monte_carlo
+    from mjfim.studies.robot_comparison import compare_estimates
     from mjfim.studies.robustness import assess_robustness
     from mjfim.studies.selected_models import selected_experiment
     from mjfim.studies.selection import select_terms
@@ -60,6 +63,7 @@ __all__ = [
     "MonteCarloStudy",
     "Pool",
     "Recording",
+    "RobotComparison",
     "ShortestExperiment",
     "StopToken",
     "Trajectory",
@@ -67,8 +71,10 @@ __all__ = [
     "assess_robustness",
     "check",
     "compare",
+    "compare_estimates",
     "design",
     "design_jointly",
+    "draw_parameters",
     "evaluate",
     "export_design",
     "identify",
@@ -100,6 +106,7 @@ MODULES = {
     "predict": "mjfim.identification.cross_validation",
     "identify": "mjfim.identification.identify",
     "inverse_dynamics": "mjfim.identification.inverse_dynamics",
+    "draw_parameters": "mjfim.identification.parameter_draws",
     "export_design": "mjfim.output.robot.export",
     "live": "mjfim.output.live",
     "save_video": "mjfim.output.video.results",
@@ -114,11 +121,13 @@ MODULES = {
     "InverseDynamicsFit": "mjfim.records.inverse_dynamics",
     "MonteCarloStudy": "mjfim.records.monte_carlo",
     "Recording": "mjfim.records.recording",
+    "RobotComparison": "mjfim.records.robot_comparison",
     "Trajectory": "mjfim.records.trajectory",
     "run_campaign": "mjfim.studies.campaign",
     "check": "mjfim.studies.check",
     "compare": "mjfim.studies.compare",
     "monte_carlo": "mjfim.studies.monte_carlo",
+    "compare_estimates": "mjfim.studies.robot_comparison",
     "assess_robustness": "mjfim.studies.robustness",
     "select_terms": "mjfim.studies.selection",
     "selected_experiment": "mjfim.studies.selected_models",

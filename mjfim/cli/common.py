@@ -704,6 +704,9 @@ class ProgressDisplay:
         self._rounds: _Rounds | None = None
         self._counts_files = False
 
+        # Work on all files, and on those that are written; data take next to none.
+        self._work: tuple[float, float] | None = None
+
     def count_file(self, path: Path) -> None:
         """Show which share of the work on files is done."""
         if path.name.startswith("."):
@@ -711,9 +714,12 @@ class ProgressDisplay:
 
         _written.append(path)
         self._counts_files = True
-        done = work_on_files([each.name for each in _written])
-        total = work_on_files([*dict.fromkeys(_names), *_second_reports(_names)])
-        self._show(f"written: {path.name}", max(done, total) or None, done)
+        if path.name == REPORT or path.suffix in PICTURE_WEIGHTS or self._work is None:
+            done = work_on_files([each.name for each in _written])
+            total = work_on_files([*dict.fromkeys(_names), *_second_reports(_names)])
+            self._work = max(done, total), done
+        total, done = self._work
+        self._show(f"written: {path.name}", total or None, done)
 
     def count_rounds(self, count: int) -> None:
         """Show from now on how many rounds are done, and the number of the present one.

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import mjfim
+from mjfim.amounts import MAX_SAMPLES
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -39,6 +40,10 @@ from mjfim.cli.executors import (
 )
 from mjfim.errors import ExperimentError
 from mjfim.output.picture_format import PictureFormat
+
+if TYPE_CHECKING:
+    from mjfim.experiment.system import System
+    from mjfim.records.estimate import Estimate
 
 
 @verb
@@ -72,6 +77,18 @@ def identify(
             "prediction of left-out data.",
         ),
     ] = False,
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            "--samples",
+            metavar="N",
+            min=1,
+            max=MAX_SAMPLES,
+            help="Draw N robots from the uncertainty of the estimate, for domain randomisation, "
+            "and write a table and a model for each of them.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn robots.")] = 0,
     video: VideoFile = None,
     live: LiveView = None,
     as_json: AsJson = False,
@@ -89,6 +106,7 @@ def identify(
     from mjfim.output import archive
     from mjfim.output.folders import estimate_files, parts_of_identified
     from mjfim.output.presentation import describe
+    from mjfim.output.robot_samples import sample_files
     from mjfim.output.summaries.logs import describe_logs
     from mjfim.recordings.read import read_log, recording_paths
     from mjfim.studies.selection import select_terms_system
@@ -103,8 +121,9 @@ def identify(
     logs = recording_paths(recordings, system.channels)
     held_out_logs = recording_paths(held_out or [], system.channels)
     names = (
-        *estimate_files(len(logs), len(held_out_logs), select=select),
+        *estimate_files(len(logs), len(held_out_logs), select=select, samples=bool(samples)),
         *parts_of_identified(output, system.model_path),
+        *sample_files(output, samples or 0, system.model_path),
     )
     claim_video(video, inputs, force=force)
     claim_folder(output, pictures.files(names), inputs, force=force)
@@ -135,6 +154,7 @@ def identify(
                 executor=workers,
             )
 
+    result, not_drawn = _with_draws(result, system, samples or 0, seed)
     summary = describe(result)
     if verbose:
         logs_read = describe_logs([log.summary for log in (*fitted, *predicted)])
@@ -143,8 +163,38 @@ def identify(
     print_result(as_json, values, summary, verbose=verbose)
     with writing(output) as results:
         remarks = results.write_estimate_folder(output, result, system, pictures)
-    for sentence in remarks:
+    for sentence in (*not_drawn, *remarks):
         errors.print(f"warning: {sentence}", markup=False)
     write_wanted_video(video, system, result)
     say_written(output)
-    raise typer.Exit(0 if result.success and not result.misfit and not result.interrupted else 1)
+    is_good = result.success and not result.misfit and not result.interrupted
+    raise typer.Exit(0 if is_good and not not_drawn else 1)
+
+
+def _with_draws(
+    result: Estimate, system: System, count: int, seed: int
+) -> tuple[Estimate, tuple[str, ...]]:
+    """Draw robots from the uncertainty of an estimate.
+
+    A fit takes long, so that its result is kept where no robots can be drawn.
+
+    Args:
+        result: The estimate.
+        system: The system that was identified.
+        count: Number of robots; 0 for none.
+        seed: Seed of the draws.
+
+    Returns:
+        The estimate with its draws, and the sentence that says why there are none.
+    """
+    import numpy as np
+
+    from mjfim.identification.parameter_draws import draw_parameters_system
+
+    if not count:
+        return result, ()
+    try:
+        draws = draw_parameters_system(system, result, count, np.random.default_rng(seed))
+    except ExperimentError as error:
+        return result, (f"--samples: no robots were drawn: {error}",)
+    return replace(result, draws=replace(draws, seed=seed)), ()

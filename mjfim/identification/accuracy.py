@@ -10,7 +10,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.robust_covariance import block_length, robust_uncertainty
+from mjfim.identification.independent_blocks import block_length
+from mjfim.identification.robust_covariance import robust_uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.optimize.condensed_least_squares import Condensed
@@ -187,23 +188,33 @@ def _robust(
     if not np.isfinite(standard_deviations(information)).all():
         return None
 
-    # The length of a bootstrap block is stated in seconds, or follows from the autocorrelation of
-    # the residuals.
-    rows = problem.row_count
-    length = block_length(correlation_rows, rows)
-    if settings.blocks is not None:
-        duration = sum(float(recording.t[-1]) for recording in problem.recordings)
-        length = settings.blocks * rows / duration
-
     return robust_uncertainty(
         solution.condensed,
         problem.common_values(solution.unknowns),
         problem.blocks.recording_of_block,
         problem.blocks.mean_rows,
-        min_rows=length,
+        min_rows=independent_rows(problem, correlation_rows),
         draws=settings.bootstrap,
         rng=np.random.default_rng(settings.seed),
+        own=problem.layout.own_columns,
     )
+
+
+def independent_rows(problem: FitProblem, correlation_rows: Sequence[float]) -> float:
+    """Number of rows of a block that counts as independent.
+
+    It is stated in seconds, or follows from the autocorrelation of the residuals.
+
+    Args:
+        problem: The least-squares problem.
+        correlation_rows: Autocorrelation time of the residuals of every output [rows].
+    """
+    stated = problem.system.experiment.fit.blocks
+    rows = problem.row_count
+    if stated is None:
+        return block_length(correlation_rows, rows)
+    duration = sum(float(recording.t[-1]) for recording in problem.recordings)
+    return stated * rows / duration
 
 
 def _intervals(

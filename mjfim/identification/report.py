@@ -30,6 +30,7 @@ from mjfim.identification.flipped_signs import (
 from mjfim.identification.laws_in_loop import laws_in_loop
 from mjfim.identification.missing_terms import find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
+from mjfim.identification.recording_comparison import compare_recordings
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
@@ -47,6 +48,7 @@ from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.missing_term import MissingTerm
 from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
+from mjfim.records.recording_comparison import RecordingComparison
 
 # Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
 IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
@@ -119,6 +121,7 @@ class _Findings:
         result: The fit.
         quality: Size and whiteness of the residuals.
         accuracy: Accuracy of theta.
+        comparison: Comparison of the recordings, or None.
         missing: Terms that the model may lack.
         reasons: Reasons for a misfit, in sentences; empty where there is none.
         at_bound: Names of the parameters at a bound or beyond it.
@@ -131,6 +134,7 @@ class _Findings:
     result: FitResult
     quality: FitQuality
     accuracy: Accuracy
+    comparison: RecordingComparison | None
     missing: tuple[MissingTerm, ...]
     reasons: tuple[str, ...]
     at_bound: tuple[str, ...]
@@ -168,12 +172,19 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
     )
     begin_stage("computing the intervals")
     accuracy = result.accuracy
+    comparison = compare_recordings(
+        result.problem,
+        result.solution,
+        quality.correlation_rows(result.problem.row_count),
+        accuracy.robust,
+    )
     at_bound, outside = _at_bounds(task.system.parameters, result.theta, task.settings.hold)
 
     findings = _Findings(
         result=result,
         quality=quality,
         accuracy=accuracy,
+        comparison=comparison,
         missing=missing,
         reasons=reasons,
         at_bound=at_bound,
@@ -336,6 +347,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         horizons=result.horizons,
         held=result.task.settings.hold,
         inverse_dynamics=result.inverse_dynamics,
+        recording_comparison=findings.comparison,
     )
 
 
@@ -521,6 +533,9 @@ def _warnings_of_misfit(findings: _Findings) -> Iterator[str]:
 
 def _warnings_of_recordings(findings: _Findings) -> Iterator[str]:
     """Warnings about recordings that contradict each other."""
+    for odd in () if findings.comparison is None else findings.comparison.odd:
+        yield str(odd)
+
     robust = findings.accuracy.robust
     if robust is None or not robust.apart:
         return

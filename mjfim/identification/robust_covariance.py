@@ -10,13 +10,18 @@ Three methods use the condensed blocks of the last linearisation, without anothe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from mjfim.arrays import Array, scaled_pseudo_inverse, scaled_to_unit_diagonal
+from mjfim.identification.independent_blocks import (
+    Blocks,
+    RecordingEvidence,
+    independent_blocks,
+    recording_evidence,
+)
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 
@@ -29,15 +34,6 @@ INVERSE_TOLERANCE = 1e-14
 
 # Probability below which the test rejects that recordings agree.
 SIGNIFICANCE = 1e-3
-
-# Length of an independent block over the autocorrelation time of the residuals.
-LENGTH_PER_CORRELATION_TIME = 4.0
-
-# Autocorrelation time [rows] up to which residuals count as white.
-WHITE_TIME = 1.5
-
-# Smallest number of independent blocks, for any autocorrelation time.
-MIN_BLOCKS = 20
 
 # Number of bootstrap replicates that are computed at once.
 REPLICATES_AT_ONCE = 200
@@ -52,28 +48,6 @@ MAX_CONDITION_OF_DRAW = 1e14
 
 # Smallest variance in a denominator.
 SMALLEST_VARIANCE = 1e-300
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Blocks:
-    """Scores and information of B blocks that count as independent.
-
-    Attributes:
-        scores: (B, c) gradient of half of each block's squared residuals.
-        information: (B, c, c) information of each block.
-        prior_rows: (l, c) Jacobian of the priors.
-        recording: (B,) index of the recording.
-    """
-
-    scores: Array
-    information: Array
-    prior_rows: Array
-    recording: np.ndarray
-
-    @property
-    def prior_information(self) -> Array:
-        """(c, c) information of the priors."""
-        return np.asarray(self.prior_rows.T @ self.prior_rows)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,6 +81,7 @@ def robust_uncertainty(
     min_rows: float,
     draws: int,
     rng: np.random.Generator,
+    own: np.ndarray | None = None,
 ) -> Uncertainty:
     """Uncertainty of the common unknowns at a minimum.
 
@@ -119,14 +94,12 @@ def robust_uncertainty(
             independent.
         draws: Number of bootstrap replicates.
         rng: Random generator of the bootstrap.
+        own: (K, e) columns of the unknowns that belong to each of K recordings; default: none.
 
     Returns:
         The uncertainty.
     """
-    # Merge blocks to longer ones that count as independent.
-    label = merge_blocks(recording, rows, min_rows)
-    known = condensed.reduced_private_rows
-    blocks = _merged(condensed, label, recording, known)
+    blocks = independent_blocks(condensed, recording, rows, min_rows)
     count = len(blocks.scores)
 
     # Sandwich and formal covariance.
@@ -140,11 +113,17 @@ def robust_uncertainty(
     replicates = _bootstrap(blocks, draws, rng)
 
     # Separate estimates from each recording, with the priors on its private unknowns.
-    recording_of_segment = np.zeros(condensed.segment_count, dtype=int)
-    recording_of_segment[condensed.segment_of_block] = recording
-    recordings = range(int(blocks.recording.max()) + 1)
-    priors = [known[recording_of_segment == k] for k in recordings]
-    each, between, apart = _compare_recordings(theta, blocks, priors)
+    if own is None:
+        own = np.zeros((int(blocks.recording.max()) + 1, 0), dtype=int)
+    evidence = recording_evidence(condensed, blocks, recording, own)
+    shared = np.setdiff1d(np.arange(len(theta)), own)
+    of_shared, between_shared, apart_shared = _compare_recordings(theta[shared], evidence)
+
+    each = np.full((len(of_shared), len(theta)), np.nan)
+    each[:, shared] = of_shared
+    between = np.zeros(len(theta))
+    between[shared] = between_shared
+    apart = tuple(int(shared[j]) for j in apart_shared)
 
     interval = _interval(theta, formal, sandwich, between, replicates, count)
     return Uncertainty(
@@ -194,84 +173,7 @@ def _interval(
     return np.column_stack([low, high])
 
 
-def block_length(correlation_rows: Sequence[float], rows: int) -> float:
-    """Number of rows of a block that counts as independent.
-
-    Args:
-        correlation_rows: Autocorrelation time of the residuals of every output [rows].
-        rows: Number of all rows.
-
-    Returns:
-        Four autocorrelation times, or one row for white noise; at most a twentieth of all rows.
-    """
-    longest = max(correlation_rows, default=1.0)
-    wanted = LENGTH_PER_CORRELATION_TIME * longest if longest > WHITE_TIME else 1.0
-    return min(wanted, max(rows / MIN_BLOCKS, 1.0))
-
-
-def merge_blocks(recording: np.ndarray, rows: np.ndarray, min_rows: float) -> np.ndarray:
-    """Merge consecutive blocks of a recording to longer blocks with enough rows.
-
-    The last block of a recording has at least half of `min_rows`, if the recording is that long.
-
-    Args:
-        recording: (b,) index of the recording of every block, ascending.
-        rows: (b,) number of rows of every block.
-        min_rows: Smallest number of rows of a longer block.
-
-    Returns:
-        (b,) number of the longer block to which each block belongs.
-    """
-    # Rows from each block to the end of its recording.
-    to_end = np.cumsum(rows[::-1])[::-1]
-    after_recording = np.searchsorted(recording, recording, side="right")
-    left_in_recording = to_end - np.append(to_end, 0.0)[after_recording]
-
-    numbers = np.zeros(len(rows), dtype=int)
-    number = -1
-    filled = 0.0
-    for b in range(len(rows)):
-        is_new_recording = b == 0 or recording[b] != recording[b - 1]
-        is_full = filled >= min_rows and left_in_recording[b] >= 0.5 * min_rows
-        if is_new_recording or is_full:
-            number += 1
-            filled = 0.0
-        numbers[b] = number
-        filled += rows[b]
-    return numbers
-
-
-def _merged(
-    condensed: Condensed, label: np.ndarray, recording: np.ndarray, known: Array
-) -> _Blocks:
-    """Sum the blocks of a linearisation by the longer block to which they belong: label: (b,).
-
-    Args:
-        condensed: The linearisation.
-        label: (b,) number of the longer block.
-        recording: (b,) index of the recording.
-        known: (P, k, c+1) rows of the priors on private unknowns, as rows of the common ones.
-    """
-    count = int(label.max(initial=-1)) + 1
-    c = condensed.common_count
-
-    scores = np.zeros((count, c))
-    information = np.zeros((count, c, c))
-    np.add.at(scores, label, condensed.block_scores)
-    np.add.at(information, label, condensed.block_information)
-
-    recording_of_label = np.zeros(count, dtype=int)
-    recording_of_label[label] = recording
-    prior_rows = np.concatenate([condensed.common_rows, known.reshape(-1, c + 1)])[:, :-1]
-    return _Blocks(
-        scores=scores,
-        information=information,
-        prior_rows=prior_rows,
-        recording=recording_of_label,
-    )
-
-
-def _bootstrap(blocks: _Blocks, draws: int, rng: np.random.Generator) -> Array:
+def _bootstrap(blocks: Blocks, draws: int, rng: np.random.Generator) -> Array:
     """(n, c) Gauss-Newton steps to the estimates from drawn blocks.
 
     Draws that do not determine all unknowns are left out.
@@ -300,22 +202,21 @@ def _bootstrap(blocks: _Blocks, draws: int, rng: np.random.Generator) -> Array:
 
 
 def _compare_recordings(
-    theta: Array, blocks: _Blocks, priors: Sequence[Array]
+    theta: Array, evidence: RecordingEvidence
 ) -> tuple[Array, Array, tuple[int, ...]]:
     """Separate estimates from each recording, and their differences beyond their scatter.
 
     The variance between recordings is estimated by the method of DerSimonian & Laird (1986).
 
     Args:
-        theta: (c,) estimate from all recordings.
-        blocks: Blocks of all recordings.
-        priors: (P_k, k, c+1) rows of the priors on the private unknowns of every recording.
+        theta: (s,) estimate from all recordings.
+        evidence: What single recordings say about these unknowns.
 
     Returns:
-        (K, c) estimates, (c,) standard deviations between recordings, and the indices of unknowns
+        (K, s) estimates, (s,) standard deviations between recordings, and the indices of unknowns
         on which they disagree.
     """
-    single = _single_estimates(theta, blocks, priors)
+    single = _single_estimates(theta, evidence)
 
     # The relative scatter within each recording is at least that of all recordings together,
     # because a few blocks often scatter little by chance.
@@ -343,16 +244,15 @@ def _compare_recordings(
     return single.theta, between, tuple(apart)
 
 
-def _single_estimates(theta: Array, blocks: _Blocks, priors: Sequence[Array]) -> _SingleEstimates:
+def _single_estimates(theta: Array, evidence: RecordingEvidence) -> _SingleEstimates:
     """Separate estimates from each recording, one Gauss-Newton step away from theta: (c,).
 
     Args:
         theta: (c,) estimate from all recordings.
-        blocks: Blocks of all recordings.
-        priors: (P_k, k, c+1) rows of the priors on the private unknowns of every recording.
+        evidence: What single recordings say about these unknowns.
     """
     c = len(theta)
-    count = len(priors)
+    count = evidence.count
     each = np.full((count, c), np.nan)
     variance = np.full((count, c), np.inf)
     formal = np.ones((count, c))
@@ -361,13 +261,10 @@ def _single_estimates(theta: Array, blocks: _Blocks, priors: Sequence[Array]) ->
 
     for k in range(count):
         # Normal equations of the recording and of the priors on its private unknowns.
-        of_recording = blocks.recording == k
-        scores = blocks.scores[of_recording]
-        information = blocks.information[of_recording]
-        rows = priors[k].reshape(-1, c + 1)
-        J = rows[:, :-1]
-        H = information.sum(axis=0) + J.T @ J
-        g = scores.sum(axis=0) + J.T @ rows[:, -1]
+        of_recording = evidence.recording == k
+        scores = evidence.scores[of_recording]
+        information = evidence.information[of_recording]
+        H, g = evidence.normal_equations(k)
         if _condition_number(H) > MAX_CONDITION_OF_RECORDING:
             continue
 

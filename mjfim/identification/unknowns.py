@@ -110,6 +110,13 @@ class UnknownLayout:
         return np.arange(len(self.shared) + len(self.per_recording))
 
     @property
+    def own_columns(self) -> np.ndarray:
+        """(K, e) common columns of the unknowns that belong to each recording."""
+        count = len(self.per_recording)
+        columns = len(self.shared) + np.arange(self.recordings * count)
+        return columns.reshape(self.recordings, count)
+
+    @property
     def estimated(self) -> np.ndarray:
         """(p,) True for the parameters that have common columns."""
         mask = np.zeros(len(self.parameters), dtype=bool)

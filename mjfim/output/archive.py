@@ -104,7 +104,7 @@ def _relative(file: Path, folder: Path) -> str:
         return file.resolve().as_posix()
 
 
-def write_table(path: Path, columns: Mapping[str, Array]) -> None:
+def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     """Write columns as CSV with all digits; NaN is an empty field.
 
     Args:

@@ -27,12 +27,15 @@ from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
 from mjfim.output.presentation import describe
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import records_in, write_report
+from mjfim.output.robot_samples import clear_samples, write_samples
+from mjfim.output.urdf.write import urdf_files, write_identified_urdfs
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.progress import begin_stage
+from mjfim.records.robot_comparison import RobotComparison
 from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json, write_json
 from mjfim.records.shown import ShownRecord
@@ -67,31 +70,37 @@ DESIGN_FILES = (
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
-# Files that `mjfim check`, `mjfim robustness` and `mjfim export-sysid` may write.
+# Files that `mjfim check`, `mjfim compare-robots`, `mjfim robustness` and `mjfim export-sysid` may
+# write.
 CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "pairs.png", *TABLE_FILES)
+ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png", *TABLE_FILES)
 ROBUSTNESS_FILES = ("playback.json", "playback.npz", REPORT, "playback.png", *TABLE_FILES)
 SYSID_FILES = ("comparison.json", "sysid_report.html")
 
 
 def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:
-    """List the files that `identified.xml` may include beside it.
+    """List the files that `identified.xml` may include beside it, and the identified URDFs.
 
     Args:
         folder: Folder of `identified.xml`.
         model: The user's MJCF.
     """
-    return copies_of_included_files(folder / IDENTIFIED, model)
+    stem = Path(IDENTIFIED).stem
+    return (*copies_of_included_files(folder / IDENTIFIED, model), *urdf_files(model, stem))
 
 
-def estimate_files(recordings: int, held_out: int = 0, *, select: bool = False) -> tuple[str, ...]:
+def estimate_files(
+    recordings: int, held_out: int = 0, *, select: bool = False, samples: bool = False
+) -> tuple[str, ...]:
     """List the files that `mjfim identify` may write for every model.
 
     Args:
         recordings: Number of recordings that are fitted.
         held_out: Number of recordings that are held out.
         select: Whether terms of the model are selected.
+        samples: Whether robots are drawn, whose models `sample_files` lists.
     """
-    names = (
+    names = [
         "parameters",
         "spectra",
         "inverse_dynamics",
@@ -99,8 +108,10 @@ def estimate_files(recordings: int, held_out: int = 0, *, select: bool = False) 
         "pairs",
         "predictions",
         "horizons",
-    )
-    figures = tuple(f"{name}.png" for name in (*names, *(["selection"] if select else [])))
+    ]
+    chosen = {"selection": select, "samples": samples, "recordings": recordings > 1}
+    names += [name for name, is_wanted in chosen.items() if is_wanted]
+    figures = tuple(f"{name}.png" for name in names)
     fits = tuple(f"{name}.png" for name in (*fit_names(recordings), *held_out_names(held_out)))
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
     return (*data, *figures, *fits, *TABLE_FILES)
@@ -273,6 +284,25 @@ def write_check_folder(
     _write_views(folder, check, picture_format)
 
 
+def write_robots_folder(
+    folder: Path,
+    comparison: RobotComparison,
+    origin: Mapping[str, str],
+    picture_format: PictureFormat = PictureFormat.PNG,
+) -> None:
+    """Write robots.json, robots.npz, report.html and a figure of the differences.
+
+    Args:
+        folder: Folder for the results.
+        comparison: The comparison.
+        origin: Folders of both estimates, relative to the folder, by their key in robots.json.
+        picture_format: Format of the pictures.
+    """
+    comparison.save_archive(folder)
+    write_json(folder / "robots.json", {**origin, **comparison.summary()})
+    _write_views(folder, comparison, picture_format)
+
+
 def write_robustness_folder(
     folder: Path,
     result: Robustness,
@@ -341,17 +371,25 @@ def write_estimate_folder(
     endings = "|".join(PictureFormat)
     _clear(
         folder,
-        rf"((fit|held_out)(_\d+)?|predictions|pairs|trace|selection|horizons|inverse_dynamics)\.({endings})|identified(_.*)?\.xml",
+        r"((fit|held_out)(_\d+)?|predictions|pairs|trace|selection|horizons|inverse_dynamics"
+        rf"|samples|recordings)\.({endings})|identified(_.*)?\.(xml|urdf)",
     )
+    clear_samples(folder)
     archive.save_with_origin(folder, estimate, system)
     write_tables(folder, estimate)
 
-    remarks = []
+    urdfs = write_identified_urdfs(folder, Path(IDENTIFIED).stem, system, estimate.theta)
+    remarks = list(urdfs.remarks)
     try:
-        remark = write_identified(folder / IDENTIFIED, system, estimate.theta)
+        remark = write_identified(folder / IDENTIFIED, system, estimate.theta, urdfs)
         remarks += [remark] if remark else []
     except ModelError as error:
         remarks.append(str(error))
+    if estimate.draws is not None:
+        begin_stage("writing the models of the drawn robots")
+        write_optional(
+            "the drawn robots", lambda: remarks.extend(write_samples(folder, estimate, system))
+        )
 
     with _video_begun(system, estimate) as drawn:
         write_optional(REPORT, lambda: write_report(folder, Estimate, made=estimate))

@@ -8,6 +8,7 @@ belongs to the user.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from typing import Any
 from mjfim import atomic_io
 from mjfim.errors import OutputError, RecordingError
 from mjfim.output.file_lock import FileLock
-from mjfim.records.serialization import read_json, write_json
+from mjfim.records.serialization import read_json
 
 # Name of the manifest, and of the locks of a manifest and of a folder.
 MANIFEST = ".mjfim.json"
@@ -87,16 +88,14 @@ class Manifest:
         """
         self.folder = folder
 
-    def origin(self, file: Path) -> Origin:
-        """Say who wrote a file of the folder.
+    def origins(self, files: Sequence[Path]) -> list[Origin]:
+        """Say who wrote some files of the folder.
 
         Args:
-            file: A file that exists.
+            files: Files that exist.
         """
-        known = self._read().get(file.name)
-        if known is None:
-            return Origin.UNKNOWN
-        return Origin.WRITTEN_HERE if Fingerprint.of(file) in known else Origin.CHANGED
+        entries = self._read()
+        return [_origin(file, entries.get(file.name)) for file in files]
 
     def enter(self, name: str, contents: Path) -> None:
         """Enter a file that is about to be written.
@@ -141,7 +140,10 @@ class Manifest:
             name: [{"size": entry.size, "sha256": entry.sha256} for entry in entries]
             for name, entries in sorted(files.items())
         }
-        write_json(self.folder / MANIFEST, {"format": FORMAT, "files": table})
+
+        # Readable JSON would take most of the time in a folder with many files.
+        with atomic_io.replacing(self.folder / MANIFEST) as temporary:
+            temporary.write_text(json.dumps({"format": FORMAT, "files": table}), encoding="utf-8")
 
 
 class OutputGuard:
@@ -180,8 +182,7 @@ class OutputGuard:
             return
 
         refused: dict[Origin, list[Path]] = {Origin.UNKNOWN: [], Origin.CHANGED: []}
-        for file in existing:
-            origin = _origin(file)
+        for file, origin in zip(existing, _origins(existing), strict=True):
             if origin is not Origin.WRITTEN_HERE:
                 refused[origin].append(file)
         if any(refused.values()):
@@ -210,7 +211,7 @@ class OutputGuard:
             file: A file that exists.
         """
         is_input = any(_is_same(file, source) for source in self._inputs)
-        return not is_input and _origin(file) is Origin.WRITTEN_HERE
+        return not is_input and _origins([file]) == [Origin.WRITTEN_HERE]
 
     def _refuse_input(self, file: Path) -> None:
         """Raise OutputError if a file is an input of the run."""
@@ -267,9 +268,24 @@ def _remove_empty(folders: Sequence[Path]) -> None:
             return
 
 
-def _origin(file: Path) -> Origin:
-    """Say who wrote a file, after the manifest of its folder."""
-    return Manifest(file.parent).origin(file) if file.is_file() else Origin.UNKNOWN
+def _origins(files: Sequence[Path]) -> list[Origin]:
+    """Say who wrote some files, after the manifests of their folders."""
+    of_folder: dict[Path, list[Path]] = {}
+    for file in files:
+        if file.is_file():
+            of_folder.setdefault(file.parent, []).append(file)
+
+    found: dict[Path, Origin] = {}
+    for folder, members in of_folder.items():
+        found.update(zip(members, Manifest(folder).origins(members), strict=True))
+    return [found.get(file, Origin.UNKNOWN) for file in files]
+
+
+def _origin(file: Path, known: Sequence[Fingerprint] | None) -> Origin:
+    """Say who wrote a file, by the fingerprints that a manifest lists for it."""
+    if known is None:
+        return Origin.UNKNOWN
+    return Origin.WRITTEN_HERE if Fingerprint.of(file) in known else Origin.CHANGED
 
 
 def _is_same(file: Path, other: Path) -> bool:

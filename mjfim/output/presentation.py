@@ -19,6 +19,7 @@ from mjfim.output.summaries.design import describe_design
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.output.summaries.inverse_dynamics import describe_inverse_dynamics
 from mjfim.output.summaries.monte_carlo import describe_study
+from mjfim.output.summaries.robot_comparison import describe_robots
 from mjfim.output.summaries.robustness import describe_robustness
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
 from mjfim.output.summary_parts import Emphasis, Paragraph, Summary, capitalised
@@ -29,6 +30,7 @@ from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.robot_comparison import RobotComparison
 from mjfim.records.robustness import Robustness
 from mjfim.records.shown import ShownRecord
 
@@ -106,4 +108,5 @@ _described.register(Check, describe_check)
 _described.register(Estimate, describe_estimate)
 _described.register(InverseDynamicsFit, describe_inverse_dynamics)
 _described.register(Comparison, describe_comparison)
+_described.register(RobotComparison, describe_robots)
 _described.register(Robustness, describe_robustness)

@@ -15,7 +15,9 @@ from mjfim.records.horizons import HorizonStudy
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
 from mjfim.records.missing_term import MissingTerm
+from mjfim.records.parameter_draws import ParameterDraws
 from mjfim.records.recording import Recording
+from mjfim.records.recording_comparison import RecordingComparison
 from mjfim.records.selection import Selection
 from mjfim.records.serialization import SavedRecord
 from mjfim.records.shown import ShownRecord
@@ -97,6 +99,10 @@ class Estimate(ShownRecord):
             recordings; None where they were not.
         inverse_dynamics: The fit to the equation of motion from which the search started; None
             where there was none.
+        draws: Robots that were drawn from the uncertainty, for simulations that vary the robot;
+            None where that was not asked for.
+        recording_comparison: What each recording suggests alone, the scatter between recordings,
+            and which one is odd; None for a single recording.
     """
 
     parameters: tuple[str, ...]
@@ -146,6 +152,8 @@ class Estimate(ShownRecord):
     horizons: HorizonStudy | None = None
     held: tuple[str, ...] = ()
     inverse_dynamics: InverseDynamicsFit | None = None
+    draws: ParameterDraws | None = None
+    recording_comparison: RecordingComparison | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -251,6 +259,10 @@ class Estimate(ShownRecord):
             "horizons": None if self.horizons is None else self.horizons.summary(),
             "inverse_dynamics": (
                 None if self.inverse_dynamics is None else self.inverse_dynamics.summary()
+            ),
+            "draws": None if self.draws is None else self.draws.summary(),
+            "recording_comparison": (
+                None if self.recording_comparison is None else self.recording_comparison.summary()
             ),
         }
 

@@ -282,7 +282,7 @@ def run(job: tuple[str, int, int]) -> Outcome:
         optimum = identify_system(system, [recording], start=true)
         least = problem.cost(problem.begin(optimum.theta))
 
-        factors = np.exp(rng.uniform(*np.log(FACTORS), len(true)))
+        factors = np.exp(rng.uniform(np.log(FACTORS[0]), np.log(FACTORS[1]), len(true)))
         factors **= rng.choice([-1.0, 1.0], len(true))
         start = true * factors
         begun = time.process_time()
@@ -351,7 +351,7 @@ def simulated(system: System, robot: Robot, rng: np.random.Generator) -> Recordi
         rng: Source of random numbers.
     """
     count = round(robot.seconds * robot.rate)
-    t = np.arange(count + 1) * system.dt
+    t: Array = np.arange(count + 1, dtype=np.float64) * system.dt
     shape = multisine(t[:-1], len(robot.amplitude), 0.4, 6, rng)
     ctrl = np.array(robot.offset) + np.array(robot.amplitude) * shape
     y = system.plant.measure(system.parameters.guess[None], ctrl)[0][0]

@@ -45,6 +45,7 @@ def test_identify_several_recordings(
     assert names(tmp_path / "fit") - {MANIFEST} == (ESTIMATE - {"fit.png"}) | {
         "fit_1.png",
         "fit_2.png",
+        "recordings.png",
     }
     both, one = read(tmp_path / "fit" / "estimate.json"), loads(identified.stdout)
     assert np.all(np.array(both["std"]) < 0.85 * np.array(one["std"]))
@@ -108,3 +109,62 @@ def test_stale_pictures_of_an_older_estimate_are_removed(
     assert {"fit_1.png", "fit_2.png"} <= names(tmp_path / "e")
     run("identify", study, recorded, "-o", tmp_path / "e")
     assert {n for n in names(tmp_path / "e") if n.startswith("fit")} == {"fit.png", "fitness.png"}
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_drawn_robots(study: Path, recorded: Path, tmp_path: Path) -> None:
+    """A table and a model for each robot; the next run into the folder replaces or removes them."""
+    out = tmp_path / "fit"
+    words = ("identify", study, recorded, "-o", out)
+    result = run(*words, "--samples", 3, "--seed", 7)
+    assert result.exit_code == 0
+    assert names(out) - {MANIFEST} == ESTIMATE | {"samples.csv", "samples.png", "samples"}
+    models = {f"robot_000{i}.xml" for i in (1, 2, 3)}
+    assert names(out / "samples") - {MANIFEST} == models
+    data = read(out / "estimate.json")
+    assert (data["draws"]["count"], data["draws"]["seed"]) == (3, 7)
+    assert "3 robots were drawn" in result.stdout
+    first = (out / "samples.csv").read_text(encoding="utf-8")
+
+    # The seed alone decides. A file that was edited is the user's.
+    (out / "samples" / "robot_0002.xml").write_text("edited", encoding="utf-8")
+    misused(run(*words, "--samples", 2), "robot_0002.xml: changed after mjfim wrote it")
+    assert run(*words, "--samples", 3, "--seed", 7, "--force").exit_code == 0
+    assert (out / "samples.csv").read_text(encoding="utf-8") == first
+    assert run(*words, "--samples", 2, "--seed", 8).exit_code == 0
+    assert names(out / "samples") - {MANIFEST} == {"robot_0001.xml", "robot_0002.xml"}
+    assert (out / "samples.csv").read_text(encoding="utf-8") != first
+
+    # Without the option, nothing of them remains.
+    assert run(*words).exit_code == 0
+    assert names(out) - {MANIFEST} == ESTIMATE
+    assert read(out / "estimate.json")["draws"] is None
+
+
+@pytest.mark.usefixtures("empty_figures")
+def test_no_robots_are_drawn_from_undetermined_parameters(
+    study: Path, recorded: Path, tmp_path: Path
+) -> None:
+    """The fit is kept, and the message names the parameter."""
+    text = study.read_text(encoding="utf-8")
+    extra = '\n[parameters.extra]\ntarget = "body/cart:inertia[1]"\n'
+    (tmp_path / "study.toml").write_text(text + extra, encoding="utf-8")
+    for file in ("cart_pendulum.xml", "cart_pendulum.csv"):
+        (tmp_path / file).write_bytes((study.parent / file).read_bytes())
+    out = tmp_path / "fit"
+    result = run("identify", tmp_path / "study.toml", recorded, "-o", out, "--samples", 5)
+    assert result.exit_code == 1
+    said = " ".join(result.stderr.split())
+    assert "--samples: no robots were drawn: the recordings do not determine extra" in said
+    assert {"samples", "samples.csv", "samples.png"}.isdisjoint(names(out))
+    assert read(out / "estimate.json")["draws"] is None
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "10001", "many"])
+def test_impossible_numbers_of_robots(
+    study: Path, recorded: Path, tmp_path: Path, count: str
+) -> None:
+    result = run("identify", study, recorded, "-o", tmp_path / "fit", "--samples", count)
+    assert result.exit_code == 2
+    assert "--samples" in result.stderr
+    assert not (tmp_path / "fit").exists()

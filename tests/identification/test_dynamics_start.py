@@ -1,4 +1,4 @@
-"""Fits that start from a fit to the equation of motion, stated or as a way out of a local minimum."""
+"""Fits that start from a fit to the equation of motion, stated or to leave a local minimum."""
 
 from __future__ import annotations
 

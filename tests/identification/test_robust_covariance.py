@@ -14,7 +14,8 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from mjfim.identification.robust_covariance import block_length, merge_blocks, robust_uncertainty
+from mjfim.identification.independent_blocks import block_length, merge_blocks
+from mjfim.identification.robust_covariance import robust_uncertainty
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 from tests.support.numerics import Array

@@ -22,6 +22,8 @@ from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors, Whiteness
 from mjfim.records.horizons import HorizonStudy
 from mjfim.records.labels import Labels
+from mjfim.records.parameter_draws import ParameterDraws
+from mjfim.records.robot_comparison import RobotComparison
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
 from mjfim.records.selection import Decision, Selection, SelectionStep
 from tests.support.figure_text import misplaced_texts
@@ -31,6 +33,7 @@ from tests.support.made_records import (
     make_estimate,
     make_labels,
     make_method_result,
+    make_recording_comparison,
     make_study,
 )
 
@@ -305,12 +308,61 @@ def horizons_figure(size: Size) -> Figure:
     return plots.horizons_figure(dataclasses.replace(found, horizons=study))
 
 
+def recording_forest(size: Size) -> Figure:
+    """Figure of as many recordings as joints, at least two."""
+    labels = size.labels
+    names = tuple(f"{'n' * size.width}run_{k}.csv" for k in range(max(size.joints, 2)))
+    made = make_recording_comparison(labels.parameters, labels.parameter_units, names)
+    return plots.recording_forest(
+        dataclasses.replace(estimate(size), recording_comparison=made, misfit=True)
+    )
+
+
+def robot_figure(size: Size) -> Figure:
+    """Figure of two robots, the first parameter of which differs."""
+    labels = size.labels
+    count = size.parameters
+    values = np.linspace(1.0, 2.0, count)
+    other = values + np.append(0.8, np.zeros(count - 1))
+    comparison = RobotComparison(
+        names=("n" * 30, "m" * 30),
+        recordings=(1, 2),
+        parameters=labels.parameters,
+        units=labels.parameter_units,
+        is_single=np.ones(count),
+        values=np.array([values, other]),
+        std=np.full((2, count), 0.02),
+        interval=np.column_stack([other - values - 0.05, other - values + 0.05]),
+        p=np.append(1e-9, np.ones(count - 1)),
+        detectable=np.full(count, 0.1),
+        joint_p=1e-9,
+        level=0.05,
+        is_reliable=False,
+    )
+    return plots.robot_figure(comparison)
+
+
+def drawn_robots(size: Size) -> Figure:
+    """Figure of 50 drawn robots."""
+    found = estimate(size)
+    noise = np.random.default_rng(0).normal(size=(50, size.parameters))
+    draws = ParameterDraws(
+        parameters=size.labels.parameters,
+        units=size.labels.parameter_units,
+        values=found.theta + found.std * noise,
+        centre=found.theta,
+        std=found.std,
+    )
+    return plots.drawn_robots(dataclasses.replace(found, draws=draws))
+
+
 FIGURES: dict[str, Callable[[Size], Figure]] = {
     "campaign_figure": campaign_figure,
     "check_figure": lambda size: plots.check_figure(check(size)),
     "check_pairs": lambda size: plots.check_pairs(check(size)),
     "compare_figure": lambda size: plots.compare_figure(comparison(size)),
     "convergence": lambda size: plots.convergence(design(size)),
+    "drawn_robots": drawn_robots,
     "estimate_pairs": lambda size: plots.estimate_pairs(estimate(size), size.labels),
     "fit": lambda size: plots.fit(estimate(size), 0, size.labels, np.full(size.joints, 0.05)),
     "held_out": lambda size: plots.held_out(estimate(size), 0, size.labels),
@@ -320,7 +372,9 @@ FIGURES: dict[str, Callable[[Size], Figure]] = {
     "parameter_intervals": lambda size: plots.parameter_intervals(estimate(size), size.labels),
     "parameter_trace": lambda size: plots.parameter_trace(estimate(size), size.labels),
     "predictions": lambda size: plots.predictions(estimate(size), size.labels),
+    "recording_forest": recording_forest,
     "residual_spectra": lambda size: plots.residual_spectra(estimate(size), size.labels),
+    "robot_figure": robot_figure,
     "robustness_figure": lambda size: plots.robustness_figure(robustness(size)),
     "selection_figure": selection_figure,
     "sensitivity_phase": lambda size: plots.sensitivity_phase(design(size), size.labels),

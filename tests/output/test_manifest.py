@@ -124,10 +124,10 @@ def test_a_run_that_is_killed_while_it_writes_leaves_no_strange_file(tmp_path: P
     new.write_text("new", encoding="utf-8")
     manifest = Manifest(tmp_path)
     manifest.enter("a.txt", new)
-    assert manifest.origin(file) is Origin.WRITTEN_HERE
+    assert manifest.origins([file]) == [Origin.WRITTEN_HERE]
 
     new.replace(file)
-    assert manifest.origin(file) is Origin.WRITTEN_HERE
+    assert manifest.origins([file]) == [Origin.WRITTEN_HERE]
 
 
 def test_the_manifest_has_one_entry_per_file(tmp_path: Path) -> None:

@@ -477,8 +477,8 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
     assert mujoco.MjModel.from_xml_path(str(new)).joint("dj").damping[0] == 0.7
 
 
-def test_attached_models_are_printed_by_mujoco(tmp_path: Path) -> None:
-    """An attached model is in another file, which the text would not find from another folder."""
+def test_attached_models(tmp_path: Path) -> None:
+    """MuJoCo prints a model of which an attached part changes; other values keep the text."""
     body = '<body name="d"><joint name="dj"/><geom size=".1"/></body>'
     part = f'<mujoco model="leg"><worldbody>{body}</worldbody></mujoco>'
     (tmp_path / "leg.xml").write_text(part, encoding="utf-8")
@@ -486,15 +486,19 @@ def test_attached_models_are_printed_by_mujoco(tmp_path: Path) -> None:
         "  <worldbody>", '  <asset><model name="leg" file="leg.xml"/></asset>\n  <worldbody>'
     )
     xml = xml.replace("  </worldbody>", '<attach model="leg" body="d" prefix="x_"/></worldbody>')
-    for path, folder, reason in (
-        ("joint/x_dj:damping", "", "joint 'x_dj' is not in the MJCF file itself"),
-        ("joint/j:damping", "out", "leg.xml"),
-    ):
-        task = task_of(xml, tmp_path, path)
-        said = write_identified(tmp_path / folder / "identified.xml", task.system, np.array([0.7]))
-        assert said is not None and "printed by MuJoCo" in said and reason in said
-        found = mujoco.MjModel.from_xml_path(str(tmp_path / folder / "identified.xml"))
-        assert found.joint(path[6:-8]).damping[0] == 0.7
+    inside = task_of(xml, tmp_path, "joint/x_dj:damping")
+    said = write_identified(tmp_path / "identified.xml", inside.system, np.array([0.7]))
+    assert said is not None
+    assert "printed by MuJoCo" in said and "joint 'x_dj' is not in the MJCF file itself" in said
+    found = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
+    assert found.joint("x_dj").damping[0] == 0.7
+
+    # From another folder, the text finds the attached model.
+    outside = task_of(xml, tmp_path, "joint/j:damping")
+    new = tmp_path / "out" / "identified.xml"
+    assert write_identified(new, outside.system, np.array([0.7])) is None
+    assert '<model name="leg" file="../leg.xml"/>' in new.read_text(encoding="utf-8")
+    assert mujoco.MjModel.from_xml_path(str(new)).joint("j").damping[0] == 0.7
 
 
 MESH = "v 0 0 0\nv 0.2 0 0\nv 0 0.3 0\nv 0 0 0.4\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"

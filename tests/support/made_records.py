@@ -13,6 +13,11 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
+from mjfim.records.recording_comparison import (
+    OddParameter,
+    OddRecording,
+    RecordingComparison,
+)
 from mjfim.records.trajectory import Trajectory
 
 
@@ -179,6 +184,44 @@ def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estima
         at_bound=("link_0.damping",),
         predicted=(predicted,),
         recordings=(recording,),
+    )
+
+
+def make_recording_comparison(
+    parameters: tuple[str, ...], units: tuple[str, ...], names: tuple[str, ...]
+) -> RecordingComparison:
+    """Make a comparison of recordings; the second one is odd in the first parameter."""
+    count = len(names)
+    truth = np.linspace(1.0, 2.0, len(parameters))
+    std = np.tile(0.05 * truth, (count, 1))
+    values = truth + std * np.random.default_rng(3).normal(size=std.shape)
+    values[1, 0] += 0.5
+    values[0, -1], std[0, -1] = np.nan, np.inf
+    odd = OddParameter(
+        name=parameters[0],
+        unit=units[0],
+        value=float(values[1, 0]),
+        std=0.05,
+        others=1.0,
+        others_std=0.03,
+        p=2e-5,
+    )
+    half = np.column_stack([truth - 0.05, truth + 0.05])
+    return RecordingComparison(
+        recordings=names,
+        parameters=parameters,
+        units=units,
+        is_stated=np.zeros(len(parameters)),
+        values=values,
+        std=std,
+        mean=truth,
+        interval=half,
+        tau=0.02 * truth,
+        share=np.full(len(parameters), 0.3),
+        p=np.geomspace(1e-5, 1.0, len(parameters)),
+        prediction=half + np.array([-0.1, 0.1]),
+        joint_p=1e-4,
+        odd=(OddRecording(index=1, name=names[1], p=2e-5, parameters=(odd,)),),
     )
 
 

@@ -25,10 +25,12 @@ from mjfim.records.estimate import (
 from mjfim.records.labels import Labels
 from mjfim.records.missing_term import MissingTerm
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.parameter_draws import ParameterDraws
 from mjfim.records.recording import Recording
+from mjfim.records.robot_comparison import RobotComparison
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
 from mjfim.records.trajectory import Trajectory
-from tests.support.made_records import ten_iterates
+from tests.support.made_records import make_recording_comparison, ten_iterates
 
 # Names of the parameters of all results.
 PARAMETERS = ("mass", "length", "damping")
@@ -180,8 +182,26 @@ def estimate(name: str = "hinge", samples: int = 200, **changes: object) -> Esti
             ),
         ),
         "labels": labels(name),
+        "draws": draws(std),
+        "recording_comparison": make_recording_comparison(
+            PARAMETERS, UNITS, ("swing.csv", "other.csv", "third.csv")
+        ),
     }
     return Estimate(**{**fields, **changes})  # type: ignore[arg-type]
+
+
+def draws(std: Array) -> ParameterDraws:
+    """Thirty drawn robots."""
+    noise = np.random.default_rng(1).normal(size=(30, len(std)))
+    return ParameterDraws(
+        parameters=PARAMETERS,
+        units=UNITS,
+        values=THETA + std * noise,
+        centre=THETA,
+        std=std,
+        replaced=2,
+        seed=0,
+    )
 
 
 def missing_term() -> MissingTerm:
@@ -355,7 +375,29 @@ def campaign(parameters: tuple[str, ...] = PARAMETERS, **changes: object) -> Cam
 
 
 # Function that makes the result of each verb.
+def robots(**changes: object) -> RobotComparison:
+    """Two robots whose damping differs."""
+    std = 0.01 * THETA
+    fields: dict[str, object] = {
+        "names": ("monday", "friday"),
+        "recordings": (3, 1),
+        "parameters": PARAMETERS,
+        "units": UNITS,
+        "is_single": np.array([1.0, 0.0, 1.0]),
+        "values": np.array([THETA, THETA + np.array([0.0, 0.001, 0.2])]),
+        "std": np.array([std, 1.5 * std]),
+        "interval": np.array([[-0.07, 0.07], [-0.04, 0.04], [0.18, 0.22]]),
+        "p": np.array([1.0, 0.8, 1e-20]),
+        "detectable": np.array([0.12, 0.06, 0.03]),
+        "joint_p": 1e-18,
+        "level": 0.05,
+        "remarks": ("of friday there is a single recording",),
+    }
+    return RobotComparison(**{**fields, **changes})  # type: ignore[arg-type]
+
+
 MAKERS = {
+    "compare-robots": robots,
     "design": design,
     "identify": estimate,
     "check": check,

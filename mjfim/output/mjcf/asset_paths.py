@@ -7,7 +7,7 @@ is none, relative to that of the file that names it.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,28 @@ def relocate_assets(document: MjcfDocument, spec: Any, source: Path, target: Pat
         document.set(compilers[-1], "assetdir", folder)
     else:
         document.insert_child(0, "compiler", {"assetdir": folder})
+
+
+def attach_files(
+    document: MjcfDocument, source: Path, target: Path, files: Mapping[Path, Path]
+) -> None:
+    """Let a text attach other files in place of some models, and find the others from its folder.
+
+    Args:
+        document: The text.
+        source: Folder from which the text loads now.
+        target: Folder from which it has to load.
+        files: New files by the resolved paths of the present ones.
+    """
+    for i, tag in enumerate(document.tags):
+        name = tag.attributes.get("file", "")
+        if tag.name != "model" or not name:
+            continue
+        new = files.get((source / name).resolve())
+        if new is not None:
+            document.set(i, "file", Path(os.path.relpath(new.resolve(), target)).as_posix())
+        elif source != target and (source / name).is_file():
+            document.set(i, "file", _relocated(name, source, target))
 
 
 def point_to_copies(

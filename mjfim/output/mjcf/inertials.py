@@ -116,7 +116,7 @@ def _write_inertia(
         attribute, numbers = "diaginertia", (old.body_inertia[body], np.diag(in_old_axes))
     else:
         entries = before[INERTIA_ROWS, INERTIA_COLUMNS]
-        attribute, numbers = "fullinertia", (entries, _rounded(after))
+        attribute, numbers = "fullinertia", (entries, rounded_entries(after))
     document.set_numbers(tag, attribute, *numbers, min_count=len(numbers[0]), magnitude=magnitude)
 
 
@@ -134,7 +134,7 @@ def _write_principal(document: MjcfDocument, tag: int, wanted: Any, body: int) -
 
 def _full_inertia(inertia: Array) -> dict[str, str]:
     """Return the attributes that state a (3, 3) matrix in the axes of the body."""
-    return {"fullinertia": all_digits(*_rounded(inertia))}
+    return {"fullinertia": all_digits(*rounded_entries(inertia))}
 
 
 def _principal_inertia(model: Any, body: int) -> dict[str, str]:
@@ -146,13 +146,19 @@ def _principal_inertia(model: Any, body: int) -> dict[str, str]:
     return {"quat": all_digits(*quat), **moments}
 
 
-def _rounded(inertia: Array) -> Array:
-    """Return the (6,) entries of `fullinertia` without the rounding errors of a rotation.
+def rounded_entries(inertia: Array) -> Array:
+    """Return the entries of an inertia matrix without the rounding errors of a rotation.
 
     The matrix was rotated out of its principal axes.
 
     These errors are about 1e-16 of the trace and depend on the processor's linear algebra kernel,
     so that 0.013 would be written as 0.01299999999999999 on some machines.
+
+    Args:
+        inertia: (3, 3) matrix [kg m²].
+
+    Returns:
+        (6,) entries xx yy zz xy xz yz.
     """
     entries = inertia[INERTIA_ROWS, INERTIA_COLUMNS]
     trace = float(np.trace(inertia))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS, resolve
 from mjfim.model.spec_writer import state_derived_values, write_element
 from mjfim.model.variants import unconstrained
-from mjfim.output.mjcf.asset_paths import relocate_assets
+from mjfim.output.mjcf.asset_paths import attach_files, relocate_assets
 from mjfim.output.mjcf.document import MjcfDocument
 from mjfim.output.mjcf.edited_files import EditedFiles
 from mjfim.output.mjcf.edits import ParameterEdits
@@ -74,7 +75,25 @@ INVERSE_WEIGHT = "body_invweight0"
 REMARK_TEXT = 120
 
 
-def write_identified(path: Path, system: System, theta: Array) -> str | None:
+@dataclass(frozen=True, kw_only=True)
+class WrittenUrdfs:
+    """URDFs with identified values, which an MJCF attaches in place of the user's.
+
+    Attributes:
+        files: The new URDFs by the resolved paths of the user's.
+        held: Names of the parameters whose values they hold.
+        remarks: Sentences about URDFs that could not be written, and about values that they cannot
+            hold.
+    """
+
+    files: dict[Path, Path] = field(default_factory=dict)
+    held: frozenset[str] = frozenset()
+    remarks: tuple[str, ...] = ()
+
+
+def write_identified(
+    path: Path, system: System, theta: Array, urdfs: WrittenUrdfs | None = None
+) -> str | None:
     """Write the user's MJCF with parameter values.
 
     In the user's text the numbers are replaced, with all their digits. Included files whose text
@@ -86,6 +105,7 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
         path: File that is written; its folder may differ from that of the model.
         system: The experiment with its model.
         theta: (p,) parameter values.
+        urdfs: URDFs with these values that the MJCF attaches; default: none.
 
     Returns:
         A sentence about everything else that changes, None if nothing does.
@@ -97,7 +117,7 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
 
     remarks = []
     try:
-        stated = _write_edited(path, system, theta, wanted)
+        stated = _write_edited(path, system, theta, wanted, urdfs or WrittenUrdfs())
     except ModelError as error:
         _write_printed(path, system, theta, wanted)
         remarks.append(
@@ -128,7 +148,9 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
     return f"{path.name}: {'; '.join(remarks)}" if remarks else None
 
 
-def _write_edited(path: Path, system: System, theta: Array, wanted: Any) -> list[str]:
+def _write_edited(
+    path: Path, system: System, theta: Array, wanted: Any, urdfs: WrittenUrdfs
+) -> list[str]:
     """Write the edited text; return the objects whose derived numbers had to be stated.
 
     Raises ModelError, with a clause that gives the reason, where the text cannot express the
@@ -137,19 +159,23 @@ def _write_edited(path: Path, system: System, theta: Array, wanted: Any) -> list
     source = system.model_path.resolve()
     document = with_terms(MjcfDocument(source.read_bytes(), source), system.source)
     relocate_assets(document, system.source.spec, source.parent, path.resolve().parent)
+    attach_files(document, source.parent, path.resolve().parent, urdfs.files)
 
+    # The URDFs hold the values of their own elements.
     edits = ParameterEdits(document, system.source.spec, system.model, wanted)
-    edits.write_parameters(system.parameters, theta)
+    names = np.array([name not in urdfs.held for name in system.parameters.names], dtype=bool)
+    others = tuple(p for p in system.parameters.parameters if p.name not in urdfs.held)
+    edits.write_parameters(replace(system.parameters, parameters=others), theta[names])
 
     stated: list[str] = []
     with ExitStack() as stack:
         files = EditedFiles(document, system.source.spec, path, stack)
         found = files.compiled()
-        if not same_dynamics(found, wanted):
-            stated = edits.write_derived(found)
-            found = files.compiled()
-
         different = _differences(found, wanted)
+        if different:
+            stated = edits.write_derived(found)
+            different = _differences(files.compiled(), wanted)
+
         if different:
             raise ModelError(
                 f"with the identified values the text compiles to a different {listed(different)}"
@@ -234,6 +260,8 @@ def _differences(a: Any, b: Any) -> list[str]:
 def _equal(x: Any, y: Any) -> bool:
     """Return whether two arrays have the same shape and nearly the same numbers."""
     x, y = np.asarray(x), np.asarray(y)
+    if np.array_equal(x, y):
+        return True
     return x.shape == y.shape and bool(_close(x, y).all())
 
 

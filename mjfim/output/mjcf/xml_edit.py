@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 from xml.parsers import expat
@@ -127,7 +128,7 @@ class XmlText:
 
         def on_doctype(*_: object) -> NoReturn:
             """Refuse entities, which could expand without limit."""
-            raise ModelError("the MJCF has a DOCTYPE")
+            raise ModelError("the XML has a DOCTYPE")
 
         parser.StartElementHandler = on_start
         parser.EndElementHandler = on_end
@@ -136,7 +137,7 @@ class XmlText:
         try:
             parser.Parse(self._text, True)
         except expat.ExpatError as error:
-            raise ModelError(f"the MJCF is not well-formed XML in UTF-8 ({error})") from None
+            raise ModelError(f"the text is not well-formed XML in UTF-8 ({error})") from None
 
     @property
     def is_edited(self) -> bool:
@@ -226,6 +227,22 @@ class XmlText:
         """
         lines = [(0, f"<!-- {comment} -->".encode())] if comment else []
         self._last_children.setdefault(parent, []).extend([*lines, *element.lines(0)])
+
+    def insert_parent(
+        self, parent: int, name: str, children: Sequence[tuple[str, dict[str, str]]]
+    ) -> None:
+        """Add an element that contains empty ones as the first child of another one.
+
+        It gets the indentation of the present first child, and its content stands in one line.
+
+        Args:
+            parent: Index of the tag of the enclosing element.
+            name: Name of the new element.
+            children: Names of its children, each with its attributes.
+        """
+        inside = b"".join(b"<%s/>" % _start_tag(child, values) for child, values in children)
+        text = b"<%s>" % _start_tag(name, {}) + inside + b"</%s>" % name.encode()
+        self._children.setdefault(parent, []).append(text)
 
     def edited(self) -> bytes:
         """Return the text with all edits applied.

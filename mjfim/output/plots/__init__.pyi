@@ -10,9 +10,12 @@ from .monte_carlo import histogram, study_overview
 from .pairs import check_pairs, estimate_pairs
 from .parameter_trace import parameter_trace
 from .parameters import parameter_intervals, std_bars
+from .recording_comparison import recording_forest
 from .recording_fit import fit, held_out
 from .residuals import predictions, residual_spectra
+from .robot_comparison import robot_figure
 from .robustness import robustness_figure
+from .samples import drawn_robots
 from .selection import selection_figure
 from .style import save
 
@@ -22,6 +25,7 @@ __all__ = [
     "check_pairs",
     "compare_figure",
     "convergence",
+    "drawn_robots",
     "estimate_pairs",
     "fit",
     "held_out",
@@ -32,7 +36,9 @@ __all__ = [
     "parameter_intervals",
     "parameter_trace",
     "predictions",
+    "recording_forest",
     "residual_spectra",
+    "robot_figure",
     "robustness_figure",
     "save",
     "selection_figure",

@@ -22,6 +22,7 @@ from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.robot_comparison import RobotComparison
 from mjfim.records.robustness import Robustness
 from mjfim.records.shown import ShownRecord
 
@@ -104,14 +105,7 @@ def _(estimate: Estimate) -> Pictures:
         "parameters": partial(plots.parameter_intervals, estimate, labels),
         "spectra": partial(plots.residual_spectra, estimate, labels),
     }
-    if estimate.selection is not None:
-        pictures["selection"] = partial(plots.selection_figure, estimate)
-    if estimate.horizons is not None:
-        pictures["horizons"] = partial(plots.horizons_figure, estimate)
-    if estimate.inverse_dynamics is not None:
-        pictures["inverse_dynamics"] = partial(
-            plots.inverse_dynamics_figure, estimate.inverse_dynamics
-        )
+    pictures |= _studies(estimate)
     if len(estimate.trace) > 1:
         pictures["trace"] = partial(plots.parameter_trace, estimate, labels)
     if has_pairs(estimate.std):
@@ -125,6 +119,24 @@ def _(estimate: Estimate) -> Pictures:
     kept = sum(prediction.recording is not None for prediction in estimate.predictions)
     for i, name in enumerate(held_out_names(kept)):
         pictures[name] = partial(plots.held_out, estimate, i, labels)
+    return pictures
+
+
+def _studies(estimate: Estimate) -> Pictures:
+    """The figures of studies that only some estimates have."""
+    pictures: Pictures = {}
+    if estimate.selection is not None:
+        pictures["selection"] = partial(plots.selection_figure, estimate)
+    if estimate.horizons is not None:
+        pictures["horizons"] = partial(plots.horizons_figure, estimate)
+    if estimate.inverse_dynamics is not None:
+        pictures["inverse_dynamics"] = partial(
+            plots.inverse_dynamics_figure, estimate.inverse_dynamics
+        )
+    if estimate.recording_comparison is not None:
+        pictures["recordings"] = partial(plots.recording_forest, estimate)
+    if estimate.draws is not None:
+        pictures["samples"] = partial(plots.drawn_robots, estimate)
     return pictures
 
 
@@ -157,6 +169,14 @@ def _(check: Check) -> Pictures:
 def _(comparison: Comparison) -> Pictures:
     """The figure of a comparison."""
     return {"compare": partial(plots.compare_figure, comparison)}
+
+
+@pictures_of.register
+def _(comparison: RobotComparison) -> Pictures:
+    """The figure of a comparison of two robots; none without a parameter in common."""
+    if not comparison.parameters:
+        return {}
+    return {"robots": partial(plots.robot_figure, comparison)}
 
 
 @pictures_of.register

@@ -13,7 +13,16 @@ from pathlib import Path
 REPORT = "report.html"
 
 # Verbs whose results have a report; of several results in a folder, the first one is the main one.
-VERBS = ("campaign", "identify", "design", "compare", "montecarlo", "robustness", "check")
+VERBS = (
+    "campaign",
+    "identify",
+    "design",
+    "compare",
+    "compare-robots",
+    "montecarlo",
+    "robustness",
+    "check",
+)
 
 
 def own_report(verb: str) -> str:

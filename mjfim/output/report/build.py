@@ -18,6 +18,7 @@ from mjfim.output.report.estimate import estimate_page
 from mjfim.output.report.monte_carlo import study_page
 from mjfim.output.report.page import Page
 from mjfim.output.report.render import is_page_of, no_video_in, rendered, video_in
+from mjfim.output.report.robot_comparison import robots_page
 from mjfim.output.report.robustness import robustness_page
 from mjfim.output.video import Video
 from mjfim.records.campaign import Campaign
@@ -26,6 +27,7 @@ from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.robot_comparison import RobotComparison
 from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json
 from mjfim.records.shown import ShownRecord
@@ -36,6 +38,7 @@ KINDS: dict[str, type[ShownRecord]] = {
     "identify": Estimate,
     "design": Design,
     "compare": Comparison,
+    "compare-robots": RobotComparison,
     "montecarlo": MonteCarloStudy,
     "robustness": Robustness,
     "check": Check,
@@ -76,6 +79,7 @@ page_of.register(Estimate, estimate_page)
 page_of.register(Check, check_page)
 page_of.register(MonteCarloStudy, study_page)
 page_of.register(Comparison, comparison_page)
+page_of.register(RobotComparison, robots_page)
 page_of.register(Robustness, robustness_page)
 page_of.register(Campaign, campaign_page)
 
@@ -264,4 +268,6 @@ def _name(folder: Path, record: ShownRecord) -> str:
         return first_ones([PurePath(recording.name).name for recording in record.recordings])
     if isinstance(record, Comparison):
         return PurePath(record.source).stem
+    if isinstance(record, RobotComparison):
+        return " and ".join(record.names)
     return folder.resolve().name

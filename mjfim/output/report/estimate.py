@@ -29,10 +29,14 @@ from mjfim.output.report.curves import (
 from mjfim.output.report.horizons import horizons_section
 from mjfim.output.report.inverse_dynamics import inverse_dynamics_section
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
+from mjfim.output.report.recording_comparison import recordings_section
 from mjfim.output.report.residual_curves import Residuals
+from mjfim.output.report.samples import samples_section
 from mjfim.output.report.selection import selection_section
 from mjfim.output.summaries.estimate import FITTED_MARK, FITTED_NOTE, describe_estimate
 from mjfim.output.summaries.horizons import describe_horizons
+from mjfim.output.summaries.recording_comparison import describe_recordings
+from mjfim.output.summaries.samples import describe_samples
 from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.summary_parts import Listing, Part, Quantity, Summary
@@ -86,6 +90,10 @@ def estimate_page(estimate: Estimate) -> Page:
         sections.append(horizons_section(estimate.horizons))
     if estimate.inverse_dynamics is not None:
         sections.append(inverse_dynamics_section(estimate.inverse_dynamics))
+    if estimate.recording_comparison is not None:
+        sections.append(recordings_section(estimate))
+    if estimate.draws is not None:
+        sections.append(samples_section(estimate))
     if estimate.predictions:
         found: list[Part | PlotGroup] = [summary.table("predictions")]
         found += [summary.table("prediction details"), _prediction_plots(estimate, labels)]
@@ -149,13 +157,13 @@ def _parameter_parts(estimate: Estimate, summary: Summary) -> Iterator[Part | Pl
         note += f" Nominal values of 0 have no relative difference: {first_ones(absent)}."
     if panels:
         yield PlotGroup(title="", panels=panels, keys=keys if shares else (), note=note)
-    in_sections: list[Part] = []
+    in_own_section = [*describe_recordings(estimate), *describe_samples(estimate)]
     if estimate.selection is not None:
-        in_sections += describe_selection(estimate.selection)
+        in_own_section += describe_selection(estimate.selection)
     if estimate.horizons is not None:
-        in_sections += describe_horizons(estimate.horizons)
+        in_own_section += describe_horizons(estimate.horizons)
     for part in summary.parts:
-        if part in in_sections:
+        if part in in_own_section:
             continue
         if part is not table and getattr(part, "key", "") not in elsewhere:
             yield part

@@ -10,6 +10,8 @@ from mjfim.errors import listed
 from mjfim.output.summaries.accuracy import NOT_ALONE
 from mjfim.output.summaries.horizons import describe_horizons
 from mjfim.output.summaries.inverse_dynamics import equation_parts
+from mjfim.output.summaries.recording_comparison import describe_recordings
+from mjfim.output.summaries.samples import describe_samples
 from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.summary_parts import (
     Cell,
@@ -63,6 +65,8 @@ def describe_estimate(estimate: Estimate) -> Summary:
         parts += describe_horizons(estimate.horizons)
     if estimate.inverse_dynamics is not None:
         parts += equation_parts(estimate.inverse_dynamics)
+    parts += describe_recordings(estimate)
+    parts += describe_samples(estimate)
     if estimate.predictions:
         parts.append(Paragraph(text=_prediction_sentence(estimate.predictions)))
     parts.append(

@@ -21,6 +21,7 @@ from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.robot_comparison import RobotComparison
 from mjfim.records.robustness import Robustness
 from mjfim.records.shown import ShownRecord
 
@@ -434,6 +435,36 @@ def _(result: Robustness) -> tuple[str, ...]:
     if result.ok:
         return ("Play the design on the robot: `mjfim export DESIGN_FOLDER --to player -o FILE`.",)
     return ()
+
+
+@verdict_of.register
+def _(comparison: RobotComparison) -> Verdict:
+    """The verdict on two robots."""
+    text = str(comparison)
+    if not comparison.parameters:
+        return Verdict(text=text, level=Level.BAD)
+    if not comparison.is_reliable:
+        return Verdict(text=f"With reservations (see the warnings): {text}", level=Level.DOUBTFUL)
+    return Verdict(text=text, level=Level.DOUBTFUL if comparison.differs else Level.GOOD)
+
+
+@next_steps.register
+def _(comparison: RobotComparison) -> tuple[str, ...]:
+    """Return the next steps after a comparison of two robots."""
+    return tuple(_steps_after_robots(comparison))
+
+
+def _steps_after_robots(comparison: RobotComparison) -> Iterator[str]:
+    """Yield the next steps after a comparison of two robots."""
+    if not comparison.is_reliable:
+        yield "Let `mjfim identify --select` add what the model lacks, for both robots alike."
+    if min(comparison.recordings) < 2:
+        yield "Record each robot two or more times: this shows how much its recordings scatter."
+    if not comparison.differs:
+        yield (
+            "Smaller differences are found with longer recordings, or with a motion from "
+            "`mjfim design`."
+        )
 
 
 @verdict_of.register

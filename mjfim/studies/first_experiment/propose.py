@@ -24,6 +24,7 @@ from mjfim.model.elements import unnamed_count
 from mjfim.model.loading import ModelSource
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.sizes import position_sizes
+from mjfim.model.urdf_sources import is_urdf
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.trajectory import Sensitivity
 from mjfim.studies.first_experiment.candidates import Candidate, candidates
@@ -47,7 +48,7 @@ from mjfim.studies.first_experiment.selection import (
 )
 from mjfim.studies.first_experiment.start import Start, choose_start, influence_of_controls
 from mjfim.studies.first_experiment.time_scale import TimeScale, reach, time_scale
-from mjfim.studies.first_experiment.urdf import UrdfModel, is_urdf, read_urdf
+from mjfim.studies.first_experiment.urdf import UrdfModel, read_urdf
 from mjfim.studies.first_experiment.wishes import Wishes, require_rate
 
 # First and last frequency of the chirp, in characteristic periods of the motion.

@@ -70,20 +70,6 @@ class UrdfModel:
         return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def is_urdf(path: Path) -> bool:
-    """Whether a model file is a URDF.
-
-    Args:
-        path: The file.
-    """
-    try:
-        for _, element in ElementTree.iterparse(path, events=("start",)):
-            return bool(element.tag == "robot")
-    except (OSError, ElementTree.ParseError):
-        return False
-    return False
-
-
 def read_urdf(path: Path) -> UrdfModel:
     """Read a URDF, and give each joint a motor.
 

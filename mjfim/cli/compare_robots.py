@@ -1,0 +1,125 @@
+"""`mjfim compare-robots`: differences of two robots, or of one robot before and after."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mjfim.cli.common import (
+    AsJson,
+    Folder,
+    Force,
+    Pictures,
+    Verbose,
+    claim_folder,
+    errors,
+    is_elsewhere,
+    print_result,
+    say_written,
+    verb,
+    writing,
+)
+from mjfim.output.picture_format import PictureFormat
+
+# Files of an estimate.
+ESTIMATE_FILES = ("estimate.json", "estimate.npz")
+
+# Files that `estimate.json` names, in words.
+ORIGINS = {"experiment": "experiment files", "model": "models"}
+
+
+@verb
+def compare_robots(
+    first: Annotated[
+        Path, typer.Argument(metavar="DIR_A", help="Folder of `mjfim identify` of the first robot.")
+    ],
+    second: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR_B",
+            help="Folder of `mjfim identify` of the second robot, or of the first one later.",
+        ),
+    ],
+    output: Folder,
+    as_json: AsJson = False,
+    pictures: Pictures = PictureFormat.PNG,
+    verbose: Verbose = False,
+    force: Force = False,
+) -> None:
+    """Say which parameters of two robots differ, or what changed in one robot since.
+
+    The exit code is 1 if they differ, or if one of the estimates is not reliable.
+    """
+    from dataclasses import replace
+
+    from mjfim.output.folders import ROBOT_FILES
+    from mjfim.output.presentation import describe
+    from mjfim.records.estimate import Estimate
+    from mjfim.studies.robot_comparison import compare_estimates
+
+    estimates = [Estimate.load(folder) for folder in (first, second)]
+    inputs = [folder / name for folder in (first, second) for name in ESTIMATE_FILES]
+    claim_folder(output, pictures.files(ROBOT_FILES), inputs, force=force)
+    result = compare_estimates(*estimates, names=_names(first, second))
+    result = replace(result, remarks=(*result.remarks, *_differences_of_files(first, second)))
+
+    origin = {"first": _relative(first, output), "second": _relative(second, output)}
+    print_result(as_json, {**origin, **result.summary()}, describe(result), verbose=verbose)
+    with writing(output) as results:
+        results.write_robots_folder(output, result, origin, pictures)
+    say_written(output)
+    if is_elsewhere(as_json) and result.differs:
+        errors.print(f"mjfim: {result}", markup=False)
+    raise typer.Exit(1 if result.differs or not result.is_reliable else 0)
+
+
+def _names(first: Path, second: Path) -> tuple[str, str]:
+    """Names of both robots: the last parts of the folders in which they differ."""
+    parts = [_folder_of(path).resolve().parts for path in (first, second)]
+    longest = max(map(len, parts))
+    for count in range(1, longest):
+        names = ["/".join(each[-count:]) for each in parts]
+        if names[0] != names[1]:
+            return names[0], names[1]
+    return str(first), str(second)
+
+
+def _folder_of(path: Path) -> Path:
+    """The folder of an estimate, of which one of the files may be named."""
+    return path if path.is_dir() else path.parent
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """Name of a folder relative to that of the results; on another drive, the absolute path."""
+    try:
+        return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return path.resolve().as_posix()
+
+
+def _differences_of_files(first: Path, second: Path) -> Iterator[str]:
+    """Yield sentences on experiments and models that differ between two estimates."""
+    from mjfim.errors import RecordingError
+    from mjfim.records.serialization import read_json
+
+    try:
+        stated = [read_json(_folder_of(path) / "estimate.json") for path in (first, second)]
+    except RecordingError:
+        return
+
+    for key, words in ORIGINS.items():
+        files = [
+            _folder_of(path) / str(values.get(key))
+            for path, values in zip((first, second), stated, strict=True)
+        ]
+        if not all(file.is_file() for file in files):
+            yield f"the {words} of the estimates are not where they were, and are not compared"
+        elif files[0].read_bytes() != files[1].read_bytes():
+            yield (
+                f"the {words} of the estimates differ ({files[0].resolve()} and "
+                f"{files[1].resolve()}); numbers in them that are no parameters can shift others"
+            )

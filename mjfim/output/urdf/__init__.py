@@ -1,0 +1,1 @@
+"""The user's URDF with identified values."""

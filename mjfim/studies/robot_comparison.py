@@ -1,0 +1,416 @@
+"""Comparison of two estimates: two robots of one kind, or one robot before and after.
+
+Each parameter is tested by Student's test, with the honest standard deviations of both estimates
+and the scatter between recordings, which both robots share; all parameters together by the
+statistic of Wald. The p-values are corrected for the number of tests by the method of Holm (1979).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, first_ones
+from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
+from mjfim.identification.random_effects import between_variance, f_tail, satterthwaite
+from mjfim.records.estimate import NORMAL_95, Estimate
+from mjfim.records.recording import Recording
+from mjfim.records.robot_comparison import RobotComparison
+
+# Probability to find any difference where there is none.
+LEVEL = 0.05
+
+# Probability with which the stated differences would have been found.
+POWER = 0.8
+
+# Degrees of freedom of standard deviations that are as good as known.
+MANY = 1e6
+
+# Eigenvalues of a correlation matrix below this share of the largest one count as zero.
+RANK_TOLERANCE = 1e-9
+
+
+def compare_estimates(
+    first: Estimate, second: Estimate, *, names: Sequence[str] = ("A", "B")
+) -> RobotComparison:
+    """Compare two robots, or one robot before and after, by their estimates.
+
+    Args:
+        first: Estimate of the first robot.
+        second: Estimate of the second robot, from other recordings.
+        names: Names of both robots.
+
+    Returns:
+        Differences of the parameters that both estimates determine, and their significance.
+
+    Raises:
+        ExperimentError: The names are not two different ones, the estimates have no parameter in
+            common, or come from the same recordings.
+    """
+    names = tuple(names)
+    if len(names) != 2 or names[0] == names[1]:
+        raise ExperimentError(f"names: {names} must be two different names, one for each robot")
+
+    common = [name for name in first.parameters if name in second.parameters]
+    if not common:
+        raise ExperimentError(
+            f"{names[0]} and {names[1]} have no parameter in common "
+            f"({first_ones(first.parameters)} and {first_ones(second.parameters)}); identify both "
+            "with the same parameters"
+        )
+    shared = _shared_recordings(first, second)
+    if len(shared) == len(first.recordings) == len(second.recordings) > 0:
+        raise ExperimentError(
+            f"{names[0]} and {names[1]} are estimates from the same recordings, so that nothing "
+            "can differ but the experiments; record each robot"
+        )
+
+    compared = [name for name in common if not _why_not_compared(name, first, second, names)]
+    scatter = _Scatter.pooled(_Scatter.of(first, compared), _Scatter.of(second, compared))
+    robots = _Robot.of(first, compared, scatter), _Robot.of(second, compared, scatter)
+    tests = _Tests.of(*robots, scatter)
+    return RobotComparison(
+        names=names,
+        recordings=(len(first.recordings), len(second.recordings)),
+        parameters=tuple(compared),
+        units=robots[0].units,
+        is_single=np.array(robots[0].is_single & robots[1].is_single, dtype=np.float64),
+        values=np.array([robot.values for robot in robots]),
+        std=np.array([robot.std for robot in robots]),
+        interval=tests.interval,
+        p=tests.p,
+        detectable=tests.detectable,
+        joint_p=tests.joint_p,
+        level=LEVEL,
+        remarks=tuple(_remarks(first, second, names, common)),
+        is_reliable=all(estimate.success and not estimate.misfit for estimate in (first, second)),
+    )
+
+
+# ---- what is known about each robot
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Robot:
+    """Estimates of q parameters of one robot.
+
+    Attributes:
+        units: Their units; may be empty.
+        is_single: (q,) True for single numbers, False for entries of vectors and tensors.
+        values: (q,) estimates [theta-unit].
+        std: (q,) standard deviations, with the scatter between recordings [theta-unit].
+        between: (q,) part of the variances that is due to this scatter [squares of theta-units].
+        correlation: (q, q) correlation of the estimates.
+    """
+
+    units: tuple[str, ...]
+    is_single: np.ndarray
+    values: Array
+    std: Array
+    between: Array
+    correlation: Array
+
+    @staticmethod
+    def of(estimate: Estimate, parameters: Sequence[str], scatter: _Scatter) -> _Robot:
+        """What an estimate says about some of its parameters.
+
+        Args:
+            estimate: The estimate.
+            parameters: Names of parameters that it determines.
+            scatter: Scatter between recordings of both robots.
+        """
+        index = [estimate.parameters.index(name) for name in parameters]
+        noise = honest_std(estimate)[index]
+        between = scatter.tau2 / _effective_numbers(estimate, parameters)
+        variance = noise**2 + between
+        formal = estimate.covariance[np.ix_(index, index)]
+        size = np.sqrt(np.diag(formal))
+        is_known = size > 0.0
+        scale = np.where(is_known, 1.0 / np.where(is_known, size, 1.0), 0.0)
+        correlation = scale[:, None] * formal * scale
+        np.fill_diagonal(correlation, 1.0)
+        return _Robot(
+            units=tuple(estimate.units[j] for j in index),
+            is_single=(estimate.sizes == np.abs(estimate.theta))[index],
+            values=estimate.theta[index],
+            std=np.sqrt(variance),
+            between=between,
+            correlation=correlation,
+        )
+
+
+def honest_std(estimate: Estimate) -> Array:
+    """(p,) standard deviations of estimates, without the scatter between recordings [theta-unit].
+
+    They are those of the 95 % intervals, which allow for autocorrelated residuals.
+
+    Args:
+        estimate: The estimate.
+    """
+    low, high = estimate.interval.T
+    below, above = estimate.theta - low, high - estimate.theta
+    at_bound = np.isin(estimate.parameters, estimate.at_bound)
+    half_width = np.where(at_bound, np.maximum(below, above), 0.5 * (high - low))
+    without_scatter = np.maximum(estimate.std, estimate.std_sandwich)
+
+    # An interval that allows for recordings that disagree contains their scatter already.
+    is_apart = (estimate.between_recordings > 0.0) & (estimate.recording_comparison is not None)
+    widened = np.where(is_apart, 0.0, half_width / NORMAL_95)
+    return np.asarray(np.maximum(without_scatter, widened))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Scatter:
+    """Scatter of q parameters between recordings.
+
+    Attributes:
+        tau2: (q,) variances between recordings [squares of theta-units].
+        freedom: (q,) their degrees of freedom; 0 where nothing is known.
+    """
+
+    tau2: Array
+    freedom: np.ndarray
+
+    @staticmethod
+    def of(estimate: Estimate, parameters: Sequence[str]) -> _Scatter:
+        """Scatter between the recordings of one robot.
+
+        Args:
+            estimate: Its estimate.
+            parameters: Names of the parameters.
+        """
+        tau2, freedom = np.zeros(len(parameters)), np.zeros(len(parameters), dtype=int)
+        comparison = estimate.recording_comparison
+        if comparison is None:
+            return _Scatter(tau2=tau2, freedom=freedom)
+
+        found = between_variance(comparison.values, comparison.std**2)
+        for j, name in enumerate(parameters):
+            if name in comparison.parameters:
+                k = comparison.parameters.index(name)
+                tau2[j] = found[k]
+                freedom[j] = max(int(np.isfinite(comparison.values[:, k]).sum()) - 1, 0)
+        return _Scatter(tau2=tau2, freedom=freedom)
+
+    @staticmethod
+    def pooled(first: _Scatter, second: _Scatter) -> _Scatter:
+        """Scatter of two robots that scatter alike. Few recordings of one say little about it.
+
+        Args:
+            first: Scatter of the first robot.
+            second: Scatter of the second robot.
+        """
+        freedom = first.freedom + second.freedom
+        total = first.freedom * first.tau2 + second.freedom * second.tau2
+        return _Scatter(tau2=total / np.maximum(freedom, 1), freedom=freedom)
+
+
+def _effective_numbers(estimate: Estimate, parameters: Sequence[str]) -> Array:
+    """(q,) effective numbers of recordings of a weighted mean, at least 1."""
+    numbers = np.ones(len(parameters))
+    comparison = estimate.recording_comparison
+    if comparison is None:
+        return numbers
+
+    for j, name in enumerate(parameters):
+        if name not in comparison.parameters:
+            continue
+        std = comparison.std[:, comparison.parameters.index(name)]
+        weights = std[np.isfinite(std) & (std > 0.0)] ** -2.0
+        if weights.size:
+            numbers[j] = np.sum(weights) ** 2 / np.sum(weights**2)
+    return numbers
+
+
+# ---- tests
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Tests:
+    """Tests of the differences of q parameters.
+
+    Attributes:
+        interval: (q, 2) 95 % intervals of the differences [theta-unit].
+        p: (q,) p-values, corrected for the number of tests.
+        detectable: (q,) differences that would have been found [theta-unit].
+        joint_p: p-value of all parameters together, corrected likewise.
+    """
+
+    interval: Array
+    p: Array
+    detectable: Array
+    joint_p: float
+
+    @staticmethod
+    def of(first: _Robot, second: _Robot, scatter: _Scatter) -> _Tests:
+        """Test whether two robots are equal.
+
+        Args:
+            first: The first robot.
+            second: The second robot.
+            scatter: Scatter between recordings of both robots.
+        """
+        count = len(first.values)
+        difference = second.values - first.values
+        std = np.hypot(first.std, second.std)
+
+        # The scatter between recordings is known from few of them.
+        share = (first.between + second.between) / np.where(std > 0.0, std**2, 1.0)
+        freedom = satterthwaite(share, MANY, scatter.freedom)
+        p = 2.0 * scipy.special.stdtr(freedom, -np.abs(difference) / np.where(std > 0.0, std, 1.0))
+
+        t = scipy.special.stdtrit(freedom, 0.975)
+        found = scipy.special.stdtrit(freedom, 1.0 - 0.5 * LEVEL / (count + 1))
+        covariance = sum(
+            robot.correlation * np.outer(robot.std, robot.std) for robot in (first, second)
+        )
+        middle = float(np.median(freedom)) if count else MANY
+        squares, rank = _wald(difference, np.asarray(covariance))
+        corrected = holm(np.append(p, f_tail(squares, rank, middle)))
+        return _Tests(
+            interval=np.column_stack([difference - t * std, difference + t * std]),
+            p=corrected[:-1],
+            detectable=(found + scipy.special.stdtrit(freedom, POWER)) * std,
+            joint_p=float(corrected[-1]),
+        )
+
+
+def holm(p: Array) -> Array:
+    """Correct p-values for their number, so that any false finding is as rare as stated.
+
+    Args:
+        p: (q,) p-values.
+
+    Returns:
+        (q,) corrected p-values (Holm 1979).
+    """
+    order = np.argsort(p, kind="stable")
+    factors = np.arange(len(p), 0, -1)
+    corrected = np.empty(len(p))
+    corrected[order] = np.minimum(np.maximum.accumulate(factors * p[order]), 1.0)
+    return corrected
+
+
+def _wald(difference: Array, covariance: Array) -> tuple[float, int]:
+    """Squared length of a difference in its covariance, and the rank of the covariance."""
+    if not len(difference):
+        return 0.0, 0
+    std = np.sqrt(np.diag(covariance))
+    scale = np.where(std > 0.0, std, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    is_known = eigenvalues > RANK_TOLERANCE * eigenvalues.max()
+    along = vectors[:, is_known].T @ (difference / scale)
+    return float(np.sum(along**2 / eigenvalues[is_known])), int(is_known.sum())
+
+
+# ---- what limits the comparison
+
+
+def _why_not_compared(name: str, first: Estimate, second: Estimate, names: Sequence[str]) -> str:
+    """Why a parameter of both estimates cannot be compared; empty where it can."""
+    if name.startswith(INITIAL_STATE_PREFIX):
+        return "it belongs to a recording"
+    units = [estimate.units[estimate.parameters.index(name)] for estimate in (first, second)]
+    if units[0] != units[1]:
+        return f"its units differ ({units[0] or 'none'} and {units[1] or 'none'})"
+    for robot, estimate in zip(names, (first, second), strict=True):
+        if name in estimate.per_recording:
+            return f"{robot} has a value for each recording"
+        if not np.isfinite(estimate.std[estimate.parameters.index(name)]):
+            return f"the recordings of {robot} do not determine it"
+    return ""
+
+
+def _remarks(
+    first: Estimate, second: Estimate, names: Sequence[str], common: Sequence[str]
+) -> Iterator[str]:
+    """Sentences that limit a comparison, the most serious ones first."""
+    both = list(zip(names, (first, second), strict=True))
+    for robot, estimate in both:
+        if not estimate.success:
+            yield f"the estimate of {robot} is not reliable: {estimate.status}"
+        if estimate.misfit:
+            yield (
+                f"the model does not explain the recordings of {robot} (misfit); its error acts "
+                "like a difference, and the intervals do not cover it"
+            )
+
+    yield from _remarks_on_recordings(first, second, names)
+    for (robot, estimate), (other, another) in (both, both[::-1]):
+        missing = [name for name in estimate.parameters if name not in another.parameters]
+        missing = [name for name in missing if not name.startswith(INITIAL_STATE_PREFIX)]
+        if missing:
+            yield (
+                f"{first_ones(missing)}: a parameter of {robot}, but fixed for {other}, which can "
+                "shift other parameters"
+            )
+    yield from _remarks_on_parameters(first, second, names, common)
+
+
+def _remarks_on_recordings(
+    first: Estimate, second: Estimate, names: Sequence[str]
+) -> Iterator[str]:
+    """Sentences on recordings that both estimates contain, and on single ones."""
+    shared = _shared_recordings(first, second)
+    if shared:
+        yield (
+            f"both estimates contain {first_ones(shared)}, which makes them alike; identify each "
+            "robot from its own recordings"
+        )
+
+    counts = zip(names, (len(first.recordings), len(second.recordings)), strict=True)
+    single = [robot for robot, count in counts if count < 2]
+    if len(single) == 2:
+        yield (
+            "single recordings say nothing about the scatter between recordings of one robot, "
+            "which may look like a difference; two or more of each robot are better"
+        )
+    elif single:
+        yield f"of {single[0]} there is a single recording; it is taken to scatter like the other"
+
+
+def _remarks_on_parameters(
+    first: Estimate, second: Estimate, names: Sequence[str], common: Sequence[str]
+) -> Iterator[str]:
+    """Sentences on parameters that are not compared, and on priors."""
+    for name in common:
+        why = _why_not_compared(name, first, second, names)
+        if why and not name.startswith(INITIAL_STATE_PREFIX):
+            yield f"{name} is not compared: {why}"
+
+    with_prior = [
+        name for name in common if all(_has_prior(name, each) for each in (first, second))
+    ]
+    if with_prior:
+        yield (
+            f"{first_ones(with_prior)}: the priors of both estimates draw them to one value, so "
+            "that a difference looks smaller than it is"
+        )
+
+
+def _has_prior(name: str, estimate: Estimate) -> bool:
+    """Whether a parameter has a prior."""
+    j = estimate.parameters.index(name)
+    return bool(estimate.prior[j, j] > 0.0)
+
+
+def _shared_recordings(first: Estimate, second: Estimate) -> list[str]:
+    """Names of recordings that are part of both estimates."""
+    return [
+        recording.name
+        for recording in first.recordings
+        if any(_is_same(recording, other) for other in second.recordings)
+    ]
+
+
+def _is_same(recording: Recording, other: Recording) -> bool:
+    """Whether two recordings have the same times and measurements."""
+    return (
+        recording.y.shape == other.y.shape
+        and bool(np.array_equal(recording.t, other.t))
+        and bool(np.array_equal(recording.y, other.y, equal_nan=True))
+    )

@@ -1,0 +1,199 @@
+"""Draws of robots: their moments against the honest covariance, their bounds and their inertias."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest, truncnorm
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.experiment.system import System
+from mjfim.identification.parameter_draws import (
+    complete_theta,
+    draw_parameters,
+    draw_parameters_system,
+    honest_covariance,
+)
+from tests.support.numerics import Array
+from tests.support.paths import MODELS
+
+# Standard deviations of mass, length and damping, and a correlation of the first two.
+STD = np.array([0.02, 0.03, 0.1])
+COVARIANCE = np.diag(STD**2)
+COVARIANCE[0, 1] = COVARIANCE[1, 0] = -0.8 * STD[0] * STD[1]
+
+
+def stated(**tables: Any) -> mjfim.Experiment:
+    """The cart-pendulum."""
+    return mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**tables)
+
+
+def estimated(system: System, covariance: Array, **fields: Any) -> mjfim.Estimate:
+    """An estimate of a system at its guess with a formal covariance."""
+    guess = system.parameters.guess
+    values = {
+        "parameters": system.parameters.names,
+        "theta": guess,
+        "std": np.sqrt(np.diag(covariance)),
+        "covariance": covariance,
+        "initial_theta": guess,
+        "chi2": 1.0,
+        "dof": 1,
+        "status": "",
+        "success": True,
+        "misfit": False,
+        "iterations": 1,
+        "residual_rms": {},
+        "at_bound": (),
+        "predicted": (),
+        "recordings": (),
+    }
+    return mjfim.Estimate(**{**values, **fields})
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    return System.resolve(stated())
+
+
+def test_the_moments_are_those_of_the_formal_covariance(system: System) -> None:
+    estimate = estimated(system, COVARIANCE)
+    draws = draw_parameters(stated(), estimate, 2000, np.random.default_rng(1))
+    assert draws.parameters == ("m", "l", "c")
+    assert draws.units == ("kg", "m", "N m s/rad")
+    assert len(draws) == 2000
+    np.testing.assert_allclose(draws.std, STD, rtol=1e-3)
+
+    deviation = draws.values - estimate.theta
+    distance = np.einsum("ni,ij,nj->n", deviation, np.linalg.inv(COVARIANCE), deviation)
+    assert kstest(distance, chi2(3).cdf).pvalue > 1e-3
+
+    # The test can fail: other correlations do not fit.
+    wrong = np.einsum("ni,ij,nj->n", deviation, np.diag(STD**-2), deviation)
+    assert kstest(wrong, chi2(3).cdf).pvalue < 1e-6
+
+
+def test_wide_intervals_stretch_the_formal_covariance(system: System) -> None:
+    """The intervals are twice and three times as wide as the formal ones."""
+    factor = np.array([2.0, 3.0, 1.0])
+    theta = system.parameters.guess
+    half = 1.959964 * factor * STD
+    estimate = estimated(system, COVARIANCE, interval=np.column_stack([theta - half, theta + half]))
+    found = honest_covariance(system, estimate)
+    np.testing.assert_allclose(found, COVARIANCE * np.outer(factor, factor), rtol=1e-5)
+
+
+def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
+    """The damping ends at its lower bound, and cannot be negative."""
+    bounded = estimated(
+        system,
+        COVARIANCE,
+        theta=np.array([2.0, 1.0, 0.0]),
+        interval=np.array([[1.9, 2.1], [0.9, 1.1], [0.0, 0.4]]),
+    )
+    found = honest_covariance(system, bounded)
+    np.testing.assert_allclose(np.sqrt(found[2, 2]), 0.4 / 1.959964, rtol=1e-5)
+    draws = draw_parameters_system(system, bounded, 1000, np.random.default_rng(2))
+    half_normal = truncnorm(0.0, np.inf, scale=0.4 / 1.959964)
+    assert kstest(draws.values[:, 2], half_normal.cdf).pvalue > 1e-3
+
+    # Both sides cut off: the deviations that led to the interval remain.
+    narrow = System.resolve(stated(parameters={"c": {"bounds": [0.9, 1.5]}}))
+    cut = replace(bounded, theta=np.array([2.0, 1.0, 1.0]), std=np.array([0.1, 0.1, 2.0]))
+    cut = replace(cut, interval=np.array([[1.9, 2.1], [0.9, 1.1], [0.9, 1.5]]))
+    assert np.sqrt(honest_covariance(narrow, cut)[2, 2]) == 2.0
+    damping = draw_parameters_system(narrow, cut, 500, np.random.default_rng(2)).values[:, 2]
+    assert 0.9 <= damping.min() < 0.92 and 1.48 < damping.max() <= 1.5
+
+
+def test_deviations_between_recordings_count(system: System) -> None:
+    estimate = estimated(
+        system, COVARIANCE, std_sandwich=2.0 * STD, between_recordings=np.array([0.0, 0.0, 0.3])
+    )
+    found = np.sqrt(np.diag(honest_covariance(system, estimate)))
+    np.testing.assert_allclose(found, [0.04, 0.06, np.hypot(0.2, 0.3)], rtol=1e-3)
+
+    # A parameter with a value for each recording is centred at their mean, and scatters as they do.
+    differing = estimated(system, COVARIANCE, per_recording={"c": (1.0, 2.0)})
+    draws = draw_parameters_system(system, differing, 10, np.random.default_rng(0))
+    assert draws.centre[2] == 1.5
+    np.testing.assert_allclose(draws.std[2], np.hypot(0.1, np.sqrt(0.5)), rtol=1e-3)
+
+
+def test_undetermined_parameters_are_named(system: System) -> None:
+    infinite = np.array([0.02, np.inf, 0.1])
+    covariance = np.diag(infinite**2)
+    with pytest.raises(ExperimentError, match=r"do not determine l, so that .*prior"):
+        draw_parameters_system(system, estimated(system, covariance), 5, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("count", [0, -3, 10_001])
+def test_counts_out_of_range(system: System, count: int) -> None:
+    with pytest.raises(ExperimentError, match=rf"robots is {count}; it must be from 1 to 10000"):
+        draw_parameters_system(
+            system, estimated(system, COVARIANCE), count, np.random.default_rng(0)
+        )
+
+
+def test_an_estimate_of_another_experiment(system: System) -> None:
+    other = replace(estimated(system, COVARIANCE), parameters=("m", "l", "d"))
+    with pytest.raises(ExperimentError, match=r"other parameters \(m, l, d\)"):
+        draw_parameters_system(system, other, 5, np.random.default_rng(0))
+    outside = replace(estimated(system, COVARIANCE), theta=np.array([2.0, 1.0, -1.0]))
+    with pytest.raises(ExperimentError, match="c lies outside of its bounds"):
+        draw_parameters_system(system, outside, 5, np.random.default_rng(0))
+
+
+def test_initial_states_are_no_properties_of_a_robot() -> None:
+    system = System.resolve(stated(nuisance={"initial": 0.1, "delay": 0.01}))
+    names = system.parameters.names
+    covariance = np.diag(np.full(len(names), 1e-4))
+    # Nobody asks how well an initial state is known.
+    covariance[3, 3] = np.inf
+    assert names[3].startswith("initial")
+    estimate = estimated(system, covariance)
+    draws = draw_parameters_system(system, estimate, 4, np.random.default_rng(0))
+    assert draws.parameters == ("m", "l", "c", "delay")
+    theta = complete_theta(system, estimate, draws, 2)
+    np.testing.assert_array_equal(theta[3:-1], estimate.theta[3:-1])
+    np.testing.assert_array_equal(theta[[0, 1, 2, -1]], draws.values[2])
+
+
+def test_unphysical_inertias_are_replaced() -> None:
+    """Central moments may break the triangle inequality; log-Cholesky coordinates cannot."""
+    central = {
+        "Ixx": {"target": "body/cart:inertia[0]", "guess": 0.01},
+        "Iyy": {"target": "body/cart:inertia[1]", "guess": 0.01},
+        "Izz": {"target": "body/cart:inertia[2]", "guess": 0.01},
+    }
+    base = stated()
+    values = {**base.model_dump(exclude_unset=True), "directory": MODELS}
+    system = System.resolve(mjfim.Experiment(**{**values, "parameters": central}))
+    assert system.parameters.names == ("Ixx", "Iyy", "Izz")
+    estimate = estimated(system, np.diag(np.full(3, 0.006**2)))
+    draws = draw_parameters_system(system, estimate, 200, np.random.default_rng(3))
+    assert draws.replaced > 20
+    assert "replaced" in str(draws)
+    moments = np.sort(draws.values, axis=1)
+    assert (moments[:, 0] > 0.0).all()
+    assert (moments[:, 2] <= (moments[:, 0] + moments[:, 1])).all()
+
+    hopeless = estimated(system, np.diag([0.006**2, 0.006**2, 1e12]))
+    with pytest.raises(ExperimentError, match=r"of 5 drawn robots still .*logcholesky"):
+        draw_parameters_system(system, hopeless, 5, np.random.default_rng(3))
+
+    whole = {"cart": {"inertial": "cart"}}
+    system = System.resolve(mjfim.Experiment(**{**values, "parameters": whole}))
+    draws = draw_parameters_system(
+        system, estimated(system, np.diag(np.full(10, 0.5**2))), 50, np.random.default_rng(3)
+    )
+    assert draws.replaced == 0
+    for values_of_robot in draws.values:
+        model = system.model_at(values_of_robot)
+        mujoco.mj_forward(model, mujoco.MjData(model))
+        assert model.body("cart").mass[0] > 0.0

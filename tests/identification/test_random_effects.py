@@ -1,0 +1,127 @@
+"""Random effects against their defining equations, dense least squares and simulated sets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.stats import chi2, f, kstest
+
+from mjfim.identification.random_effects import (
+    Information,
+    between_variance,
+    difference,
+    f_tail,
+    random_effects,
+    satterthwaite,
+    total_of,
+)
+
+
+def test_between_variance_solves_the_equation_of_paule_and_mandel() -> None:
+    rng = np.random.default_rng(0)
+    variances = rng.uniform(0.1, 4.0, (7, 30))
+    values = rng.normal(size=(7, 30)) * np.sqrt(variances + np.linspace(0.0, 9.0, 30))
+    found = between_variance(values, variances)
+
+    def squares(tau2: float, j: int) -> float:
+        """Weighted squares of the deviations, less their expected value."""
+        w = 1.0 / (variances[:, j] + tau2)
+        mean = np.sum(w * values[:, j]) / w.sum()
+        return float(np.sum(w * (values[:, j] - mean) ** 2) - 6.0)
+
+    positive = [j for j in range(30) if squares(0.0, j) > 0.0]
+    assert 10 < len(positive) < 30
+    for j in range(30):
+        wanted = brentq(squares, 0.0, 1e4, args=(j,), xtol=1e-12) if j in positive else 0.0
+        assert found[j] == pytest.approx(wanted, rel=1e-8, abs=1e-12)
+
+
+def test_missing_estimates_are_left_out() -> None:
+    values = np.array([[1.0, np.nan], [2.0, np.nan], [np.nan, 5.0]])
+    variances = np.array([[1.0, np.inf], [1.0, np.inf], [np.inf, 2.0]])
+    found = random_effects(values, variances, 1e9)
+    np.testing.assert_array_equal(found.count, [2, 1])
+    np.testing.assert_allclose(found.mean, [1.5, 5.0])
+    np.testing.assert_allclose(found.variance, [0.5, 2.0])
+    np.testing.assert_allclose(found.p, [chi2(1).sf(0.5), 1.0])
+    assert np.isinf(found.prediction).all()
+    nothing = random_effects(np.full((2, 1), np.nan), np.full((2, 1), np.inf), 10.0)
+    assert np.isnan(nothing.mean[0]) and np.isinf(nothing.variance[0]) and nothing.p[0] == 1.0
+
+
+@pytest.mark.parametrize("tau", [0.0, 1.0, 3.0])
+def test_intervals_for_another_recording_hold_its_estimate(tau: float) -> None:
+    """Exact for equal variances, whatever the scatter between recordings is."""
+    rng = np.random.default_rng(1)
+    count, sets = 4, 4000
+    values = rng.normal(size=(count + 1, sets)) * np.hypot(1.0, tau)
+    low, high = random_effects(values[:-1], np.ones((count, sets)), 1e9).prediction.T
+    inside = (low <= values[-1]) & (values[-1] <= high)
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.012)
+
+
+def test_p_values_of_equal_recordings_are_uniform() -> None:
+    rng = np.random.default_rng(2)
+    variances = rng.uniform(0.2, 2.0, (5, 2000))
+    values = rng.normal(size=(5, 2000)) * np.sqrt(variances)
+    assert kstest(random_effects(values, variances, 1e9).p, "uniform").pvalue > 1e-3
+
+
+def parts_of(rng: np.random.Generator, ranks: list[int], size: int) -> list[Information]:
+    """Random information about `size` unknowns, of given ranks."""
+    rows = [rng.normal(size=(rank, size)) for rank in ranks]
+    return [Information(matrix=J.T @ J, vector=J.T @ (J @ rng.normal(size=size))) for J in rows]
+
+
+@pytest.mark.parametrize("ranks", [[4, 4], [2, 3, 4], [1, 1, 1, 1], [2, 2, 1]])
+def test_difference_is_the_increase_of_squares(ranks: list[int]) -> None:
+    """Dense least squares with one theta for each part, and with one for all."""
+    rng = np.random.default_rng(3)
+    size = 4
+    rows = [rng.normal(size=(rank, size)) for rank in ranks]
+    y = [rng.normal(size=rank) for rank in ranks]
+    parts = [Information(matrix=J.T @ J, vector=J.T @ b) for J, b in zip(rows, y, strict=True)]
+
+    # Each part alone explains its data exactly, because it has at most as many rows as unknowns.
+    J, b = np.concatenate(rows), np.concatenate(y)
+    together = np.linalg.lstsq(J, b)[0]
+    squares, dof = difference(parts, 1e-9)
+    assert squares == pytest.approx(np.sum((J @ together - b) ** 2), rel=1e-9, abs=1e-12)
+    assert dof == len(b) - np.linalg.matrix_rank(J)
+
+
+def test_scatter_adds_to_the_covariance_also_of_singular_information() -> None:
+    rng = np.random.default_rng(4)
+    (full,) = parts_of(rng, [3], 3)
+    tau2 = np.diag([0.5, 0.0, 2.0])
+    found = full.with_scatter(tau2)
+    np.testing.assert_allclose(
+        np.linalg.inv(found.matrix), np.linalg.inv(full.matrix) + tau2, rtol=1e-9, atol=1e-12
+    )
+    estimate = np.linalg.solve(full.matrix, full.vector)
+    np.testing.assert_allclose(np.linalg.solve(found.matrix, found.vector), estimate, rtol=1e-8)
+
+    # Information about one direction: its variance grows by the scatter along it.
+    direction = np.array([1.0, 2.0, -1.0])
+    rank_one = Information(matrix=np.outer(direction, direction), vector=3.0 * direction)
+    scattered = rank_one.with_scatter(tau2)
+    variance = 1.0 + direction @ tau2 @ direction
+    np.testing.assert_allclose(scattered.matrix, rank_one.matrix / variance, atol=1e-12)
+    np.testing.assert_allclose(scattered.vector, rank_one.vector / variance, atol=1e-12)
+    assert rank_one.with_scatter(np.zeros((3, 3))) is rank_one
+
+
+def test_totals_add() -> None:
+    parts = parts_of(np.random.default_rng(5), [2, 2, 1], 3)
+    total = total_of(parts)
+    np.testing.assert_allclose(total.matrix, sum(part.matrix for part in parts))
+    np.testing.assert_allclose(total.vector, sum(part.vector for part in parts))
+
+
+def test_distributions() -> None:
+    assert f_tail(6.0, 3, 10.0) == pytest.approx(f(3, 10).sf(2.0))
+    assert f_tail(6.0, 0, 10.0) == 1.0
+    np.testing.assert_allclose(
+        satterthwaite(np.array([0.0, 1.0, 0.5]), 50.0, 2), [50.0, 2.0, 1.0 / (0.25 / 50 + 0.125)]
+    )

@@ -1,0 +1,84 @@
+"""Draws from a truncated normal distribution against rejection sampling and against theory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import ks_2samp, kstest, norm, truncnorm
+
+from mjfim.identification.truncated_normal import draw_truncated_normal
+from tests.support.numerics import Array
+
+INFINITE = np.full(3, np.inf)
+
+
+def covariance_of(std: Array, correlation: float) -> Array:
+    """Covariance of variables of which each pair has the same correlation."""
+    count = len(std)
+    matrix = np.full((count, count), correlation) + (1.0 - correlation) * np.eye(count)
+    return np.asarray(matrix * np.outer(std, std))
+
+
+def test_without_bounds_the_moments_are_those_of_the_normal_distribution() -> None:
+    mean, std = np.array([1.0, -2.0, 30.0]), np.array([1e-6, 2.0, 1e5])
+    covariance = covariance_of(std, 0.7)
+    rng = np.random.default_rng(1)
+    drawn = draw_truncated_normal(mean, covariance, -INFINITE, INFINITE, 4000, rng)
+    for j in range(3):
+        assert kstest(drawn[:, j], norm(mean[j], std[j]).cdf).pvalue > 1e-3
+    np.testing.assert_allclose(np.corrcoef(drawn.T)[0, 1:], 0.7, atol=0.03)
+
+
+@pytest.mark.parametrize("correlation", [-0.45, 0.0, 0.9, 0.999])
+def test_bounds_cut_off_as_rejection_does(correlation: float) -> None:
+    mean, std = np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.0, 0.5])
+    covariance = covariance_of(std, correlation)
+    lower, upper = np.array([0.0, -1.0, -np.inf]), np.array([np.inf, 4.0, 2.3])
+    rng = np.random.default_rng(2)
+    drawn = draw_truncated_normal(mean, covariance, lower, upper, 3000, rng)
+    assert ((lower <= drawn) & (drawn <= upper)).all()
+
+    plain = rng.multivariate_normal(mean, covariance, 60_000)
+    kept = plain[((lower <= plain) & (plain <= upper)).all(axis=1)]
+    for direction in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0.3, 0], [1, -0.3, 1], [0, 1, -6]):
+        assert ks_2samp(drawn @ direction, kept @ direction).pvalue > 1e-3
+
+
+def test_many_estimates_at_their_bounds() -> None:
+    """Rejection would keep one of 2^14 draws."""
+    zero, std = np.zeros(14), np.linspace(0.1, 10.0, 14)
+    rng = np.random.default_rng(3)
+    drawn = draw_truncated_normal(zero, np.diag(std**2), zero, np.full(14, np.inf), 1000, rng)
+    for j in range(14):
+        assert kstest(drawn[:, j] / std[j], truncnorm(0.0, np.inf).cdf).pvalue > 1e-3
+
+
+def test_an_interval_far_in_the_tail() -> None:
+    rng = np.random.default_rng(4)
+    bound = np.array([7.0])
+    drawn = draw_truncated_normal(np.zeros(1), np.eye(1), -bound, bound, 2000, rng)
+    assert kstest(drawn[:, 0], norm.cdf).pvalue > 1e-3
+
+    # The mean is at the bound, and a narrow interval remains.
+    drawn = draw_truncated_normal(np.ones(1), np.eye(1), np.ones(1), np.ones(1) + 1e-9, 9, rng)
+    assert ((drawn >= 1.0) & (drawn <= 1.0 + 1e-9)).all()
+    assert len(np.unique(drawn)) > 1
+
+
+def test_a_singular_covariance_keeps_its_directions() -> None:
+    mean = np.array([1.0, 2.0, 3.0])
+    direction = np.array([1.0, -2.0, 0.0])
+    covariance = np.outer(direction, direction)
+    lower = np.array([0.5, -np.inf, -np.inf])
+    rng = np.random.default_rng(5)
+    drawn = draw_truncated_normal(mean, covariance, lower, INFINITE, 500, rng)
+    np.testing.assert_allclose(drawn[:, 0] * 2.0 + drawn[:, 1], 4.0, atol=1e-9)
+    np.testing.assert_array_equal(drawn[:, 2], 3.0)
+    assert drawn[:, 0].min() >= 0.5
+
+
+def test_draws_depend_on_the_generator_alone() -> None:
+    arguments = (np.zeros(2), np.eye(2), np.zeros(2), np.full(2, np.inf), 5)
+    first = draw_truncated_normal(*arguments, np.random.default_rng(6))
+    again = draw_truncated_normal(*arguments, np.random.default_rng(6))
+    np.testing.assert_array_equal(first, again)

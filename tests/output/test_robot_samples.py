@@ -1,0 +1,133 @@
+"""Models of drawn robots: each equals the model in memory, and nothing is half-written."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.experiment.system import System
+from mjfim.identification.parameter_draws import complete_theta, draw_parameters_system
+from mjfim.output import robot_samples
+from mjfim.output.manifest import MANIFEST, OutputGuard, claimed
+from mjfim.output.mjcf.write import same_dynamics, write_identified
+from mjfim.output.robot_samples import clear_samples, sample_files, write_samples
+from mjfim.records.estimate import Estimate
+from tests.identification.test_parameter_draws import COVARIANCE, estimated
+from tests.support.paths import MODELS
+
+# A robot whose link stands in an included file.
+MAIN = """
+<mujoco>
+  <worldbody><include file="link.xml"/></worldbody>
+  <actuator><motor name="drive" joint="hinge"/></actuator>
+</mujoco>
+"""
+LINK = """
+<mujocoinclude>
+  <body name="link">
+    <joint name="hinge" axis="0 1 0" damping="0.1"/>
+    <inertial pos="0 0 -0.3" mass="1" diaginertia="0.01 0.01 0.001"/>
+  </body>
+</mujocoinclude>
+"""
+
+
+def drawn(system: System, covariance: Any, count: int) -> Estimate:
+    """An estimate with draws."""
+    estimate = estimated(system, np.asarray(covariance))
+    rng = np.random.default_rng(0)
+    return replace(estimate, draws=draw_parameters_system(system, estimate, count, rng))
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    return System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+
+
+def test_every_model_is_the_one_in_memory(system: System, tmp_path: Path) -> None:
+    estimate = drawn(system, COVARIANCE, 5)
+    assert estimate.draws is not None
+    assert write_samples(tmp_path, estimate, system) == []
+    expected = sample_files(tmp_path, 5, system.model_path)
+    found = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")}
+    assert found == set(expected)
+
+    for i in range(5):
+        path = tmp_path / "samples" / f"robot_{i + 1:04d}.xml"
+        written = mujoco.MjModel.from_xml_path(str(path))
+        theta = complete_theta(system, estimate, estimate.draws, i)
+        assert same_dynamics(written, system.model_at(theta, at_keyframe=False))
+        assert written.body("bob").mass[0] == estimate.draws.values[i, 0]
+
+    # The table holds all digits.
+    with (tmp_path / "samples.csv").open(encoding="utf-8", newline="") as stream:
+        header, *rows = csv.reader(stream)
+    assert header == ["robot", "m [kg]", "l [m]", "c [N m s/rad]"]
+    assert [row[0] for row in rows] == ["1", "2", "3", "4", "5"]
+    table = np.array([[float(cell) for cell in row[1:]] for row in rows])
+    np.testing.assert_array_equal(table, estimate.draws.values)
+
+
+def test_included_files_are_written_for_each_robot(tmp_path: Path) -> None:
+    (tmp_path / "main.xml").write_text(MAIN, encoding="utf-8")
+    (tmp_path / "link.xml").write_text(LINK, encoding="utf-8")
+    tables: dict[str, Any] = {
+        "model": "main.xml",
+        "directory": tmp_path,
+        "rate": 100.0,
+        "noise": {"state": 0.01},
+        "parameters": {"mass": {"target": "body/link:mass"}},
+    }
+    system = System.resolve(mjfim.Experiment(**tables))
+    estimate = drawn(system, [[1e-4]], 3)
+    out = tmp_path / "out"
+    write_samples(out, estimate, system)
+    assert estimate.draws is not None
+    found = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
+    assert found == set(sample_files(out, 3, system.model_path))
+    for i in range(3):
+        model = mujoco.MjModel.from_xml_path(str(out / "samples" / f"robot_{i + 1:04d}.xml"))
+        assert model.body("link").mass[0] == estimate.draws.values[i, 0]
+
+
+def test_without_robots_there_are_no_files(system: System, tmp_path: Path) -> None:
+    assert sample_files(tmp_path, 0, system.model_path) == ()
+
+
+def test_all_models_are_written_or_none(
+    system: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The third model cannot be written."""
+    estimate = drawn(system, COVARIANCE, 4)
+    write = write_identified
+
+    def fail(path: Path, *arguments: Any) -> str | None:
+        """Write the model of a robot, but not that of the third."""
+        if path.stem.endswith("3"):
+            raise mjfim.errors.ModelError("the link has a fault")
+        return write(path, *arguments)
+
+    monkeypatch.setattr(robot_samples, "write_identified", fail)
+    with claimed(tmp_path, OutputGuard([], force=False), exclusive=True):
+        (remark,) = write_samples(tmp_path, estimate, system)
+    assert remark == "no models of drawn robots were written: the link has a fault"
+    assert {path.name for path in tmp_path.iterdir()} == {"samples.csv", MANIFEST}
+
+
+def test_files_of_the_user_remain(system: System, tmp_path: Path) -> None:
+    with claimed(tmp_path, OutputGuard([], force=False), exclusive=True):
+        write_samples(tmp_path, drawn(system, COVARIANCE, 3), system)
+    (tmp_path / "samples" / "robot_0002.xml").write_text("edited", encoding="utf-8")
+    (tmp_path / "samples" / "notes.txt").write_text("mine", encoding="utf-8")
+    with claimed(tmp_path, OutputGuard([], force=False), exclusive=True):
+        clear_samples(tmp_path)
+    names = {path.name for path in (tmp_path / "samples").iterdir()}
+    assert names == {"robot_0002.xml", "notes.txt", MANIFEST}
+    assert not (tmp_path / "samples.csv").exists()

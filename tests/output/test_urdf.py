@@ -1,0 +1,425 @@
+"""The user's URDF with identified values: its text is kept, and MuJoCo reads the robot from it."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ModelError
+from mjfim.experiment.system import System
+from mjfim.model.urdf_sources import urdf_sources
+from mjfim.output.manifest import MANIFEST
+from mjfim.output.mjcf.write import same_dynamics, write_identified
+from mjfim.output.robot_samples import sample_files, write_samples
+from mjfim.output.urdf.document import UrdfDocument
+from mjfim.output.urdf.write import urdf_files, write_identified_urdfs
+from tests.output.test_robot_samples import drawn
+from tests.support.cli import names, run
+from tests.support.numerics import Array
+
+# Two links with inertial frames that are turned, and a tool that is fixed to the second one.
+URDF = """<?xml version="1.0"?>
+<!-- größer als ASCII; <mass value="9"/> stays a comment -->
+<robot name='two'>
+  <link name="base"/>
+  <link name="upper">
+    <inertial>
+      <!-- from CAD -->
+      <origin xyz="0.10 0.02 -0.150" rpy="0.3 -0.2 0.5"/>
+      <mass   value="1.50"/>
+      <inertia ixx="0.020" ixy="0.001" ixz="0" iyy="0.030"
+               iyz="-0.0020" izz="0.0150"/>
+    </inertial>
+    <visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual>
+  </link>
+  <link name='lower'>
+    <inertial>
+      <mass value="0.7"/>
+      <origin xyz='0 0 -0.1' rpy='0 0.7 0'/>
+      <inertia ixx="0.004" ixy="0" ixz="0" iyy="0.005" iyz="0" izz="0.0020"/>
+    </inertial>
+  </link>
+  <link name="tool">
+    <inertial>
+      <origin xyz="0 0.01 0.03" rpy="1.0 0 0"/>
+      <mass value="0.2"/>
+      <inertia ixx="0.0004" ixy="0" ixz="0" iyy="0.0005" iyz="0" izz="0.00020"/>
+    </inertial>
+  </link>
+  <joint name="shoulder" type="revolute">
+    <parent link="base"/> <child link="upper"/>
+    <origin xyz="0 0 1.0" rpy="0.1 0.2 0"/>
+    <axis xyz="0 1 0"/>
+    <dynamics damping="0.10" friction="0.050"/>
+    <limit lower="-3" upper="3" effort="20" velocity="5"/>
+  </joint>
+  <joint name="elbow" type="continuous">
+    <parent link="upper"/> <child link="lower"/>
+    <origin xyz="0 0 -0.3"/>
+    <axis xyz="1 0 0"/>
+  </joint>
+  <joint name="flange" type="fixed">
+    <parent link="lower"/> <child link="tool"/>
+    <origin xyz="0 0 -0.2" rpy="0 0 0.4"/>
+  </joint>
+</robot>
+"""
+
+# An MJCF that attaches the URDF, as `mjfim init` writes it.
+MOTORS = """<mujoco model="driven">
+  <!-- motors for the URDF -->
+  <asset><model name="robot" file="two.urdf"/></asset>
+  <worldbody><attach model="robot" prefix="{prefix}"/></worldbody>
+  <actuator>
+    <motor name="m" joint="{prefix}shoulder" gear="2.0"/>
+    <motor name="n" joint="{prefix}elbow"/>
+  </actuator>
+</mujoco>
+"""
+
+# Parameters of the robot.
+PARAMETERS: dict[str, dict[str, Any]] = {
+    "lower": {"inertial": "lower"},
+    "upper_mass": {"target": "body/upper:mass"},
+    "upper_com": {"target": "body/upper:ipos[1]"},
+    "upper_Iyy": {"target": "body/upper:fullinertia[1]"},
+    "shoulder_damping": {"target": "joint/shoulder:damping"},
+    "elbow_damping": {"target": "joint/elbow:damping", "scale": 0.1},
+    "elbow_friction": {"target": "joint/elbow:frictionloss", "scale": 0.1},
+}
+
+
+def system_of(
+    folder: Path, model: str = "two.urdf", prefix: str = "", **further: dict[str, Any]
+) -> System:
+    """The system of a model in a folder, with further parameters."""
+    (folder / "two.urdf").write_text(URDF, encoding="utf-8")
+    (folder / "driven.xml").write_text(MOTORS.format(prefix=prefix), encoding="utf-8")
+    tables: dict[str, Any] = {
+        "model": model,
+        "directory": folder,
+        "rate": 100.0,
+        "noise": {"state": 0.01},
+        "parameters": {**PARAMETERS, **further},
+    }
+    return System.resolve(mjfim.Experiment(**tables))
+
+
+def other_values(system: System) -> Array:
+    """Values beside the guess."""
+    theta = np.array(system.parameters.guess)
+    rng = np.random.default_rng(0)
+    theta += 0.1 * rng.uniform(-1.0, 1.0, len(theta)) * system.parameters.magnitude
+    return np.maximum(theta, system.parameters.lower)
+
+
+def motion(model: Any) -> Array:
+    """(n, 2 nv) motion of a model from rest, with its friction, and mass matrix and bias forces."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.3
+    found = []
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+        found.append(np.concatenate([data.qpos, data.qvel, data.qfrc_bias]))
+    matrix = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, matrix)
+    return np.concatenate([np.array(found).ravel(), matrix.ravel()])
+
+
+def test_mujoco_reads_the_identified_robot(tmp_path: Path) -> None:
+    system = system_of(tmp_path)
+    theta = other_values(system)
+    out = tmp_path / "out"
+    written = write_identified_urdfs(out, "identified", system, theta)
+    assert written.remarks == ()
+    assert len(written.held) == len(system.parameters)
+
+    found = mujoco.MjModel.from_xml_path(str(out / "identified.urdf"))
+    wanted = system.model_at(theta)
+    assert same_dynamics(found, wanted)
+    np.testing.assert_allclose(motion(found), motion(wanted), rtol=1e-9, atol=1e-11)
+
+    # The test can fail: the stated robot moves otherwise.
+    assert np.abs(motion(system.model) - motion(wanted)).max() > 1e-3
+
+
+def test_only_the_numbers_change(tmp_path: Path) -> None:
+    """One number changes, then those of a link with which another one is merged."""
+    system = system_of(tmp_path)
+    theta = np.array(system.parameters.guess)
+    names = list(system.parameters.names)
+    theta[names.index("upper_mass")] = 1.75
+    theta[names.index("upper_com")] = 0.03
+    theta[names.index("elbow_friction")] = 0.04
+    write_identified_urdfs(tmp_path / "out", "identified", system, theta)
+    text = (tmp_path / "out" / "identified.urdf").read_text(encoding="utf-8")
+    changes = [
+        line
+        for line in difflib.ndiff(URDF.splitlines(), text.splitlines())
+        if line.startswith(("+ ", "- "))
+    ]
+    assert changes == [
+        '-       <origin xyz="0.10 0.02 -0.150" rpy="0.3 -0.2 0.5"/>',
+        '+       <origin xyz="0.10 0.03 -0.150" rpy="0.3 -0.2 0.5"/>',
+        '-       <mass   value="1.50"/>',
+        '+       <mass   value="1.75"/>',
+        '+     <dynamics friction="0.04"/>',
+    ]
+
+    # The tool keeps its inertia; the first moment of the link takes the whole change.
+    theta[names.index("lower.alpha")] += 0.1
+    write_identified_urdfs(tmp_path / "out", "identified", system, theta)
+    document = UrdfDocument((tmp_path / "out" / "identified.urdf").read_bytes())
+    tool, lower = document.inertia("tool"), document.inertia("lower")
+    assert tool is not None and lower is not None
+    assert tool.mass == 0.2
+    total = system.model_at(theta).body("lower").mass[0]
+    assert lower.mass == pytest.approx(total - 0.2, rel=1e-12)
+
+
+@pytest.mark.parametrize("prefix", ["", "left_"])
+def test_an_mjcf_attaches_the_identified_urdf(tmp_path: Path, prefix: str) -> None:
+    """In the MJCF, the gain of a motor changes; the links are not merged there."""
+    renamed = {
+        name: {
+            key: value.replace("body/", f"body/{prefix}").replace("joint/", f"joint/{prefix}")
+            if isinstance(value, str)
+            else value
+            for key, value in table.items()
+        }
+        for name, table in PARAMETERS.items()
+    }
+    renamed["lower"] = {"inertial": f"{prefix}lower"}
+    renamed["tool"] = {"target": f"body/{prefix}tool:mass"}
+    renamed["gear"] = {"target": "actuator/m:gear[0]"}
+    system = system_of(tmp_path, "driven.xml", prefix, **renamed)
+    theta = other_values(system)
+    out = tmp_path / "out"
+    written = write_identified_urdfs(out, "identified", system, theta)
+    assert written.remarks == (
+        "identified.urdf: a URDF cannot hold gear; identified.xml has all values",
+    )
+    assert write_identified(out / "identified.xml", system, theta, written) is None
+    text = (out / "identified.xml").read_text(encoding="utf-8")
+    assert '<model name="robot" file="identified.urdf"/>' in text
+    assert "<!-- motors for the URDF -->" in text
+    gear = theta[-1]
+    assert f'gear="{float(gear)!r}"' in text
+
+    wanted = system.model_at(theta)
+    assert same_dynamics(mujoco.MjModel.from_xml_path(str(out / "identified.xml")), wanted)
+
+    # The URDF alone moves as the robot with its motors at rest.
+    alone = mujoco.MjModel.from_xml_path(str(out / "identified.urdf"))
+    np.testing.assert_allclose(motion(alone), motion(wanted), rtol=1e-8, atol=1e-10)
+
+
+def test_values_that_a_urdf_cannot_hold_are_named(tmp_path: Path) -> None:
+    further = {
+        "rotor": {"target": "joint/elbow:armature", "scale": 0.01},
+        "drag": {"target": "joint/elbow:damping[1]", "scale": 0.01},
+    }
+    system = system_of(tmp_path, **further)
+    theta = other_values(system)
+    written = write_identified_urdfs(tmp_path / "out", "identified", system, theta)
+    assert written.remarks == (
+        "identified.urdf: a URDF cannot hold rotor, drag; identified.xml has all values",
+    )
+    assert (tmp_path / "out" / "identified.urdf").is_file()
+
+
+def test_a_urdf_that_is_attached_twice_is_not_written(tmp_path: Path) -> None:
+    system = system_of(tmp_path)
+    twice = MOTORS.format(prefix="a_").replace(
+        '<attach model="robot" prefix="a_"/>',
+        '<attach model="robot" prefix="a_"/><body name="b" pos="1 0 0">'
+        '<attach model="robot" prefix="b_"/></body>',
+    )
+    (tmp_path / "driven.xml").write_text(twice, encoding="utf-8")
+    tables = {
+        **system.experiment.model_dump(exclude_unset=True),
+        "model": "driven.xml",
+        "directory": tmp_path,
+        "parameters": {"m": {"target": "body/a_upper:mass"}},
+    }
+    both = System.resolve(mjfim.Experiment(**tables))
+    (source,) = urdf_sources(both.model_path)
+    assert source.prefixes == ("a_", "b_")
+    written = write_identified_urdfs(tmp_path / "out", "identified", both, np.array([1.6]))
+    (remark,) = written.remarks
+    assert "is attached 2 times, and one URDF has one set of values" in remark
+    assert written.files == {}
+    assert not (tmp_path / "out").exists()
+
+
+def test_fixed_links_that_are_heavier_than_the_whole(tmp_path: Path) -> None:
+    """The identified mass of lower and tool is less than that of the tool alone."""
+    system = system_of(tmp_path)
+    theta = np.array(system.parameters.guess)
+    theta[0] = 0.5 * np.log(0.1)
+    written = write_identified_urdfs(tmp_path / "out", "identified", system, theta)
+    (remark,) = written.remarks
+    assert remark.startswith(
+        "identified.urdf: not written: the links that are fixed to link 'lower'"
+    )
+    assert not list((tmp_path / "out").glob("*.urdf"))
+
+
+def test_links_whose_inertia_comes_from_their_geometry(tmp_path: Path) -> None:
+    """The link gets an inertial, and a missing origin is added."""
+    text = """<robot name="one">
+  <link name="base"/>
+  <link name="arm">
+    <collision><origin xyz="0 0 -0.2"/><geometry><box size="0.1 0.1 0.4"/></geometry></collision>
+  </link>
+  <link name="hand">
+    <inertial>
+      <mass value="0.5"/>
+      <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/>
+    </inertial>
+  </link>
+  <joint name="j" type="continuous">
+    <parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+  </joint>
+  <joint name="k" type="continuous">
+    <parent link="arm"/><child link="hand"/><origin xyz="0 0 -0.4"/><axis xyz="0 1 0"/>
+  </joint>
+</robot>
+"""
+    (tmp_path / "one.urdf").write_text(text, encoding="utf-8")
+    tables: dict[str, Any] = {
+        "model": "one.urdf",
+        "directory": tmp_path,
+        "rate": 100.0,
+        "noise": {"state": 0.01},
+        "parameters": {
+            "arm": {"target": "body/arm:mass"},
+            "hand": {"target": "body/hand:ipos[2]", "scale": 0.1},
+        },
+    }
+    system = System.resolve(mjfim.Experiment(**tables))
+    theta = np.array([5.0, -0.05])
+    written = write_identified_urdfs(tmp_path / "out", "identified", system, theta)
+    assert written.remarks == ()
+    file = tmp_path / "out" / "identified.urdf"
+    assert same_dynamics(mujoco.MjModel.from_xml_path(str(file)), system.model_at(theta))
+    changed = file.read_text(encoding="utf-8")
+    assert '<origin xyz="0 0 -0.05"/>' in changed
+    assert '<inertial><origin xyz="0.0 0.0 -0.2"/><mass value="5.0"/>' in changed
+
+
+@pytest.mark.parametrize(
+    ("extension", "name", "said"),
+    [
+        ("", "arm.obj", '<mesh filename="../../arm.obj"/>'),
+        ('<mujoco><compiler meshdir="."/></mujoco>', "arm.obj", '<compiler meshdir="../.."/>'),
+        (
+            '<mujoco><compiler strippath="true"/></mujoco>',
+            "package://some/arm.obj",
+            '<compiler strippath="true" meshdir="../.."/>',
+        ),
+    ],
+)
+def test_meshes_are_found_from_another_folder(
+    tmp_path: Path, extension: str, name: str, said: str
+) -> None:
+    tetrahedron = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    (tmp_path / "arm.obj").write_text(tetrahedron, encoding="utf-8")
+    mesh = f'<collision><geometry><mesh filename="{name}"/></geometry></collision>\n  </link>\n'
+    text = URDF.replace("</visual>\n  </link>\n", f"</visual>\n    {mesh}")
+    text = text.replace("<robot name='two'>", f"<robot name='two'>\n  {extension}")
+    (tmp_path / "two.urdf").write_text(text, encoding="utf-8")
+    tables: dict[str, Any] = {
+        "model": "two.urdf",
+        "directory": tmp_path,
+        "rate": 100.0,
+        "noise": {"state": 0.01},
+        "parameters": {"mass": {"target": "body/upper:mass"}},
+    }
+    system = System.resolve(mjfim.Experiment(**tables))
+    out = tmp_path / "far" / "away"
+    assert write_identified_urdfs(out, "identified", system, np.array([2.0])).remarks == ()
+    assert said in (out / "identified.urdf").read_text(encoding="utf-8")
+    assert mujoco.MjModel.from_xml_path(str(out / "identified.urdf")).nmesh == 1
+
+
+def test_drawn_robots_are_urdfs_as_well(tmp_path: Path) -> None:
+    system = system_of(tmp_path, "driven.xml")
+    estimate = drawn(system, np.diag((1e-3 * system.parameters.magnitude) ** 2), 3)
+    estimate = replace(estimate, theta=other_values(system))
+    out = tmp_path / "out"
+    assert write_samples(out, estimate, system) == []
+    found = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
+    assert found == set(sample_files(out, 3, system.model_path))
+    assert "samples/robot_0002.urdf" in found
+    assert estimate.draws is not None
+    for i in range(3):
+        file = out / "samples" / f"robot_{i + 1:04d}.xml"
+        assert f'file="robot_{i + 1:04d}.urdf"' in file.read_text(encoding="utf-8")
+        model = mujoco.MjModel.from_xml_path(str(file))
+        j = estimate.draws.parameters.index("upper_mass")
+        assert model.body("upper").mass[0] == estimate.draws.values[i, j]
+
+
+def test_names_of_files(tmp_path: Path) -> None:
+    system = system_of(tmp_path, "driven.xml")
+    assert urdf_files(system.model_path, "identified") == ("identified.urdf",)
+    two = MOTORS.format(prefix="a_").replace(
+        "</asset>", '<model name="other" file="other.urdf"/></asset>'
+    )
+    two = two.replace("</worldbody>", '<attach model="other" prefix="b_"/></worldbody>')
+    (tmp_path / "other.urdf").write_text(URDF, encoding="utf-8")
+    (tmp_path / "driven.xml").write_text(two, encoding="utf-8")
+    assert urdf_files(tmp_path / "driven.xml", "identified") == (
+        "identified_two.urdf",
+        "identified_other.urdf",
+    )
+    plain = tmp_path / "plain.xml"
+    plain.write_text("<mujoco/>", encoding="utf-8")
+    assert urdf_files(plain, "identified") == ()
+
+
+def test_a_text_that_is_no_urdf() -> None:
+    with pytest.raises(ModelError, match="no URDF but <mujoco>"):
+        UrdfDocument(b"<mujoco/>")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
+def test_identify_writes_both(tmp_path: Path) -> None:
+    """The command line claims and writes the URDF, and removes it where it is not made again."""
+    system_of(tmp_path, "driven.xml")
+    experiment = """
+model = "driven.xml"
+rate = 100.0
+horizon = 1.0
+noise = { state = 0.01 }
+initial = { control = { kind = "sine", amplitude = 1.0, frequency = 0.7 } }
+[parameters.mass]
+target = "body/upper:mass"
+guess = 1.4
+true = 1.6
+"""
+    (tmp_path / "two.toml").write_text(experiment, encoding="utf-8")
+    out = tmp_path / "fit"
+    assert run("simulate", tmp_path / "two.toml", "-o", tmp_path / "log.csv").exit_code == 0
+    words = ("identify", tmp_path / "two.toml", tmp_path / "log.csv", "-o", out)
+    result = run(*words)
+    assert result.exit_code == 0, result.stderr
+    assert {"identified.xml", "identified.urdf", MANIFEST} <= names(out)
+    assert "six significant digits" not in result.stderr
+    estimate = mjfim.Estimate.load(out)
+    model = mujoco.MjModel.from_xml_path(str(out / "identified.xml"))
+    assert model.body("upper").mass[0] == estimate.theta[0]
+
+    (out / "identified.urdf").write_text("edited", encoding="utf-8")
+    refused = run(*words)
+    assert refused.exit_code == 2
+    assert "identified.urdf: changed after mjfim wrote it" in refused.stderr

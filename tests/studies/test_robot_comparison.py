@@ -1,0 +1,306 @@
+"""Comparison of two robots: rates of false and true alarms, its sentences, and what limits it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.identification.independent_blocks import (
+    block_length,
+    independent_blocks,
+    recording_evidence,
+)
+from mjfim.identification.recording_comparison import compare_evidence
+from mjfim.identification.robust_covariance import robust_uncertainty
+from mjfim.output.summaries.verdicts import Level, verdict_of
+from mjfim.records.recording import Recording
+from mjfim.records.robot_comparison import RobotComparison
+from mjfim.studies.robot_comparison import compare_estimates, holm, honest_std
+from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
+
+NAMES = ("mass", "damping", "length")
+UNITS = ("kg", "N m s/rad", "m")
+
+
+def recordings(count: int, seed: int) -> tuple[Recording, ...]:
+    """Recordings that differ from those of other seeds."""
+    return tuple(
+        Recording(
+            t=np.arange(2.0),
+            ctrl=np.zeros((1, 1)),
+            y=np.array([[float(seed)], [float(k)]]),
+            outputs=("y",),
+            name=f"robot_{seed}_{k}.csv",
+        )
+        for k in range(count)
+    )
+
+
+def estimate(seed: int = 0, count: int = 2, **changes: Any) -> mjfim.Estimate:
+    """An estimate of three parameters."""
+    theta = np.array([2.0, 0.15, 1.0])
+    std = np.array([0.02, 0.01, 0.01])
+    fields: dict[str, Any] = {
+        "parameters": NAMES,
+        "units": UNITS,
+        "theta": theta,
+        "std": std,
+        "covariance": np.diag(std**2),
+        "initial_theta": theta,
+        "chi2": 1.0,
+        "dof": 1,
+        "status": "converged",
+        "success": True,
+        "misfit": False,
+        "iterations": 1,
+        "residual_rms": {},
+        "at_bound": (),
+        "predicted": (),
+        "recordings": recordings(count, seed),
+    }
+    return mjfim.Estimate(**{**fields, **changes})
+
+
+# ---- one comparison
+
+
+def test_a_worn_joint_is_named() -> None:
+    worn = estimate(1, theta=np.array([2.01, 0.21, 1.0]))
+    found = compare_estimates(estimate(), worn, names=("monday", "friday"))
+    assert found.changed == (1,)
+    assert found.differs
+    sentence = found.sentence(1)
+    assert sentence.startswith("damping of friday is 40 % above that of monday: 0.21 ± 0.02 ag")
+    assert "0.15 ± 0.02 N m s/rad, p = " in sentence
+    assert str(found) == "There is a difference between monday and friday in damping."
+    assert verdict_of(found).level is Level.DOUBTFUL
+
+    # The distance is 4.2 standard deviations; four tests are made.
+    sigmas = 0.06 / np.hypot(0.01, 0.01)
+    assert found.p[1] == pytest.approx(4 * 2 * student.sf(sigmas, 1e6), rel=1e-2)
+    np.testing.assert_allclose(
+        found.interval[1], 0.06 + np.array([-1, 1]) * 1.96 * 0.01 * 2**0.5, rtol=1e-3
+    )
+
+    # The other way round, the sign changes.
+    back = compare_estimates(worn, estimate())
+    assert "of B is 29 % below that of A" in back.sentence(1)
+
+
+def test_equal_robots_say_what_would_have_been_found() -> None:
+    found = compare_estimates(estimate(), estimate(1, theta=np.array([2.01, 0.152, 0.998])))
+    assert not found.differs
+    assert "no difference between A and B. A change of" in str(found)
+    assert "% in mass" in str(found)
+    assert "with 80 % power" in str(found)
+    assert verdict_of(found).level is Level.GOOD
+
+    # 2.50 standard deviations for significance, and 0.84 for the power.
+    expected = (student.isf(0.025 / 4, 1e6) + student.isf(0.2, 1e6)) * 0.02 * 2**0.5
+    assert found.detectable[0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_entries_of_vectors_have_no_percentage() -> None:
+    sizes = np.array([2.0, 1.0, 1.0])
+    found = compare_estimates(
+        estimate(sizes=sizes), estimate(1, theta=np.array([2.0, 0.3, 1.0]), sizes=sizes)
+    )
+    assert "damping of B is 0.15 N m s/rad above that of A" in found.sentence(1)
+
+
+def test_combinations_may_differ_although_no_parameter_does() -> None:
+    """Strongly correlated errors: the sum is known, and differs."""
+    correlation = np.array([[1.0, -0.99, 0.0], [-0.99, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    std = np.array([0.1, 0.1, 0.1])
+    fields = {"std": std, "covariance": correlation * np.outer(std, std)}
+    first = estimate(theta=np.array([1.0, 1.0, 1.0]), **fields)
+    second = estimate(1, theta=np.array([1.06, 1.06, 1.0]), **fields)
+    found = compare_estimates(first, second)
+    assert found.changed == ()
+    assert found.joint_p < 1e-3
+    assert found.differs
+    assert "do not say in which single parameter" in str(found)
+
+
+def test_wide_intervals_count_and_bounds_do_not() -> None:
+    theta = np.array([2.0, 0.0, 1.0])
+    wide = estimate(
+        theta=theta,
+        interval=np.array([[1.8, 2.2], [0.0, 0.3], [0.9, 1.1]]),
+        at_bound=("damping",),
+    )
+    np.testing.assert_allclose(honest_std(wide) * 1.96, [0.2, 0.3, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"misfit": True}, "does not explain the recordings of B (misfit)"),
+        ({"success": False, "status": "stopped"}, "the estimate of B is not reliable: stopped"),
+        ({"units": ("g", "N m s/rad", "m")}, "mass is not compared: its units differ (kg and g)"),
+        ({"std": np.array([np.inf, 0.1, 0.1])}, "recordings of B do not determine it"),
+        ({"per_recording": {"mass": (1.0, 2.0)}}, "B has a value for each recording"),
+        ({"parameters": ("load", "damping", "length")}, "load: a parameter of B, but fixed for A"),
+        ({"count": 1}, "of B there is a single recording"),
+        ({"seed": 0, "count": 3}, "both estimates contain robot_0_0.csv, robot_0_1.csv"),
+    ],
+)
+def test_remarks(changes: dict[str, Any], said: str) -> None:
+    found = compare_estimates(estimate(), estimate(**{"seed": 1, **changes}))
+    assert any(said in remark for remark in found.remarks), found.remarks
+    is_poor = "misfit" in changes or "success" in changes
+    assert found.is_reliable is not is_poor
+
+
+def test_single_recordings_of_both() -> None:
+    found = compare_estimates(estimate(count=1), estimate(1, count=1))
+    assert any(remark.startswith("single recordings say nothing") for remark in found.remarks)
+
+
+def test_priors_draw_both_to_one_value() -> None:
+    prior = np.diag([1.0, 0.0, 0.0])
+    found = compare_estimates(estimate(prior=prior), estimate(1, prior=prior))
+    assert any(remark.startswith("mass: the priors") for remark in found.remarks)
+
+
+def test_misuse() -> None:
+    with pytest.raises(ExperimentError, match="no parameter in common"):
+        compare_estimates(estimate(), estimate(1, parameters=("a", "b", "c")))
+    with pytest.raises(ExperimentError, match="from the same recordings"):
+        compare_estimates(estimate(), estimate())
+    with pytest.raises(ExperimentError, match="two different names"):
+        compare_estimates(estimate(), estimate(1), names=("A", "A"))
+
+
+def test_initial_states_are_not_compared() -> None:
+    names = ("mass", "initial qpos:hinge", "length")
+    found = compare_estimates(estimate(parameters=names), estimate(1, parameters=names))
+    assert found.parameters == ("mass", "length")
+    assert not any("initial" in remark for remark in found.remarks)
+
+
+def test_holm() -> None:
+    np.testing.assert_allclose(holm(np.array([0.04, 0.001, 0.03, 0.5])), [0.09, 0.004, 0.09, 0.5])
+    assert holm(np.zeros(0)).shape == (0,)
+
+
+def test_a_comparison_is_saved_and_loaded(tmp_path: Any) -> None:
+    found = compare_estimates(estimate(), estimate(1, theta=np.array([2.0, 0.3, 1.0])))
+    found.save(tmp_path)
+    again = mjfim.RobotComparison.load(tmp_path)
+    assert again.summary()["words"] == found.summary()["words"]
+    np.testing.assert_array_equal(again.p, found.p)
+
+
+# ---- rates
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """Two robots with K recordings each.
+
+    Attributes:
+        K: Number of recordings of each robot.
+        phi: Correlation of successive noise values.
+        tau: Scatter between recordings [standard deviations of one recording].
+        c: Number of parameters.
+    """
+
+    K: int
+    phi: float = 0.0
+    tau: float = 0.0
+    c: int = 3
+
+    def estimated(self, rng: np.random.Generator, shift: float, seed: int) -> mjfim.Estimate:
+        """Estimate of a robot whose first parameter is shifted."""
+        N = 400
+        X = waves(self.K, N, self.c)
+        growth = (1.0 + self.phi) / (1.0 - self.phi)
+        std = np.sqrt(2.0 / N * growth)
+        deviations = self.tau * std * rng.normal(size=(self.K, self.c))
+        deviations[:, 0] += shift
+        y = noise(self.phi, (self.K, N), rng) + np.einsum("knc,kc->kn", X, 1.0 + deviations)
+
+        theta, condensed = Linear(X=X).fitted(y)
+        recording = condensed.segment_of_block
+        rows = np.full(len(recording), float(FINE))
+        length = block_length([growth], self.K * N)
+        uncertainty = robust_uncertainty(
+            condensed, theta, recording, rows, min_rows=length, draws=100, rng=rng
+        )
+        comparison = None
+        if self.K > 1:
+            own = np.zeros((self.K, 0), dtype=int)
+            blocks = independent_blocks(condensed, recording, rows, length)
+            comparison = compare_evidence(
+                theta,
+                recording_evidence(condensed, blocks, recording, own),
+                recordings=[str(k) for k in range(self.K)],
+                parameters=[f"p{j}" for j in range(self.c)],
+                units=[""] * self.c,
+                is_single=np.ones(self.c, dtype=bool),
+            )
+        covariance = np.linalg.inv(condensed.information())
+        return estimate(
+            seed,
+            self.K,
+            parameters=tuple(f"p{j}" for j in range(self.c)),
+            units=("",) * self.c,
+            theta=theta,
+            initial_theta=theta,
+            covariance=covariance,
+            std=np.sqrt(np.diag(covariance)),
+            std_sandwich=uncertainty.sandwich,
+            interval=uncertainty.interval,
+            between_recordings=uncertainty.between,
+            recording_comparison=comparison,
+        )
+
+    def compared(self, rng: np.random.Generator, shift: float = 0.0) -> RobotComparison:
+        """Compare two robots."""
+        return compare_estimates(self.estimated(rng, 0.0, 1), self.estimated(rng, shift, 2))
+
+
+def test_equal_robots_rarely_differ() -> None:
+    rng = np.random.default_rng(0)
+    alarms = sum(Setting(K=2).compared(rng).differs for _ in range(40))
+    assert alarms <= 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "setting",
+    [
+        Setting(K=1),
+        Setting(K=1, phi=0.9),
+        Setting(K=3),
+        Setting(K=3, phi=0.9, c=8),
+        Setting(K=3, tau=1.0),
+        Setting(K=4, tau=3.0),
+    ],
+    ids=str,
+)
+def test_rate_of_false_alarms(setting: Setting) -> None:
+    """The stated level is 5 %; 300 comparisons give 8.5 % with a probability of 1 %."""
+    rng = np.random.default_rng(1)
+    alarms = sum(setting.compared(rng).differs for _ in range(300))
+    assert alarms / 300 <= 0.085
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", [Setting(K=1), Setting(K=4), Setting(K=4, phi=0.9)], ids=str)
+def test_rate_of_true_alarms(setting: Setting) -> None:
+    """A shift as large as the difference that would be found with a probability of 80 %."""
+    rng = np.random.default_rng(2)
+    hits = 0
+    for _ in range(200):
+        shift = float(setting.compared(rng).detectable[0])
+        found = setting.compared(rng, shift)
+        hits += 0 in found.changed
+    assert 0.68 <= hits / 200 <= 0.92
