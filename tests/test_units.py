@@ -263,17 +263,18 @@ def own_fits(tmp_path_factory, recording: Recording) -> dict[str, dict[str, Any]
     return found
 
 
-LARGER, SMALLER = ("long", "heavy", "slow"), ("short", "light", "quick")
-
-# Each unit larger and smaller; with smaller units, only the plainest path is fast.
+# All units change together in the fast tests, each of them alone in the slow ones.
+FAST_UNITS = [
+    *(("stated start", name) for name in COMBINED),
+    *((path, COMBINED[0]) for path in FITS),
+]
 UNITS_OF_FITS = [
-    *((path, name) for path in FITS for name in LARGER),
-    *(("stated start", name) for name in SMALLER),
+    *dict.fromkeys(FAST_UNITS),
     *(
         pytest.param(path, name, marks=pytest.mark.slow)
         for path in FITS
-        for name in SMALLER
-        if path != "stated start"
+        for name in SCALES
+        if (path, name) not in FAST_UNITS
     ),
 ]
 

@@ -50,6 +50,7 @@ def test_identify_does_not_replace_the_model_of_the_experiment(
 
 
 @pytest.mark.usefixtures("empty_figures")
+@pytest.mark.slow
 def test_compare_keeps_controls_that_it_did_not_write(tmp_path: Path) -> None:
     """In the folder of the experiment, whose own control has a name like a result."""
     study = write_experiment(tmp_path, start='"control_mine.csv"')

@@ -53,6 +53,7 @@ def test_identify_several_recordings(
 
 
 @pytest.mark.usefixtures("empty_figures")
+@pytest.mark.slow
 def test_misfit(study: Path, recorded: Path, tmp_path: Path) -> None:
     """The model cannot explain the recording: the exit code and the text say so."""
     header, *rows = recorded.read_text(encoding="utf-8").splitlines()

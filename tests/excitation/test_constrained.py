@@ -178,6 +178,7 @@ def assert_inside(task: DesignTask, ctrl: Array) -> None:
         assert values[:, limit.index].max() <= limit.upper, limit
 
 
+@pytest.mark.slow
 def test_an_infeasible_start_is_made_feasible(tmp_path: Path) -> None:
     wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
     task = cart_inside(tmp_path, control=wild, descent={"max_iterations": 6})

@@ -145,6 +145,7 @@ def test_units_come_from_the_path_where_none_is_stated(experiment: Experiment) -
     assert task.system.units == ("kg", "m", "N m s/rad")
 
 
+@pytest.mark.slow
 def test_the_criterion_becomes_smooth_where_the_smallest_eigenvalues_meet(tmp_path: Path) -> None:
     task = cart_task(tmp_path, horizon=1.0, cost={"control": 1e-4})
     made = design_task(task)
@@ -169,6 +170,7 @@ def test_the_criterion_becomes_smooth_where_the_smallest_eigenvalues_meet(tmp_pa
             assert moved.cost > 0.99 * made.final.cost
 
 
+@pytest.mark.slow
 def test_a_design_that_knows_its_nuisance_parameters_beats_one_that_does_not(
     tmp_path: Path,
 ) -> None:

@@ -287,6 +287,7 @@ def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) 
         design_task(task)
 
 
+@pytest.mark.slow
 def test_limits_that_no_control_can_keep_end_with_exit_code_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

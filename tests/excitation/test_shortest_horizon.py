@@ -50,6 +50,7 @@ def shorter() -> mjfim.ShortestExperiment:
     return mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.05)
 
 
+@pytest.mark.slow
 def test_it_reaches_every_target(shorter: mjfim.ShortestExperiment) -> None:
     assert 0.5 < shorter.horizon < 1.4 and shorter.closed
     task = DesignTask.resolve(shorter.experiment)

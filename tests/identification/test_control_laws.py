@@ -77,6 +77,7 @@ def exact(system: System, inputs: np.ndarray) -> Recording:
     return Recording(t=t, ctrl=inputs, y=y[0], outputs=system.outputs.names, name="exact")
 
 
+@pytest.mark.slow
 def test_plant_gains_and_latency_are_found_from_references_alone() -> None:
     laws = {"shoulder": SHOULDER, "elbow": ELBOW}
     experiment = arm_experiment(

@@ -149,6 +149,7 @@ def test_two_recordings_carry_twice_the_information(
     assert len(two.predicted) == 2
 
 
+@pytest.mark.slow
 def test_bounds_are_kept_and_named(design: mjfim.Design, recording: Recording) -> None:
     base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     tight = {**base.model_dump(exclude_unset=True)["parameters"]}

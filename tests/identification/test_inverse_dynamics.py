@@ -213,6 +213,7 @@ def test_base_parameters_of_an_arm_with_hardly_any_noise(coordinates: str, tmp_p
     assert not System.resolve(experiment).impossible(fit.theta)
 
 
+@pytest.mark.slow
 def test_seven_joints_with_friction(tmp_path: Path) -> None:
     joints = 7
     log, _ = arm_log(joints, 8.0, np.random.default_rng(2), friction=True, sigma=2e-5)

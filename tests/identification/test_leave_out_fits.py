@@ -33,6 +33,7 @@ def fitted(fit: dict[str, object], recordings: int) -> tuple[FitProblem, Solutio
 
 
 @pytest.mark.parametrize("fit", [{}, {"segments": 0.5}])
+@pytest.mark.slow
 def test_the_step_leads_to_the_fit_of_the_others(fit: dict[str, object]) -> None:
     problem, solution = fitted(fit, 3)
     parts = list(left_out_parts(problem))
@@ -52,6 +53,7 @@ def test_the_step_leads_to_the_fit_of_the_others(fit: dict[str, object]) -> None
         assert np.linalg.norm(missed / sigma) < 0.2 * np.linalg.norm(moved / sigma)
 
 
+@pytest.mark.slow
 def test_initial_states_of_the_part_are_those_that_fit_it_best() -> None:
     problem, solution = fitted({"segments": 0.5}, 2)
     (step, _) = leave_out_steps(problem, solution, list(left_out_parts(problem)))

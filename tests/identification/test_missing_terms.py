@@ -58,6 +58,7 @@ def test_the_missing_term_comes_first_and_in_about_its_size(
     assert any(path in sentence for sentence in found.warnings)
 
 
+@pytest.mark.slow
 def test_a_bias_and_a_delay_are_found(tmp_path: Path) -> None:
     task = DesignTask.resolve(stated(horizon=2.0))
     clean = simulate_system(task.system, task.initial, seed=1)

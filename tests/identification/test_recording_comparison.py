@@ -186,6 +186,7 @@ class Setting:
         return alarms / sets, hits / sets, joint / sets
 
 
+@pytest.mark.slow
 def test_equal_recordings_rarely_give_an_odd_one() -> None:
     alarms, _, joint = Setting(K=4).rates(100)
     assert alarms <= 0.04
@@ -238,6 +239,7 @@ def recordings() -> list[Recording]:
     return found
 
 
+@pytest.mark.slow
 def test_a_fit_names_the_odd_recording(recordings: list[Recording]) -> None:
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
         fit={"bootstrap": 0}

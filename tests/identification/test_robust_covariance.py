@@ -147,6 +147,7 @@ def study(
 
 
 @pytest.mark.parametrize("with_offsets", [False, True])
+@pytest.mark.slow
 def test_with_correlated_noise_the_sandwich_is_right_and_the_formal_deviation_is_not(
     with_offsets: bool,
 ) -> None:
@@ -159,6 +160,7 @@ def test_with_correlated_noise_the_sandwich_is_right_and_the_formal_deviation_is
 
 
 @pytest.mark.parametrize("with_offsets", [False, True])
+@pytest.mark.slow
 def test_with_white_noise_all_deviations_agree(with_offsets: bool) -> None:
     """Formal, sandwich and bootstrap deviations agree with the spread of the estimates."""
     s = study(0.0, with_offsets)
@@ -219,6 +221,7 @@ def test_recordings_that_disagree_are_found() -> None:
     assert np.mean(np.array(between)[:, 1]) < 0.02
 
 
+@pytest.mark.slow
 def test_few_blocks_of_each_recording_give_no_false_alarms() -> None:
     """Strongly coloured noise leaves about five blocks per recording.
 

@@ -250,6 +250,7 @@ def test_initial_states_without_one_output_come_from_the_model(
 
 @pytest.mark.parametrize("fit", [{"start": "measured"}, {"segments": 0.5}])
 @pytest.mark.parametrize("names", [("qpos:hinge",), ("qvel:hinge",)])
+@pytest.mark.slow
 def test_an_initial_position_that_no_output_shows_does_not_disturb_the_fit(
     tmp_path: Path, fit: dict[str, object], names: tuple[str, ...]
 ) -> None:

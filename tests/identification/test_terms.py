@@ -92,6 +92,7 @@ def test_activations_of_terms_are_no_unknowns_of_segments(tmp_path: Path, kind: 
         )
 
 
+@pytest.mark.slow
 def test_a_log_with_wrong_scale_and_bias_gives_both(tmp_path: Path) -> None:
     experiment = experiment_of(
         tmp_path,
@@ -174,6 +175,7 @@ def lines_of(toml: str) -> list[str]:
     return [re.sub(r", (\w+ = )", r"\n\1", part) for part in toml.split("; ")]
 
 
+@pytest.mark.slow
 def test_a_complete_model_with_terms_lacks_none(tmp_path: Path) -> None:
     stated, robot = without_term(tmp_path, "actuator_lag")
     table = {"kind": "actuator_lag", "actuator": "motor"}

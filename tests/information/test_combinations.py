@@ -152,6 +152,7 @@ def test_a_prior_on_one_member_makes_the_others_identifiable(tmp_path) -> None:
     assert any("by priors only" in sentence for sentence in found.verdict)
 
 
+@pytest.mark.slow
 def test_check_and_identify_estimate_an_initial_state_per_recording(tmp_path) -> None:
     task = pendulum(tmp_path, parameters={"d": PARAMETERS["d"]}, nuisance={"initial": 0.05})
     recordings = [simulate_system(task.system, task.initial, seed=s) for s in range(3)]

@@ -456,6 +456,7 @@ def test_the_consumer_may_stop_between_iterates() -> None:
     assert second.value < first.value
 
 
+@pytest.mark.slow
 def test_lbfgs_needs_fewer_iterations_than_metric_descent_for_the_same_digits() -> None:
     metric = MetricDescent(
         np.zeros((2, 2)), R * DT, np.zeros((2, 2))

@@ -159,6 +159,7 @@ def test_actions_are_the_controls_in_the_unit(
     np.testing.assert_allclose(states, wanted, rtol=1e-6, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_identify_reads_the_dataset(
     cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
 ) -> None:

@@ -197,6 +197,7 @@ def test_robust_redesigns_sample_around_the_estimate(campaign: Campaign) -> None
     assert np.ptp(before.thetas, axis=0).min() > 10 * np.ptp(pool.thetas, axis=0).max()
 
 
+@pytest.mark.slow
 def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path) -> None:
     """A target is not reached where the estimate is wrong by many standard deviations."""
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1.0"/>')
@@ -209,6 +210,7 @@ def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path)
     assert any("misfit" in sentence for sentence in found.warnings)
 
 
+@pytest.mark.slow
 def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_path: Path) -> None:
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" damping="0.5"/>')
     easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
@@ -247,6 +249,7 @@ def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
     assert "wanted 0.008" in found.short and "wanted 0.008" in str(found)
 
 
+@pytest.mark.slow
 def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     """The bob loses a tenth of its mass between two rounds."""
     first = campaign.rounds[0]

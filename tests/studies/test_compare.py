@@ -109,6 +109,7 @@ def test_no_method_has_to_find_what_can_be_identified(monkeypatch: pytest.Monkey
     assert c.rows[1].sound
 
 
+@pytest.mark.slow
 def test_rows_hold_the_numbers_of_their_controls() -> None:
     task = DesignTask.resolve(pendulum())
     for r in small().rows:
@@ -294,6 +295,7 @@ def test_the_picture_of_any_result_is_drawn(rows: tuple[MethodResult, ...], tmp_
 # ---- the command line
 
 
+@pytest.mark.slow
 def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = (

@@ -629,6 +629,7 @@ def test_a_start_that_moves_on_a_ball_joint_is_an_unknown_of_the_fit(tmp_path: P
     assert np.isfinite(bench.run(0).estimate).all()
 
 
+@pytest.mark.slow
 def test_the_verb_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: Path) -> None:
     """Tables and sentences on stdout, JSON and a figure in the folder; robots in processes."""
     experiment, path = cart
@@ -646,6 +647,7 @@ def test_the_verb_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: 
     assert loaded.summary()["limits"] == found["limits"]
 
 
+@pytest.mark.slow
 def test_a_stopped_study_keeps_the_robots_that_are_done(
     cart: tuple[mjfim.Experiment, Path],
 ) -> None:

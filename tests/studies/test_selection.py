@@ -81,6 +81,7 @@ def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.interval, plain.interval)
 
 
+@pytest.mark.slow
 def test_terms_that_no_data_tell_apart_are_named_with_what_they_imply(tmp_path: Path) -> None:
     """Inertia of the cart, inertia of the hinge and a weaker motor have the same effect."""
     found = mjfim.select_terms(stated(), recorded(tmp_path, 'armature="0.9"', count=2))
@@ -108,6 +109,7 @@ def test_a_selection_that_is_stopped_returns_what_it_has(tmp_path: Path) -> None
     assert len(found.theta) == 3
 
 
+@pytest.mark.slow
 def test_a_selection_is_saved_and_loaded(tmp_path: Path) -> None:
     found = mjfim.select_terms(stated(), recorded(tmp_path, 'stiffness="8"', count=2))
     assert found.selection is not None
