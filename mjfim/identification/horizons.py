@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -337,12 +338,12 @@ def _is_apart(fit: _LengthFit, chosen: _LengthFit) -> np.ndarray:
     return np.asarray(np.abs(fit.theta - chosen.theta) > allowed)
 
 
-def with_length(task: FitTask, length: float | None) -> FitTask:
+def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTask:
     """The task of fitting segments of a length.
 
     Args:
         task: The task.
-        length: The length [s]; None for a length that the fit chooses.
+        length: The length [s], or "whole"; None for a length that the fit chooses.
     """
     system = task.system
     settings = task.settings.model_copy(update={"segments": length})

@@ -21,6 +21,7 @@ class Decision(Enum):
     POOLED = "pooled"
     HELD = "held"
     KEPT = "kept apart"
+    SHORTENED = "predicted over segments"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -50,6 +50,11 @@ class FittedModel:
     held: tuple[str, ...] = ()
 
     @property
+    def is_changed(self) -> bool:
+        """Whether the model differs from the stated one."""
+        return bool(self.terms or self.pooled or self.held)
+
+    @property
     def penalised_cost(self) -> float:
         """Cost and the number of parameters of the terms, by which chance reduces it (AIC)."""
         return self.cost + sum(len(term.parameters) for term in self.terms)

@@ -19,6 +19,7 @@ from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.continuation import WholeFit, is_doubtful
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction, held_out_losses
 from mjfim.identification.horizons import with_length
@@ -188,8 +189,15 @@ class _Selector:
     max_terms: int
 
     def selected(self, task: FitTask) -> tuple[Estimate, System]:
-        """Estimate of the extended model, and the extended model."""
-        result = fit_task(self._search(task), self.workers)
+        """Estimate of the extended model, and the extended model.
+
+        Where the length of the segments is not stated, terms are chosen by whole recordings, which
+        show them best. Where these do not explain the recordings, the length is chosen for the
+        extended model, and terms are chosen by predictions over this length as well.
+        """
+        is_free = task.settings.segments is None
+        whole = with_length(task, "whole") if is_free else task
+        result = fit_task(self._search(whole), self.workers)
         losses = self._losses(result, result)
         if losses is None:
             ending = "The selection was interrupted, or no part of the data can be left out."
@@ -197,19 +205,15 @@ class _Selector:
 
         first = FittedModel(result=result, losses=losses, cost=result.solution.cost, terms=())
         steps = [SelectionStep(decision=Decision.BEGUN, error=losses.error)]
-        model, ending = self._grown(first, first, steps)
-        model = self._pruned(model, first, steps)
-        model = self._simplified(model, first, steps)
+        model, ending = self._chosen(first, first, steps)
+        result = self._final(model, is_free)
 
-        # The chosen model is fitted like any other, with all attempts against local minima, and
-        # over the length of segments that suits it.
-        result = model.result
-        is_changed = bool(model.terms or model.pooled or model.held)
-        if is_changed and not self._is_stopped():
-            final = replace(result.task, start=result.theta, held_out=self.held_out)
-            if task.settings.segments is None:
-                final = with_length(final, None)
-            result = fit_task(self._search(final), self.workers)
+        # Over segments, the data may show other terms.
+        if result.task.settings.segment_length is not None and is_free:
+            model, ending = self._over_length(model, first, result, steps, ending)
+            if model.result is not result:
+                result = self._final(model, is_free=False)
+        is_changed = model.is_changed
 
         # The report compares the estimate with the guess, not with where the last search began.
         guess = result.task.system.parameters.guess
@@ -245,7 +249,80 @@ class _Selector:
             differs=different(estimate, found.theta, interval),
         )
 
+    def _final(self, model: FittedModel, is_free: bool) -> FitResult:
+        """The fit of the chosen model, with all attempts against local minima.
+
+        Args:
+            model: The chosen model.
+            is_free: Whether the length of the segments is left to the fit.
+        """
+        result = model.result
+        fit = WholeFit(problem=result.problem, solution=result.solution, quality=result.quality)
+        is_settled = not model.is_changed and not (is_free and is_doubtful(result.task, fit))
+        if is_settled or self._is_stopped():
+            return result
+        final = replace(result.task, start=result.theta, held_out=self.held_out)
+        if is_free:
+            final = with_length(final, None)
+        return fit_task(self._search(final), self.workers)
+
     # ---- steps
+
+    def _chosen(
+        self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
+    ) -> tuple[FittedModel, str]:
+        """Add terms, remove needless ones, and simplify the parameters.
+
+        Args:
+            model: Where to begin.
+            first: The stated model.
+            steps: Receives the steps.
+
+        Returns:
+            The chosen model, and why no more terms were added.
+        """
+        model, ending = self._grown(model, first, steps)
+        model = self._pruned(model, first, steps)
+        return self._simplified(model, first, steps), ending
+
+    def _over_length(
+        self,
+        model: FittedModel,
+        first: FittedModel,
+        result: FitResult,
+        steps: list[SelectionStep],
+        ending: str,
+    ) -> tuple[FittedModel, str]:
+        """Choose terms by predictions over segments instead of whole recordings.
+
+        Args:
+            model: The model that was chosen by whole recordings.
+            first: The stated model.
+            result: Fit of the chosen model over segments.
+            steps: Receives the steps.
+            ending: Why no more terms were added by whole recordings.
+
+        Returns:
+            The chosen model, and why no more terms were added.
+        """
+        length = result.task.settings.segment_length
+        losses = self._losses(result, first.result)
+        if losses is None or length is None:
+            return replace(model, result=result), ending
+
+        words = f"segments of {length:.2g} s"
+        steps.append(
+            SelectionStep(
+                decision=Decision.SHORTENED,
+                description=words,
+                count=len(model.terms),
+                error=losses.error,
+            )
+        )
+        cost = result.problem.with_noise(first.result.problem.noise).cost(result.solution.unknowns)
+        cut = replace(model, result=result, losses=losses, cost=cost)
+        stated = replace(first.result, task=with_length(first.result.task, length))
+        return self._chosen(cut, replace(first, result=stated), steps)
 
     def _grown(
         self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]

@@ -23,6 +23,7 @@ WORDS = {
     Decision.POOLED: "pooled",
     Decision.HELD: "held at the guess",
     Decision.KEPT: "kept apart",
+    Decision.SHORTENED: "predicted over segments",
 }
 
 
@@ -99,7 +100,7 @@ def _table(selection: Selection) -> SummaryTable:
 
 def _row(step: SelectionStep) -> Row:
     """Row of a step."""
-    is_begin = step.decision is Decision.BEGUN
+    is_begin = step.decision in (Decision.BEGUN, Decision.SHORTENED)
     reduction = "" if is_begin else Quantity(value=step.reduction, digits=2)
     error = "" if is_begin else Quantity(value=step.standard_error, digits=2)
     is_other = step.decision is Decision.REJECTED and step.reduction > step.standard_error
