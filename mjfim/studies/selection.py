@@ -65,6 +65,10 @@ SIMILAR_SHARE = 0.5
 # Largest number of poorly known parameters that are held one by one.
 MAX_HELD_ATTEMPTS = 8
 
+# Ratio of the errors of left-out data, above which a simpler model predicts worse, even where the
+# data are too few for a clear difference.
+WORSE_ERROR_RATIO = 1.02
+
 # Difference of the costs of two fits (half of the sum of squared residuals in standard deviations)
 # below which both explain the data equally well: by one standard deviation at most.
 EQUAL_COST = 0.5
@@ -487,7 +491,9 @@ class _Selector:
 
         decision, words = named
         reduction = simpler.losses.reduction(model.losses)
-        is_worse = reduction.is_clear
+        is_worse = (
+            reduction.is_clear or simpler.losses.error > WORSE_ERROR_RATIO * model.losses.error
+        )
         steps.append(
             SelectionStep(
                 decision=Decision.KEPT if is_worse else decision,
