@@ -16,16 +16,15 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import SimulationDivergedError, explain_renamed_arguments, listed
+from mjfim.errors import SimulationDivergedError, explain_renamed_arguments
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.continuation import WholeFit, continued_fit, is_doubtful
-from mjfim.identification.extreme_values import describe_extreme_value
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import fit_quality
+from mjfim.identification.fit_start import begin_fit
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.horizons import choose_horizon, with_length
-from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equations
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import NEWTON, FitSearch
@@ -47,11 +46,8 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from mjfim.parallel import ExecutorLike, one_blas_thread
-from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
-from mjfim.plant.plant import UNSTABLE_LOOP
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
-from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
 
@@ -203,14 +199,13 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
 
     # A fit to the equation of motion gives the start where that is asked for, or where the model
     # diverges at the stated one.
-    search, dynamics = _begun(search, problem)
+    begun = begin_fit(search, problem)
+    search = begun.search
     task = search.task
 
     # With much data, the search begins on a subset of the segments.
-    begin_stage("simulating the segments from the initial guess")
     subset = quick_subset(problem)
     begin = problem.begin(task.start)
-    completed(partial(_require_finite_cost, task, problem, subset, begin))
 
     # Combinations of parameters that no recording determines are held at their start values.
     begin_stage("testing what the recordings determine")
@@ -233,7 +228,8 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
         held_out=held_out,
         subset=subset,
         restart=fit.restart,
-        inverse_dynamics=fit.inverse_dynamics if dynamics is None else dynamics,
+        inverse_dynamics=begun.inverse_dynamics or fit.inverse_dynamics,
+        start_diverged=begun.start_diverged,
     )
 
     # Where the model does not explain whole recordings, the length of the segments matters.
@@ -269,7 +265,7 @@ def _over_chosen_length(
     if choice.length is None or search.interrupted():
         return replace(result, horizons=choice.study)
 
-    task = with_length(result.task, choice.length)
+    task = with_length(search.task, choice.length)
     cut, held_out = _problems(task, workers)
     cut = cut.pinned(task.start, result.null_space)
     chosen = replace(search, task=task)
@@ -280,7 +276,7 @@ def _over_chosen_length(
         return replace(result, horizons=choice.study)
     return replace(
         result,
-        task=task,
+        task=replace(task, start=result.task.start),
         problem=weighted,
         solution=solution,
         quality=fit_quality(weighted, solution),
@@ -328,49 +324,6 @@ def refit_task(search: FitSearch, near: FitResult, workers: FitWorkers | None = 
         subset=subset,
         restart=None,
     )
-
-
-def _begun(search: FitSearch, problem: FitProblem) -> tuple[FitSearch, InverseDynamicsFit | None]:
-    """The searches from a fit to the equation of motion, where that is asked for or needed.
-
-    It is needed where the model diverges at the start. Parameters that the equation of motion does
-    not contain keep their start.
-
-    Args:
-        search: The searches from the stated start.
-        problem: The problem of all recordings.
-
-    Returns:
-        The searches from where the model does not diverge, if there is such a start, and the fit
-        to the equation of motion from which they start, or None.
-
-    Raises:
-        RecordingError: A degree of freedom was not measured.
-    """
-    task = search.task
-    if task.settings.start == "inverse_dynamics":
-        begin_stage("fitting the equation of motion")
-        found: InverseDynamicsFit | None = fit_equations(
-            problem.system, problem.recordings, task.start
-        )
-    elif _is_finite(problem, task.start):
-        return search, None
-    else:
-        found = try_fit_equations(problem.system, problem.recordings, task.start)
-
-    if found is None or not _is_finite(problem, found.theta):
-        return search, found if task.settings.start == "inverse_dynamics" else None
-    return replace(search, task=replace(task, start=np.array(found.theta))), found
-
-
-def _is_finite(problem: FitProblem, theta: Array) -> bool:
-    """Whether the model does not diverge at parameters theta: (p,)."""
-    subset = quick_subset(problem)
-    begin = of_subset(problem.begin(theta), subset)
-
-    # The square of an extreme measured value is infinite.
-    with np.errstate(over="ignore"):
-        return bool(np.isfinite(completed(partial(problem.of_segments(subset).cost, begin))))
 
 
 def _problems(task: FitTask, workers: FitWorkers | None) -> tuple[FitProblem, FitProblem | None]:
@@ -462,43 +415,6 @@ def _first_fit(
         status = f"{solution.status}, from {len(searched)} of {count} segments"
         solution = replace(solution, status=status)
     return part, np.arange(len(searched)), (weighted, solution)
-
-
-def _require_finite_cost(
-    task: FitTask, problem: FitProblem, subset: np.ndarray, begin: UnknownValues
-) -> None:
-    """Raise SimulationDivergedError where the model diverges at the start of the search."""
-    # The square of an extreme measured value is infinite, which the message below explains.
-    with np.errstate(over="ignore"):
-        cost = problem.of_segments(subset).cost(of_subset(begin, subset))
-    if not np.isfinite(cost):
-        names = task.system.parameters.names
-        values = listed([f"{n} = {v:.6g}" for n, v in zip(names, task.start, strict=True)])
-        extreme = describe_extreme_value(task.recordings, task.system.channels.control_columns)
-        why = _why_diverged(problem, task.start)
-        cause = f"; {extreme}; is it a fault of the log?" if extreme else f": {why}"
-        raise SimulationDivergedError(f"the simulation diverges at the start ({values}){cause}")
-
-
-def _why_diverged(problem: FitProblem, theta: Array) -> str:
-    """Why the simulation of a segment from its start diverges, as a clause for a message.
-
-    Args:
-        problem: Problem with the segments.
-        theta: (p,) parameters [theta-unit].
-    """
-    plant = problem.system.plant
-    if plant.laws is not None:
-        return UNSTABLE_LOOP
-    model = plant.model(theta)
-    substeps = plant.simulator.substeps
-
-    for segment in problem.segments:
-        end = segment.begin + segment.samples
-        ctrl = problem.recordings[segment.recording].ctrl[segment.begin : end]
-        if find_divergence(model, segment.start, ctrl, substeps) is not None:
-            return explain_divergence(model, segment.start, ctrl, substeps)
-    return NO_WARNING
 
 
 def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:

@@ -21,6 +21,7 @@ from mjfim.identification.aligned_recording import changes_within_samples
 from mjfim.identification.cross_validation import predict_unfitted
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality
+from mjfim.identification.fit_start import values_of_start
 from mjfim.identification.flipped_signs import (
     POOR_FIT,
     flipped_signs,
@@ -88,6 +89,7 @@ class FitResult:
         restart: How the fit was repeated from fits over segments; None where it was not.
         horizons: Lengths of segments that were compared; None where they were not.
         inverse_dynamics: The fit to the equation of motion from which the search started, or None.
+        start_diverged: Whether it started there because the model diverges at the stated start.
     """
 
     task: FitTask
@@ -100,6 +102,7 @@ class FitResult:
     restart: Restart | None
     horizons: HorizonStudy | None = None
     inverse_dynamics: InverseDynamicsFit | None = None
+    start_diverged: bool = False
 
     @property
     def theta(self) -> Array:
@@ -493,6 +496,12 @@ def _warnings_of_search(findings: _Findings) -> Iterator[str]:
     """Warnings about an interrupted search, a poor minimum and undetermined parameters."""
     quality = findings.quality
     accuracy = findings.accuracy
+    if findings.result.start_diverged:
+        yield (
+            f"the model diverges at the start ({values_of_start(findings.result.task)}): the "
+            "search began at a fit to the equation of motion instead"
+        )
+
     if findings.unpredictable is not None:
         yield str(findings.unpredictable)
 
