@@ -9,8 +9,10 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
+from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.independent_blocks import block_length
+from mjfim.identification.prior_share import prior_directions
 from mjfim.identification.robust_covariance import robust_uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
@@ -18,6 +20,7 @@ from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.combinations import ParameterGroup
 from mjfim.records.estimate import NORMAL_95, Uncertainty
+from mjfim.records.prior_directions import PriorDirections
 
 # Half width of an interval over the size of the value (an entry of a vector or tensor has the size
 # of the whole), above which a parameter is poorly known.
@@ -54,6 +57,7 @@ class Accuracy:
         poorly_known: Names of parameters of interest that are poorly known, and a remark on each.
         data_information: (p, p) information of the recordings alone, without priors.
         robust: Robust uncertainty of the common unknowns; None where one of them is not determined.
+        prior_directions: Combinations of inertias that the CAD prior determines, or None.
     """
 
     std: Array
@@ -67,6 +71,7 @@ class Accuracy:
     poorly_known: tuple[tuple[str, str], ...]
     data_information: Array
     robust: Uncertainty | None
+    prior_directions: PriorDirections | None
 
 
 def accuracy_of(
@@ -101,6 +106,7 @@ def accuracy_of(
     covariance = np.where(np.logical_or.outer(in_group, in_group), np.inf, covariance)
     declared_alone = np.array([not parameter.group for parameter in parameters.parameters])
 
+    data = _data_information(problem, solution)
     robust = _robust(problem, solution, correlation_rows)
     sandwich, interval, between = _intervals(problem, theta, std, robust)
     return Accuracy(
@@ -113,8 +119,9 @@ def accuracy_of(
         singular=not np.isfinite(std[~in_group]).all(),
         single_unidentifiable=bool((in_group & declared_alone).any()),
         poorly_known=tuple(_poorly_known(problem.system, theta, interval, covariance)),
-        data_information=_data_information(problem, solution.condensed),
+        data_information=data,
         robust=robust,
+        prior_directions=prior_directions(parameters, theta, data, std),
     )
 
 
@@ -246,18 +253,18 @@ def _intervals(
     return sandwich, np.column_stack([low, high]), between
 
 
-def _data_information(problem: FitProblem, condensed: Condensed) -> Array:
+def _data_information(problem: FitProblem, solution: Solution) -> Array:
     """(p, p) information of the recordings alone about the parameters that they share.
 
     All other unknowns are marginalised.
     """
     parameters = problem.system.parameters
     layout = problem.layout
-    index = layout.parameter_of_column
 
     # Only the priors on the marginalised unknowns count.
-    H = condensed.information(with_common_rows=False)
-    prior = parameters.prior_information[np.ix_(index, index)] * np.eye(len(index))
+    H = solution.condensed.information(with_common_rows=False)
+    J = problem.prior_rows.of_parameters(solution.unknowns)[:, :-1]
+    prior = J.T @ J
     kept = np.arange(len(layout.shared))
 
     information = np.zeros((len(parameters), len(parameters)))
@@ -271,6 +278,8 @@ def _poorly_known(
     """Names of the parameters of interest that are poorly known, each with a remark.
 
     The remark says how accurate the estimate is, and which parameter it is confounded with.
+    Inertias with a CAD prior are left out: single ones of an arm are no result, and what the
+    recordings determine of them is said once for all (`prior_share`).
     """
     parameters = system.parameters
     variance = np.diag(covariance)
@@ -278,7 +287,7 @@ def _poorly_known(
     sizes = parameters.sizes(theta)
     std = np.sqrt(np.maximum(np.where(is_known, variance, 1.0), SMALLEST_VARIANCE))
 
-    for j in parameters.interest:
+    for j in np.setdiff1d(parameters.interest, CadPrior.of(parameters).columns):
         half_width = 0.5 * float(interval[j, 1] - interval[j, 0])
         smallest = SMALLEST_RELATIVE_SIZE * float(parameters.magnitude[j])
         size = max(float(sizes[j]), smallest)

@@ -10,11 +10,9 @@ from mjfim.arrays import Array
 from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.model.parameters import ParameterSet
 
-# Standard deviation of a weak prior about the start, in sizes of a coordinate, and of one on the
-# logarithm of an inertia for which the model is no prior knowledge. They hold what the recordings
-# do not determine.
+# Standard deviation of a weak prior about the start, in sizes of a coordinate. It holds what the
+# recordings do not determine.
 HOLD_SIGMA = 100.0
-HOLD_LOGARITHM = 10.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,8 +59,8 @@ class EquationPriors:
         plain = np.ones(len(x), dtype=bool)
         for body in self.coordinates.bodies:
             plain[body.columns] = False
-            sigma = HOLD_LOGARITHM if body.cad_sigma is None else body.cad_sigma
-            found = body.difference(x[body.columns])
+            sigma = body.prior_sigma
+            found = body.linear_difference(x[body.columns])
             own = np.zeros((len(found.residual), len(x)))
             own[:, body.columns] = found.jacobian / sigma
             rows.append(own)

@@ -18,7 +18,12 @@ from mjfim.records.recording import Recording
 
 
 def extended_problem(
-    problem: FitProblem, recordings: Sequence[Recording], at: UnknownValues, extended: System
+    problem: FitProblem,
+    recordings: Sequence[Recording],
+    at: UnknownValues,
+    extended: System,
+    *,
+    differentiated: bool = True,
 ) -> tuple[FitProblem, UnknownValues]:
     """The problem of an extended system, and the solution of the stated one in it.
 
@@ -30,6 +35,8 @@ def extended_problem(
         recordings: All recordings.
         at: Its solution.
         extended: The extended system, which has all parameters of the stated one.
+        differentiated: Whether the problem is linearised, for which its difference steps have to be
+            calibrated.
     """
     stated, names = problem.system.parameters.names, extended.parameters.names
     theta = np.array(extended.parameters.guess)
@@ -37,7 +44,7 @@ def extended_problem(
 
     # The rows are those of the solution; a delay as a parameter would let the segments begin
     # earlier.
-    wider = FitProblem.of(extended, recordings)
+    wider = FitProblem.of(extended, recordings, calibrated=differentiated)
     simulation = replace(wider.simulation, segments=_extended_segments(problem, wider))
     wider = replace(
         wider,

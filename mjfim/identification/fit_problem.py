@@ -77,7 +77,12 @@ class FitProblem:
 
     @classmethod
     def of(
-        cls, system: System, recordings: Sequence[Recording], *, data_only: bool = False
+        cls,
+        system: System,
+        recordings: Sequence[Recording],
+        *,
+        data_only: bool = False,
+        calibrated: bool = True,
     ) -> FitProblem:
         """The problem that the `[fit]` table of a system's experiment states.
 
@@ -85,6 +90,8 @@ class FitProblem:
             system: The system.
             recordings: Recordings in SI units.
             data_only: Whether to leave priors and bounds out.
+            calibrated: Whether to calibrate the difference steps; False for a problem that is never
+                linearised.
 
         Returns:
             The problem.
@@ -104,9 +111,10 @@ class FitProblem:
         aligned = tuple(align(system, recording) for recording in recordings)
 
         # Difference steps depend on how strongly each parameter changes the recorded motion.
-        longest = max(aligned, key=lambda recording: len(recording.ctrl))
-        samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
-        system = _calibrated_along(system, longest, samples)
+        if calibrated:
+            longest = max(aligned, key=lambda recording: len(recording.ctrl))
+            samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
+            system = _calibrated_along(system, longest, samples)
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = has_free_starts(system)

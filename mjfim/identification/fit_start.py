@@ -110,8 +110,8 @@ def _begun_by_dynamics(search: FitSearch, problem: FitProblem) -> BegunFit:
 
 
 def _from(search: FitSearch, theta: Array) -> FitSearch:
-    """The searches from parameters theta: (p,)."""
-    return replace(search, task=replace(search.task, start=np.array(theta)))
+    """The searches from parameters theta: (p,), which a fit to the equation of motion found."""
+    return replace(search, task=replace(search.task, start=np.array(theta)), begins_near=True)
 
 
 def _is_finite(problem: FitProblem, theta: Array) -> bool:

@@ -19,6 +19,7 @@ from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError, explain_renamed_arguments
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.continuation import WholeFit, continued_fit, is_doubtful
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import fit_quality
@@ -461,7 +462,10 @@ def _stacked_sensitivity(
     change = np.concatenate([error for _, error in rows])
 
     # Priors are further rows, which have no error of finite differences.
-    prior = np.sqrt(np.diag(np.diag(task.system.parameters.prior_information)))
+    parameters = task.system.parameters
+    stated = np.sqrt(np.diag(np.diag(parameters.prior_information)))
+    from_model = CadPrior.of(parameters).rows(task.start)[:, :-1]
+    prior = np.concatenate([stated, from_model])
     return np.concatenate([J, prior]), np.concatenate([change, np.zeros_like(prior)])
 
 

@@ -30,6 +30,10 @@ from mjfim.model.targets import InertiaField
 # Number of coordinates of an inertia.
 COUNT = 10
 
+# Standard deviation of a weak prior on the logarithm of an inertia for which the model is no prior
+# knowledge. It holds what the recordings do not determine.
+HOLD_LOGARITHM = 10.0
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UnknownBody:
@@ -75,15 +79,54 @@ class UnknownBody:
         by_parameters = barycentric_of(logcholesky_derivatives(self.values(linear))).T
         return np.asarray(np.linalg.inv(by_parameters))
 
+    def moved(self, values: Array, step: Array) -> Array:
+        """(10,) parameters after a step of (10,) parameters: a straight line in linear coordinates.
+
+        Forces are linear along it, so that Gauss-Newton steps err less than along a straight line
+        in log-Cholesky coordinates, which is taken where the other one leaves physical inertias.
+        """
+        straight = np.asarray(values + step)
+        if not self.is_logcholesky or not step.any():
+            return straight
+        by_values = barycentric_of(logcholesky_derivatives(values))
+        linear = self.linear(values) + step @ by_values
+        return self.values(linear) if self.is_physical(linear) else straight
+
     def is_physical(self, linear: Array) -> bool:
         """Whether the barycentric coordinates: (10,) are those of a body with a volume."""
         return is_positive_definite(pseudo_inertia_of(linear))
 
-    def difference(self, linear: Array) -> InertiaDifference:
+    @property
+    def prior_sigma(self) -> float:
+        """Standard deviation of the prior in a linear fit, very weak where none is stated."""
+        return HOLD_LOGARITHM if self.cad_sigma is None else self.cad_sigma
+
+    def linear_difference(self, linear: Array) -> InertiaDifference:
         """Difference of an inertia, by its (10,) barycentric coordinates, from the model's."""
         return inertia_difference(
             pseudo_inertia_of(linear), BARYCENTRIC_DERIVATIVES, self.reference
         )
+
+    def difference(self, values: Array) -> InertiaDifference:
+        """Difference of an inertia, by its (10,) parameters, from the model's.
+
+        Barycentric coordinates of a search need not be those of a body. Their difference is the
+        linearised one, whose square is that of the metric to second order.
+        """
+        if not self.is_logcholesky:
+            factor = logcholesky_factor(self.reference)
+            model = barycentric_of(factor @ factor.T)
+            jacobian = self.linear_difference(model).jacobian
+            return InertiaDifference(residual=jacobian @ (values - model), jacobian=jacobian)
+
+        with np.errstate(over="ignore", invalid="ignore"):
+            factor = logcholesky_factor(values)
+            pseudo_inertia = factor @ factor.T
+            derivatives = logcholesky_derivatives(values)
+        if not np.isfinite(derivatives).all() or not np.isfinite(pseudo_inertia).all():
+            shape = (COUNT, COUNT)
+            return InertiaDifference(residual=np.full(COUNT, np.inf), jacobian=np.zeros(shape))
+        return inertia_difference(pseudo_inertia, derivatives, self.reference)
 
 
 def unknown_bodies(parameters: ParameterSet) -> tuple[UnknownBody, ...]:

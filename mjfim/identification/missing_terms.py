@@ -13,7 +13,7 @@ are screened by simulations with some of their values (`mjfim/identification/scr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -29,6 +29,7 @@ from mjfim.identification.candidates import (
 )
 from mjfim.identification.extended_problems import extended_problem, with_residuals_of
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.screened_terms import screened_terms
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -61,6 +62,10 @@ INVERSE_TOLERANCE = 1e-12
 
 # Smallest column norm in a denominator.
 SMALLEST_NORM = 1e-300
+
+# Largest number of samples that a linearisation by parameters and candidates simulates, over all of
+# its differences. With more data, segments that are spread over them are enough for the tests.
+MAX_SIMULATED = 1_000_000
 
 # Samples of the motion from which the speeds of the joints are taken.
 SPEED_SAMPLES = 2000
@@ -100,23 +105,44 @@ def find_missing_terms(
     Returns:
         The terms, most significant first; empty where no term is significant.
     """
+    system = problem.system
+    groups = [
+        _affordable(list(candidates_of(system, _typical_speeds(problem, at)))),
+        # Contacts would slow down all simulations of the other candidates.
+        _affordable(list(load_candidates_of(system))),
+    ]
+    problem, at = _affordable_data(problem, at, groups)
+
     squares = 2.0 * problem.cost(at)
-    found = _by_score(problem, recordings, at, squares)
+    found = _by_score(problem, recordings, at, squares, groups)
     found += screened_terms(problem, recordings, at, squares)
 
     wanted = [term for term in found if term.share > MIN_EXPLAINED_SHARE]
     return tuple(_by_significance(wanted)[:MAX_NAMED_TERMS])
 
 
+def _affordable_data(
+    problem: FitProblem, at: UnknownValues, groups: Sequence[Sequence[Candidate]]
+) -> tuple[FitProblem, UnknownValues]:
+    """The segments on which groups of candidates are tested, and their unknowns."""
+    tested = [sum(len(each.tested) for each in candidates) for candidates in groups]
+    columns = problem.layout.column_count + problem.simulation.private_count + max(tested)
+    count = len(problem.segments)
+    wanted = max(int(MAX_SIMULATED * count / (problem.sample_count * columns)), 1)
+    if wanted >= count:
+        return problem, at
+    chosen = spread_over_data(count, wanted)
+    return problem.of_segments(chosen), replace(at, private=at.private[chosen])
+
+
 def _by_score(
-    problem: FitProblem, recordings: Sequence[Recording], at: UnknownValues, squares: float
+    problem: FitProblem,
+    recordings: Sequence[Recording],
+    at: UnknownValues,
+    squares: float,
+    groups: Sequence[Sequence[Candidate]],
 ) -> list[MissingTerm]:
     """Terms whose score tests are significant, in the order of the candidates."""
-    system = problem.system
-    together = _affordable(list(candidates_of(system, _typical_speeds(problem, at))))
-
-    # Contacts would slow down all simulations of the other candidates.
-    groups = (together, _affordable(list(load_candidates_of(system))))
     count = sum(len(candidates) for candidates in groups)
 
     # Of the variants of one term, the most significant one stands for it.

@@ -13,9 +13,11 @@ from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import NextStepLength, UnknownValues
 from mjfim.plant.noise import Noise
 
-# Share of the segments of the test, and their smallest number.
+# Share of the segments of the test, their smallest number, and the largest share that this may be:
+# a test of more segments saves too little of a linearisation of all of them.
 TESTED_SHARE = 0.1
 MIN_TESTED_SEGMENTS = 15
+LARGEST_TESTED_SHARE = 0.3
 
 # Smallest information of the tested segments about a parameter, as a share of what as many segments
 # hold on average. With less, the test says nothing about the parameter.
@@ -46,8 +48,8 @@ def next_step_on_part(
         The test; None where there are too few segments for it.
     """
     count = len(problem.segments)
-    wanted = int(TESTED_SHARE * count)
-    if wanted < MIN_TESTED_SEGMENTS:
+    wanted = max(int(TESTED_SHARE * count), MIN_TESTED_SEGMENTS)
+    if wanted > LARGEST_TESTED_SHARE * count:
         return None
     tested = spread_over_data(count, wanted)
     part = problem.of_segments(tested)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.pins import Pins
 from mjfim.identification.segment_simulation import SegmentSimulation
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -43,13 +44,45 @@ class PriorRows:
         layout = self.simulation.layout
         rows = np.zeros((0, layout.column_count + 1))
         if self.with_priors:
-            rows = layout.prior_rows(at)
+            rows = self.of_parameters(at)
         if self._pins_involve_private:
             return rows
 
         residual = self.pins.residual(layout.theta(at))
         columns = layout.to_columns(self.pins.rows, 0)
         return np.concatenate([rows, np.column_stack([columns, residual])])
+
+    def of_parameters(self, at: UnknownValues) -> Array:
+        """Rows of the priors on the common unknowns, without pins.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (l, c+1) rows `[J, r]`: the stated priors, then those from the model's inertias.
+        """
+        layout = self.simulation.layout
+        rows = [layout.prior_rows(at)]
+        is_own = np.zeros(len(layout.parameters), dtype=bool)
+        is_own[layout.per_recording] = True
+
+        # An inertia with a value for each recording has a prior in each of them.
+        rows.append(self._cad_rows(self._cad.of_bodies(~is_own), at, 0))
+        own = self._cad.of_bodies(is_own)
+        rows += [self._cad_rows(own, at, k) for k in range(layout.recordings) if own.bodies]
+        return np.concatenate(rows)
+
+    def _cad_rows(self, prior: CadPrior, at: UnknownValues, recording: int) -> Array:
+        """(l, c+1) rows of the priors on inertias, with the values of one recording."""
+        layout = self.simulation.layout
+        found = prior.rows(layout.theta_of_recording(at, recording))
+        columns = layout.to_columns(found[:, :-1], recording)
+        return np.column_stack([columns, found[:, -1]])
+
+    @cached_property
+    def _cad(self) -> CadPrior:
+        """Priors from the model's inertias."""
+        return CadPrior.of(self.simulation.system.parameters)
 
     def private(self, at: UnknownValues) -> Array:
         """Rows on the private unknowns of every segment.

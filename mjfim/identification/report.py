@@ -18,6 +18,7 @@ from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.identification.accuracy import Accuracy, accuracy_of
 from mjfim.identification.aligned_recording import changes_within_samples
+from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.cross_validation import predict_unfitted
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality
@@ -308,7 +309,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
     return Estimate(
         parameters=parameters.names,
         units=system.units,
-        prior=parameters.prior_information,
+        prior=parameters.prior_information + CadPrior.of(parameters).information(result.theta),
         theta=result.theta,
         std=accuracy.std,
         covariance=accuracy.covariance,
@@ -351,6 +352,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         held=result.task.settings.hold,
         inverse_dynamics=result.inverse_dynamics,
         recording_comparison=findings.comparison,
+        prior_directions=accuracy.prior_directions,
     )
 
 

@@ -123,7 +123,7 @@ def _screened(
     extended = _extended_system(system, added, path)
     if extended is None:
         return None
-    wider, begin = extended_problem(problem, recordings, at, extended)
+    wider, begin = extended_problem(problem, recordings, at, extended, differentiated=False)
 
     quantity = extended.source.terms[added.name].quantity(screening.field)
     first = (

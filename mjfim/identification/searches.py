@@ -15,7 +15,7 @@ from mjfim.identification.estimated_noise import EstimatedNoiseProblem
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.next_step import next_step_on_part
 from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
-from mjfim.identification.subsets import first_subset, of_subset, quick_subset
+from mjfim.identification.subsets import first_subset, of_subset
 from mjfim.identification.task import FitTask
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.optimize.levenberg_marquardt import (
@@ -120,11 +120,14 @@ class FitSearch:
         task: System, recordings and settings.
         budget: Budget whose token ends all searches.
         callback: Called with every iterate, or None.
+        begins_near: Whether the start of the task is near the minimum, as a fit to the equation of
+            motion is.
     """
 
     task: FitTask
     budget: Budget
     callback: Callback | None
+    begins_near: bool = False
 
     def interrupted(self) -> bool:
         """True after a request to stop."""
@@ -378,19 +381,24 @@ class FitSearch:
         if max_iterations is not None:
             iterations = min(iterations, max_iterations)
         settings = SearchSettings(
-            max_iterations=iterations, tolerance=FINAL_TOLERANCE, in_true_deviations=True
+            max_iterations=iterations,
+            tolerance=FINAL_TOLERANCE,
+            begins_near=self.begins_near,
+            in_true_deviations=True,
         )
         samples = problem.sample_count * 2 * len(self.task.system.parameters)
         if samples < SAMPLES_OF_MUCH_DATA:
             return settings
 
         # A search over a part of the data has led near the minimum, where there is such a part.
-        begins_near = len(quick_subset(problem)) < len(problem.segments)
+        begins_near = len(first_subset(problem)) < len(problem.segments)
+        next_step_length = next_step_on_part(problem) if begins_near else None
         return replace(
             settings,
             tolerance=FINAL_TOLERANCE_OF_MUCH_DATA,
             relinearise_at_end=False,
-            next_step_length=next_step_on_part(problem) if begins_near else None,
+            next_step_length=next_step_length,
+            begins_near=self.begins_near or next_step_length is not None,
         )
 
     def with_initial_states(

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import Step
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -156,7 +158,8 @@ class UnknownLayout:
     def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
         """The unknowns after a fraction of a step.
 
-        Common unknowns are clipped to the bounds, which rounding might exceed.
+        Common unknowns are clipped to the bounds, which rounding might exceed. Inertias of whole
+        bodies move along straight lines of their barycentric coordinates.
 
         Args:
             at: The unknowns.
@@ -172,11 +175,20 @@ class UnknownLayout:
         count = len(self.shared)
         theta = np.array(at.theta)
         theta[self.shared] = values[:count]
+        for body in self._shared_bodies:
+            own = theta[body.columns] - at.theta[body.columns]
+            theta[body.columns] = body.moved(at.theta[body.columns], own)
         return UnknownValues(
             theta=theta,
             private=at.private + fraction * step.private,
             per_recording=values[count:].reshape(at.per_recording.shape),
         )
+
+    @cached_property
+    def _shared_bodies(self) -> tuple[UnknownBody, ...]:
+        """Bodies whose whole inertia is unknown, with one value in all recordings."""
+        bodies = unknown_bodies(self.parameters)
+        return tuple(body for body in bodies if np.isin(body.columns, self.shared).all())
 
     def theta_of_recording(self, at: UnknownValues, recording: int) -> Array:
         """Parameters of one recording.

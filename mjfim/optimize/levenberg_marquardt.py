@@ -23,7 +23,8 @@ T = TypeVar("T")
 # Damping of the first step, relative to the squared column norms of the Jacobian.
 INITIAL_DAMPING = 1e-3
 
-# Damping (nearly zero) of the step whose length estimates the distance to the minimum.
+# Damping (nearly zero) of the step whose length estimates the distance to the minimum, and of the
+# first step of a search that begins near it.
 WEAK_DAMPING = 1e-6
 
 # Damping above which the search gives up: no step lowers the cost.
@@ -250,8 +251,9 @@ class SearchSettings:
         rough_share: Predicted decrease of the cost, as a share of the cost, below which a step is
             the last one. It serves searches that need not converge; 0 for the others.
         next_step_length: Estimates the length of the next step [standard deviations] at the end
-            of a complete one, at less cost than a linearisation of all data. A search that has it
-            begins with hardly any damping, since it begins near the minimum. None without it.
+            of a complete one, at less cost than a linearisation of all data. None without it.
+        begins_near: Whether the search begins near the minimum, with hardly any damping. Damping
+            would slow it down along combinations that the data determine little.
         in_true_deviations: True to measure lengths in standard deviations that allow for
             autocorrelated residuals, because what is far below the true accuracy need not be
             searched for. False for formal standard deviations.
@@ -265,6 +267,7 @@ class SearchSettings:
     relinearise_at_end: bool = True
     rough_share: float = 0.0
     next_step_length: NextStepLength | None = None
+    begins_near: bool = False
     in_true_deviations: bool = False
     cost_to_beat: float = np.inf
 
@@ -354,7 +357,7 @@ class _Search:
         # A length of many unknowns is compared with the root mean square of each.
         self.unknowns_length = float(np.sqrt(max(len(problem.lower), 1)))
         self.damping = INITIAL_DAMPING if settings.damped else 0.0
-        if settings.damped and settings.next_step_length is not None:
+        if settings.damped and settings.begins_near:
             self.damping = WEAK_DAMPING
         self.damping_growth = 2.0
         self.stagnant_iterations = 0

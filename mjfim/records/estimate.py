@@ -16,6 +16,7 @@ from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
 from mjfim.records.missing_term import MissingTerm
 from mjfim.records.parameter_draws import ParameterDraws
+from mjfim.records.prior_directions import PriorDirections
 from mjfim.records.recording import Recording
 from mjfim.records.recording_comparison import RecordingComparison
 from mjfim.records.selection import Selection
@@ -79,7 +80,7 @@ class Estimate(ShownRecord):
         seconds: Wall time [s].
         steps: MuJoCo steps taken.
         units: Unit of each parameter.
-        prior: (p, p) information of the parameters' priors.
+        prior: (p, p) information of the parameters' priors, at the estimate.
         labels: Names and units for figures and tables; None in records of earlier versions.
         restart: How the fit was repeated from fits over segments; None where it was not.
         trace: (n, p) the initial guess, and the parameters at the begin and at each iteration of
@@ -103,6 +104,8 @@ class Estimate(ShownRecord):
             None where that was not asked for.
         recording_comparison: What each recording suggests alone, the scatter between recordings,
             and which one is odd; None for a single recording.
+        prior_directions: Combinations of inertias that the recordings do not determine, but the
+            inertias of the model (`cad_prior`); None without any.
     """
 
     parameters: tuple[str, ...]
@@ -154,6 +157,7 @@ class Estimate(ShownRecord):
     inverse_dynamics: InverseDynamicsFit | None = None
     draws: ParameterDraws | None = None
     recording_comparison: RecordingComparison | None = None
+    prior_directions: PriorDirections | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -263,6 +267,9 @@ class Estimate(ShownRecord):
             "draws": None if self.draws is None else self.draws.summary(),
             "recording_comparison": (
                 None if self.recording_comparison is None else self.recording_comparison.summary()
+            ),
+            "prior_directions": (
+                None if self.prior_directions is None else self.prior_directions.summary()
             ),
         }
 

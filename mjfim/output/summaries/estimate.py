@@ -57,8 +57,8 @@ def describe_estimate(estimate: Estimate) -> Summary:
     """
     fit = Paragraph(text=capitalised(_fit_sentence(estimate)))
     parts: list[Part] = [_estimate_table(estimate), fit]
-    if estimate.restart is not None:
-        parts.append(Paragraph(text=str(estimate.restart)))
+    remarks = (estimate.restart, estimate.prior_directions)
+    parts += [Paragraph(text=str(remark)) for remark in remarks if remark is not None]
     if estimate.selection is not None:
         parts += describe_selection(estimate.selection)
     if estimate.horizons is not None:
