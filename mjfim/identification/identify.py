@@ -56,6 +56,10 @@ from mjfim.records.recording import Recording
 # for before all of them.
 SHARES_THAT_DETERMINE = (0.2, 0.5)
 
+# A smaller share that is tried first where it has enough segments.
+SMALL_SHARE = 0.05
+SEGMENTS_OF_SMALL_SHARE = 3
+
 Callback = Callable[[FitEvent], None]
 
 
@@ -439,7 +443,8 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
 def _parts_that_determine(problem: FitProblem) -> Iterator[FitProblem]:
     """Parts of the data that may determine all parameters, small ones first."""
     count = len(problem.segments)
-    for share in SHARES_THAT_DETERMINE:
+    is_much = SMALL_SHARE * count >= SEGMENTS_OF_SMALL_SHARE
+    for share in (*[SMALL_SHARE] * is_much, *SHARES_THAT_DETERMINE):
         wanted = int(share * count)
         if wanted:
             yield problem.of_segments(spread_over_data(count, wanted))

@@ -30,6 +30,9 @@ from mjfim.model.targets import InertiaField
 # Number of coordinates of an inertia.
 COUNT = 10
 
+# Share of the way to an inertia that no body has, which one step may go.
+TO_BOUNDARY = 0.9
+
 # Standard deviation of a weak prior on the logarithm of an inertia for which the model is no prior
 # knowledge. It holds what the recordings do not determine.
 HOLD_LOGARITHM = 10.0
@@ -79,18 +82,30 @@ class UnknownBody:
         by_parameters = barycentric_of(logcholesky_derivatives(self.values(linear))).T
         return np.asarray(np.linalg.inv(by_parameters))
 
-    def moved(self, values: Array, step: Array) -> Array:
-        """(10,) parameters after a step of (10,) parameters: a straight line in linear coordinates.
+    def physical_share(self, values: Array, step: Array) -> float:
+        """Largest share, at most 1, of a step (10,) of the parameters that `moved` may take.
 
-        Forces are linear along it, so that Gauss-Newton steps err less than along a straight line
-        in log-Cholesky coordinates, which is taken where the other one leaves physical inertias.
+        Args:
+            values: (10,) parameters at which the step begins.
+            step: (10,) the step.
         """
-        straight = np.asarray(values + step)
         if not self.is_logcholesky or not step.any():
-            return straight
-        by_values = barycentric_of(logcholesky_derivatives(values))
-        linear = self.linear(values) + step @ by_values
-        return self.values(linear) if self.is_physical(linear) else straight
+            return 1.0
+        change = np.tensordot(step, logcholesky_derivatives(values), axes=1)
+        inverse = np.linalg.inv(logcholesky_factor(values))
+        smallest = float(np.linalg.eigvalsh(inverse @ change @ inverse.T)[0])
+        return min(1.0, -TO_BOUNDARY / smallest) if smallest < 0.0 else 1.0
+
+    def moved(self, values: Array, step: Array) -> Array:
+        """(10,) parameters after a physical step along a straight line of linear coordinates.
+
+        Forces are linear along it, so that Gauss-Newton steps err far less than along a straight
+        line of log-Cholesky coordinates.
+        """
+        if not self.is_logcholesky or not step.any():
+            return np.asarray(values + step)
+        change = barycentric_of(logcholesky_derivatives(values))
+        return self.values(self.linear(values) + step @ change)
 
     def is_physical(self, linear: Array) -> bool:
         """Whether the barycentric coordinates: (10,) are those of a body with a volume."""

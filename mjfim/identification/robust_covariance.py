@@ -107,7 +107,8 @@ def robust_uncertainty(
     inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
     centred = blocks.scores - blocks.scores.mean(axis=0)
     S = centred.T @ centred * (count / max(count - 1, 1)) + blocks.prior_information
-    sandwich = np.sqrt(np.maximum(np.diag(inverse @ S @ inverse), 0.0))
+    of_scatter = inverse @ S @ inverse
+    sandwich = np.sqrt(np.maximum(np.diag(of_scatter), 0.0))
     formal = np.sqrt(np.maximum(np.diag(inverse), 0.0))
 
     replicates = _bootstrap(blocks, draws, rng)
@@ -134,7 +135,34 @@ def robust_uncertainty(
         each=each,
         blocks=count,
         draws=theta + replicates,
+        covariance=covering_covariance(inverse, _student_factor(count) ** 2 * of_scatter),
     )
+
+
+def covering_covariance(first: Array, second: Array) -> Array:
+    """Covariance that is in every direction at least as large as two others.
+
+    Args:
+        first: (c, c) a covariance.
+        second: (c, c) another one, which may be singular.
+
+    Returns:
+        (c, c) covariance; it is larger than both only where they differ in their axes.
+    """
+    scale = np.sqrt(np.maximum(np.diag(first), SMALLEST_VARIANCE))
+    values, vectors = np.linalg.eigh(first / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    relative = np.linalg.pinv(root, rcond=INVERSE_TOLERANCE)
+    ratios, axes = np.linalg.eigh(relative @ second @ relative.T)
+    spread = root @ axes
+    return np.asarray((spread * np.maximum(ratios, 1.0)) @ spread.T)
+
+
+def _student_factor(count: int) -> float:
+    """Ratio of the quantiles of Student's distribution, from a number of blocks, and the normal."""
+    upper_tail = 0.5 + LEVEL / 2.0
+    student = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail))
+    return student / float(scipy.special.ndtri(upper_tail))
 
 
 def _interval(
@@ -156,8 +184,8 @@ def _interval(
         count: Number of blocks from which the sandwich covariance was computed.
     """
     upper_tail = 0.5 + LEVEL / 2.0
-    student_quantile = float(scipy.special.stdtrit(max(count - 1, 1), upper_tail))
-    normal_quantile = float(scipy.special.stdtrit(1e9, upper_tail))
+    normal_quantile = float(scipy.special.ndtri(upper_tail))
+    student_quantile = _student_factor(count) * normal_quantile
 
     half_width = np.maximum(
         normal_quantile * np.hypot(formal, between),

@@ -159,7 +159,9 @@ class UnknownLayout:
         """The unknowns after a fraction of a step.
 
         Common unknowns are clipped to the bounds, which rounding might exceed. Inertias of whole
-        bodies move along straight lines of their barycentric coordinates.
+        bodies move along straight lines of their barycentric coordinates. Where a body would not be
+        physical there, all unknowns move a smaller fraction: what the bodies do together is then as
+        the linearisation predicts.
 
         Args:
             at: The unknowns.
@@ -169,14 +171,21 @@ class UnknownLayout:
         Returns:
             The moved unknowns.
         """
+        count, bodies = len(self.shared), self._shared_bodies
+        by_theta = np.zeros(len(at.theta))
+        by_theta[self.shared] = fraction * step.common[:count]
+        shares = [
+            body.physical_share(at.theta[body.columns], by_theta[body.columns]) for body in bodies
+        ]
+        share = min(shares, default=1.0)
+        fraction = share * fraction
+
         values = self.common_values(at) + fraction * step.common
         values = np.clip(values, self.lower, self.upper)
-
-        count = len(self.shared)
         theta = np.array(at.theta)
         theta[self.shared] = values[:count]
-        for body in self._shared_bodies:
-            own = theta[body.columns] - at.theta[body.columns]
+        for body in bodies:
+            own = share * by_theta[body.columns]
             theta[body.columns] = body.moved(at.theta[body.columns], own)
         return UnknownValues(
             theta=theta,

@@ -575,7 +575,8 @@ class _Search:
             predicted.common_length < COMPLETE_STEP * length
             and predicted.private_length < SHORT_STEP * self.unit
         )
-        return complete and length < SHORT_STEP * self.unit and next_length < self._tolerance
+        short = SHORT_STEP * self.unit * self.unknowns_length
+        return complete and length < short and next_length < self._tolerance
 
     def _is_near(self, predicted: Step) -> bool:
         """Whether a search that need not converge has come near the minimum.

@@ -464,6 +464,8 @@ class Uncertainty:
             information.
         blocks: Number of blocks of the bootstrap.
         draws: (n, c) bootstrap replicates of the estimate.
+        covariance: (c, c) covariance that is in every direction at least the formal one and the
+            sandwich one, for combinations of the unknowns; empty in records of earlier versions.
     """
 
     sandwich: Array
@@ -473,6 +475,7 @@ class Uncertainty:
     each: Array
     blocks: int
     draws: Array
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,6 +30,7 @@ BENCHMARKS = {
     "starts": "how often do fits find the optimum from starts wrong by factors of 3 to 10?",
     "prove_identification": "do the 95 % intervals hold the true values?",
     "selection": "does `identify --select` find the term that a model lacks, and no other?",
+    "arm_logs": "do closed-loop logs of arms give base parameters and torques within intervals?",
     "measured_data": "how well are measured data of other groups predicted, with added terms?",
 }
 
