@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from mjfim.studies.check import check
     from mjfim.studies.compare import compare
     from mjfim.studies.monte_carlo import monte_carlo
+    from mjfim.studies.payload import identify_payload
     from mjfim.studies.robot_comparison import compare_estimates
     from mjfim.studies.robustness import assess_robustness
     from mjfim.studies.selected_models import selected_experiment
@@ -78,6 +79,7 @@ __all__ = [
     "evaluate",
     "export_design",
     "identify",
+    "identify_payload",
     "inverse_dynamics",
     "live",
     "monte_carlo",
@@ -127,6 +129,7 @@ MODULES = {
     "check": "mjfim.studies.check",
     "compare": "mjfim.studies.compare",
     "monte_carlo": "mjfim.studies.monte_carlo",
+    "identify_payload": "mjfim.studies.payload",
     "compare_estimates": "mjfim.studies.robot_comparison",
     "assess_robustness": "mjfim.studies.robustness",
     "select_terms": "mjfim.studies.selection",

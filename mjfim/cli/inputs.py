@@ -37,7 +37,8 @@ def require_inputs(arguments: Mapping[str, Any]) -> None:
         raise RecordingError(f"{design}: no such design file")
 
     # Episodes of a dataset, whose names have no ending, are no files of their own.
-    for path in (*(arguments.get("recordings") or ()), *(arguments.get("held_out") or ())):
+    keys = ("recordings", "held_out", "without")
+    for path in (path for key in keys for path in arguments.get(key) or ()):
         if path.suffix and not path.exists():
             raise RecordingError(f"{path}: no such file")
 

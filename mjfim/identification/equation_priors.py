@@ -45,13 +45,11 @@ class EquationPriors:
 
     def stated(self, x: Array) -> tuple[Array, Array]:
         """Rows of the priors of the experiment, as those of `all`."""
-        weight = np.sqrt(np.diag(self.parameters.prior_information))
-        chosen = weight > 0.0
-        if not chosen.any():
+        rows = self.parameters.prior_rows
+        if not len(rows):
             return np.zeros(0), np.zeros((0, len(x)))
-        residual = weight * (self.coordinates.theta(x) - self.parameters.guess)
-        derivative = weight[:, None] * self.coordinates.derivative(x)
-        return residual[chosen], derivative[chosen]
+        residual = rows @ (self.coordinates.theta(x) - self.parameters.guess)
+        return residual, rows @ self.coordinates.derivative(x)
 
     def weak(self, x: Array) -> tuple[Array, Array]:
         """Rows of weak priors about the model's inertias and about the start, as those of `all`."""

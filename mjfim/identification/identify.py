@@ -468,9 +468,8 @@ def _stacked_sensitivity(
 
     # Priors are further rows, which have no error of finite differences.
     parameters = task.system.parameters
-    stated = np.sqrt(np.diag(np.diag(parameters.prior_information)))
     from_model = CadPrior.of(parameters).rows(task.start)[:, :-1]
-    prior = np.concatenate([stated, from_model])
+    prior = np.concatenate([parameters.prior_rows, from_model])
     return np.concatenate([J, prior]), np.concatenate([change, np.zeros_like(prior)])
 
 

@@ -114,7 +114,7 @@ class PriorRows:
         # Stated priors on the deviations of the initial state.
         parameters = system.parameters
         private = layout.private
-        weight = np.sqrt(np.diag(parameters.prior_information))[private] * self.with_priors
+        weight = parameters.prior_weight[private] * self.with_priors
         pin_count = len(self.pins.rows) if self._pins_involve_private else 0
         rows = np.zeros((count, n + pin_count, m))
         rows[:, diagonal, diagonal] = weight

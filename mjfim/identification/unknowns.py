@@ -249,7 +249,7 @@ class UnknownLayout:
         return columns
 
     def prior_rows(self, at: UnknownValues) -> Array:
-        """Rows of the stated priors on the common unknowns.
+        """Rows of prior knowledge on the common unknowns.
 
         Args:
             at: The unknowns.
@@ -258,9 +258,15 @@ class UnknownLayout:
             (l, c+1) rows `[J, r]`, with residuals in standard deviations of the prior.
         """
         index = self.parameter_of_column
-        information = np.diag(self.parameters.prior_information)[index]
-        weight = np.sqrt(information)
+        weight = self.parameters.prior_weight[index]
 
         deviation = self.common_values(at) - self.parameters.guess[index]
-        rows = np.column_stack([np.diag(weight), weight * deviation])
-        return np.asarray(rows[weight > 0.0])
+        rows = np.column_stack([np.diag(weight), weight * deviation])[weight > 0.0]
+
+        # Parameters that an earlier estimate knows are shared by all recordings.
+        earlier = self.parameters.earlier_rows
+        if earlier is None:
+            return np.asarray(rows)
+        residual = earlier @ (self.theta_of_recording(at, 0) - self.parameters.guess)
+        known = np.column_stack([self.to_columns(earlier, 0), residual])
+        return np.concatenate([rows, known])

@@ -141,12 +141,15 @@ class ParameterSet:
             an inertia by (parametrisation, body), (4,) quaternions by (array, row).
         mocap: Where mocap bodies start; None where they start as compiled.
         whole_terms: Physical terms of the model that are written as a whole.
+        earlier_rows: (l, p) rows R of what an earlier estimate knows: `|R (theta - guess)|^2` are
+            squared standard deviations; None where there is no such knowledge.
     """
 
     parameters: tuple[Parameter, ...]
     nominal: dict[tuple[str, int], Array] = field(default_factory=dict)
     mocap: MocapPlacement | None = None
     whole_terms: tuple[Term, ...] = ()
+    earlier_rows: Array | None = None
 
     @staticmethod
     def build(
@@ -244,8 +247,22 @@ class ParameterSet:
 
     @property
     def prior_information(self) -> Array:
-        """(p, p) information of the stated priors [1/theta^2]."""
-        return np.diag(self._values(lambda p: 0.0 if p.prior is None else p.prior**-2))
+        """(p, p) information of the stated priors and of an earlier estimate [1/theta^2]."""
+        return np.asarray(self.prior_rows.T @ self.prior_rows)
+
+    @property
+    def prior_rows(self) -> Array:
+        """(l, p) rows R of all prior knowledge, whose residuals are `R (theta - guess)`."""
+        weight = self.prior_weight
+        stated = np.diag(weight)[weight > 0.0]
+        if self.earlier_rows is None:
+            return stated
+        return np.concatenate([stated, self.earlier_rows])
+
+    @property
+    def prior_weight(self) -> Array:
+        """(p,) inverse standard deviations of the stated priors; 0 without one [1/theta-unit]."""
+        return self._values(lambda p: 0.0 if p.prior is None else 1.0 / p.prior)
 
     @property
     def interest(self) -> np.ndarray:

@@ -16,6 +16,7 @@ from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
 from mjfim.records.missing_term import MissingTerm
 from mjfim.records.parameter_draws import ParameterDraws
+from mjfim.records.payload import PayloadEstimate
 from mjfim.records.prior_directions import PriorDirections
 from mjfim.records.recording import Recording
 from mjfim.records.recording_comparison import RecordingComparison
@@ -106,6 +107,7 @@ class Estimate(ShownRecord):
             and which one is odd; None for a single recording.
         prior_directions: Combinations of inertias that the recordings do not determine, but the
             inertias of the model (`cad_prior`); None without any.
+        payload: The payload that was looked for; None where none was.
     """
 
     parameters: tuple[str, ...]
@@ -158,6 +160,7 @@ class Estimate(ShownRecord):
     draws: ParameterDraws | None = None
     recording_comparison: RecordingComparison | None = None
     prior_directions: PriorDirections | None = None
+    payload: PayloadEstimate | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -265,6 +268,7 @@ class Estimate(ShownRecord):
                 None if self.inverse_dynamics is None else self.inverse_dynamics.summary()
             ),
             "draws": None if self.draws is None else self.draws.summary(),
+            "payload": None if self.payload is None else self.payload.summary(),
             "recording_comparison": (
                 None if self.recording_comparison is None else self.recording_comparison.summary()
             ),

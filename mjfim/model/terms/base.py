@@ -123,22 +123,29 @@ class Tilt(Term):
 
 @dataclass(frozen=True, kw_only=True)
 class Payload(Term):
-    """A point mass that is fixed to a body.
+    """A load that is fixed to a body, whose rotational inertia is equal about all axes.
 
     Attributes:
         body: Name of the body.
     """
 
     kind = "payload"
-    description = "A point mass that is fixed to a body, such as a load in a gripper."
-    equation = "mass at the point (x, y, z) of the body's frame"
-    elements = "body without joints, with an inertial of that mass"
+    description = (
+        "A load that is fixed to a body, such as one in a gripper. Its rotational inertia about "
+        "its centre of mass is equal about all axes, as that of a ball or a cube; 0 is a point "
+        "mass."
+    )
+    equation = "mass and inertia at the point (x, y, z) of the body's frame"
+    elements = "body without joints, with an inertial"
     acts_on = "body"
     fields = (
         FieldDescription(name="mass", description="mass of the load", unit="kg"),
         *(
             FieldDescription(name=axis, description=f"{axis} in the frame of the body", unit="m")
             for axis in AXES
+        ),
+        FieldDescription(
+            name="inertia", description="rotational inertia of the load", unit="kg m²"
         ),
     )
     sources = (ATKESON_1986,)
@@ -153,11 +160,13 @@ class Payload(Term):
         if name == WORLD or int(model.body_weldid[number]) == 0:
             raise ExperimentError(f"body: {name!r} does not move, so that a load has no effect")
 
-        values = resolved_values(cls.kind, table, dict.fromkeys(("mass", *AXES), 0.0))
+        fields = ("mass", *AXES, "inertia")
+        values = resolved_values(cls.kind, table, dict.fromkeys(fields, 0.0))
+        tree_mass = float(model.body_subtreemass[model.body_rootid[number]])
         mass = TermQuantity(
             value=values["mass"],
             unit="kg",
-            size=float(model.body_subtreemass[model.body_rootid[number]]),
+            size=tree_mass,
             bounds=(0.0, np.inf),
             numbers=((f"body/{table.name}:mass", 1.0),),
         )
@@ -174,7 +183,15 @@ class Payload(Term):
             )
             for i, axis in enumerate(AXES)
         )
-        return cls(name=table.name, body=name, quantities=(("mass", mass), *places))
+        inertia = TermQuantity(
+            value=values["inertia"],
+            unit="kg m²",
+            size=tree_mass * length**2,
+            bounds=(0.0, np.inf),
+            numbers=tuple((f"body/{table.name}:inertia[{i}]", 1.0) for i in range(3)),
+        )
+        quantities = (("mass", mass), *places, ("inertia", inertia))
+        return cls(name=table.name, body=name, quantities=quantities)
 
     def edit(self, spec: Any) -> None:
         """Add the body of the load."""
@@ -182,7 +199,7 @@ class Payload(Term):
         load.pos = [self.value(axis) for axis in AXES]
         load.mass = self.value("mass")
         load.ipos = np.zeros(3)
-        load.inertia = np.zeros(3)
+        load.inertia = np.full(3, self.value("inertia"))
         load.explicitinertial = True
 
     def changes(self) -> tuple[MjcfChange, ...]:
@@ -190,7 +207,7 @@ class Payload(Term):
         inertial = (
             ("pos", (0.0, 0.0, 0.0)),
             ("mass", (self.value("mass"),)),
-            ("diaginertia", (0.0, 0.0, 0.0)),
+            ("diaginertia", (self.value("inertia"),) * 3),
         )
         place = tuple(self.value(axis) for axis in AXES)
         load = NewElement(

@@ -56,7 +56,7 @@ def describe_estimate(estimate: Estimate) -> Summary:
         estimate: The estimate.
     """
     fit = Paragraph(text=capitalised(_fit_sentence(estimate)))
-    parts: list[Part] = [_estimate_table(estimate), fit]
+    parts: list[Part] = [_estimate_table(estimate), fit, *_payload_parts(estimate)]
     remarks = (estimate.restart, estimate.prior_directions)
     parts += [Paragraph(text=str(remark)) for remark in remarks if remark is not None]
     if estimate.selection is not None:
@@ -104,6 +104,12 @@ def describe_estimate(estimate: Estimate) -> Summary:
         parts=tuple(parts),
         warnings=estimate.warnings,
     )
+
+
+def _payload_parts(estimate: Estimate) -> list[Part]:
+    """Sentences about a payload that was looked for, beside those of the verdict."""
+    payload = estimate.payload
+    return [] if payload is None else [Paragraph(text=text) for text in payload.sentences]
 
 
 def _fit_sentence(estimate: Estimate) -> str:

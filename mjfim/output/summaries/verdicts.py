@@ -196,7 +196,15 @@ def _steps_after_design(design: Design) -> Iterator[str]:
 
 @verdict_of.register
 def _(estimate: Estimate) -> Verdict:
-    """The verdict on an estimate."""
+    """The verdict on an estimate, with the payload first where one was looked for."""
+    fit = _verdict_on_fit(estimate)
+    if estimate.payload is None or fit.level is Level.BAD:
+        return fit
+    return Verdict(text=f"{estimate.payload}. {fit.text}", level=fit.level)
+
+
+def _verdict_on_fit(estimate: Estimate) -> Verdict:
+    """The verdict on how an estimate explains the recordings."""
     ratio = float(np.sqrt(estimate.chi2 / max(estimate.dof, 1)))
     if not estimate.success:
         text = f"These estimates are not reliable: {_why_not_reliable(estimate)}."

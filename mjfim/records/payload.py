@@ -1,0 +1,158 @@
+"""Record of an unknown payload that an identification has found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mjfim.arrays import Array, freeze
+from mjfim.records.combinations import join_names
+
+# Axes of the frame of a body.
+AXES = ("x", "y", "z")
+
+# Largest number of decimal places that are shown; smaller numbers have an exponent.
+MOST_PLACES = 5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PayloadEstimate:
+    """Mass, centre of mass and rotational inertia of a payload. Intervals are those of 95 %.
+
+    Attributes:
+        body: Name of the body that carries it.
+        mass: Its mass [kg].
+        mass_interval: (2,) interval of the mass [kg].
+        centre: (3,) centre of mass in the frame of the body [m].
+        centre_interval: (3, 2) its intervals [m].
+        undetermined: Axes along which the recordings do not determine the centre of mass.
+        inertia: Rotational inertia about its centre of mass, equal about all axes [kg m²].
+        inertia_interval: (2,) its interval [kg m²].
+        edge: Edge of the uniform cube whose inertia is assumed, because the recordings do not
+            determine it [m]; None where they do.
+        known: Parameters of the robot whose earlier estimate, with its uncertainty, is prior
+            knowledge.
+        held: Parameters of the robot that are held, so that their errors are in no interval.
+        source: Words for where the earlier estimate is from; empty without one.
+    """
+
+    body: str
+    mass: float
+    mass_interval: Array
+    centre: Array
+    centre_interval: Array
+    undetermined: tuple[str, ...]
+    inertia: float
+    inertia_interval: Array
+    edge: float | None
+    known: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        freeze(self, "mass_interval", "centre", "centre_interval", "inertia_interval")
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the recordings show that there is a payload."""
+        return bool(np.isfinite(self.mass_interval).all() and self.mass_interval[0] > 0.0)
+
+    def __str__(self) -> str:
+        """The payload in one sentence."""
+        if not self.is_seen:
+            limit = f"{float(self.mass_interval[1]):.3g} kg"
+            return f"The recordings show no payload at {self.body} (its mass is below {limit})"
+
+        mass = _with_half_width(self.mass, self.mass_interval)
+        places = [
+            f"{axis} not determined"
+            if axis in self.undetermined
+            else f"{axis} = {_with_half_width(value, interval)} m"
+            for axis, value, interval in zip(AXES, self.centre, self.centre_interval, strict=True)
+        ]
+        return (
+            f"The payload at {self.body} has a mass of {mass} kg and its centre of mass at "
+            f"{', '.join(places)} in the frame of {self.body}"
+        )
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Sentences about the inertia, and about what is taken as known."""
+        return tuple(
+            sentence
+            for sentence in (self._about_inertia, self._about_known, self._about_held)
+            if sentence
+        )
+
+    @property
+    def _about_inertia(self) -> str:
+        """Sentence about the rotational inertia."""
+        if not self.is_seen:
+            return ""
+        if self.edge is None:
+            inertia = _with_half_width(self.inertia, self.inertia_interval)
+            return (
+                "The recordings determine the rotational inertia about the centre of mass, taken "
+                f"as equal about all axes: {inertia} kg m²."
+            )
+        return (
+            "The recordings do not determine the rotational inertia. Assumed is that of a uniform "
+            f"cube with an edge of {self.edge:.2g} m, give or take as much, about a fitted value "
+            f"of {self.inertia:.2g} kg m²; --size states the edge."
+        )
+
+    @property
+    def _about_known(self) -> str:
+        """Sentence about the robot's parameters that an earlier estimate knows."""
+        if not self.known:
+            return ""
+        return (
+            f"The robot's {join_names(list(self.known))} are known from {self.source}; the "
+            "intervals of the payload contain their uncertainty."
+        )
+
+    @property
+    def _about_held(self) -> str:
+        """Sentence about the robot's parameters that are held."""
+        if not self.held:
+            return ""
+        verb = "is" if len(self.held) == 1 else "are"
+        return (
+            f"The robot's {join_names(list(self.held))} {verb} held, so that the intervals of the "
+            "payload do not contain their errors; --from or --without give their uncertainty."
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of `payload` in estimate.json."""
+        return {
+            "words": f"{self}.",
+            "body": self.body,
+            "is_seen": self.is_seen,
+            "mass": self.mass,
+            "mass_interval": self.mass_interval,
+            "centre": self.centre,
+            "centre_interval": self.centre_interval,
+            "undetermined": list(self.undetermined),
+            "inertia": self.inertia,
+            "inertia_interval": self.inertia_interval,
+            "inertia_is_assumed": self.edge is not None,
+            "edge": self.edge,
+            "known": list(self.known),
+            "held": list(self.held),
+            "source": self.source,
+        }
+
+
+def _with_half_width(value: float, interval: Array) -> str:
+    """A value with the longer half of its interval, both to the digits of the latter."""
+    half_width = float(np.max(np.abs(np.asarray(interval) - value)))
+    if not np.isfinite(half_width) or half_width <= 0.0:
+        return f"{value:.4g}"
+
+    # Two digits of the half width, and the value to the same place.
+    places = 1 - int(np.floor(np.log10(half_width)))
+    if 0 <= places <= MOST_PLACES:
+        return f"{value:.{places}f} ± {half_width:.{places}f}"
+    return f"{value:.3g} ± {half_width:.2g}"

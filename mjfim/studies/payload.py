@@ -1,0 +1,469 @@
+"""Identification of an unknown payload on a robot whose own parameters are known.
+
+The payload is a term of the model: a mass at a point of a body, with a rotational inertia that is
+equal about all axes (Atkeson, An and Hollerbach 1986 estimate the ten parameters of a load; one
+number of inertia is what a short log can tell). What an earlier estimate knows about the robot is
+prior knowledge with its covariance, so that the uncertainty of the robot is part of the intervals.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.errors import ExperimentError, listed
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.identification.horizons import with_length
+from mjfim.identification.identify import Callback, fit_task, identify_system
+from mjfim.identification.parameter_draws import honest_covariance
+from mjfim.identification.report import FitResult, estimate_from
+from mjfim.identification.searches import FitSearch
+from mjfim.identification.task import FitTask
+from mjfim.model.terms.base import AXES
+from mjfim.parallel import one_blas_thread
+from mjfim.records.estimate import NORMAL_95, Estimate
+from mjfim.records.payload import PayloadEstimate
+from mjfim.records.progress import begin_stage, shown_progress
+from mjfim.records.recording import Recording
+from mjfim.studies.payload_experiment import (
+    KIND,
+    PayloadPlace,
+    RobotExperiment,
+    parameters_of,
+)
+from mjfim.studies.selected_models import selected_experiment
+
+# Density of the uniform cube whose size is assumed where none is stated [kg/m³]: that of water, and
+# of MuJoCo's geoms that state no mass.
+DENSITY = 1000.0
+
+# Half width of the interval of the inertia over its value up to which recordings determine it.
+DETERMINED_SHARE = 0.5
+
+# Share of the half width that the prior alone gives, from which on recordings do not determine a
+# coordinate of the centre of mass.
+UNDETERMINED_SHARE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownRobot:
+    """What is known of a robot's parameters.
+
+    Attributes:
+        tables: Tables of its parameters, with guesses from the earlier estimate.
+        known: Names of the parameters that the earlier estimate knows with an uncertainty.
+        covariance: (k, k) covariance of these.
+        held: Names of the parameters that are held.
+        source: Words for where the earlier estimate is from.
+    """
+
+    tables: dict[str, Any]
+    known: tuple[str, ...]
+    covariance: Array
+    held: tuple[str, ...]
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class IdentifiedPayload:
+    """Result of the identification of a payload.
+
+    Attributes:
+        estimate: The estimate, with its `payload`.
+        system: The robot with the payload.
+    """
+
+    estimate: Estimate
+    system: System
+
+
+def identify_payload(
+    experiment: Experiment,
+    recordings: Sequence[Recording],
+    *,
+    body: str | None = None,
+    robot: Estimate | None = None,
+    without: Sequence[Recording] = (),
+    size: float | None = None,
+    callback: Callback | None = None,
+    threads: int | None = None,
+    stop: StopToken | None = None,
+    progress: bool = True,
+) -> Estimate:
+    """Estimate mass, centre of mass and rotational inertia of a payload on a known robot.
+
+    `estimate.payload` holds them. Ctrl-C ends the search with the best result so far.
+
+    Args:
+        experiment: The robot, with its parameters and noise; a payload in it is the start.
+        recordings: Recordings with the payload.
+        body: Name of the body that carries it; default: the one where the experiment states a
+            payload.
+        robot: Earlier estimate of the robot's parameters with this experiment, whose uncertainty
+            becomes part of that of the payload. Without it, parameters without `prior` are held.
+        without: Recordings of the robot without the payload, from which its parameters are
+            estimated first.
+        size: Edge of the cube of which the payload has the volume [m]; it gives the rotational
+            inertia where the recordings do not determine it. Default: a cube of water.
+        callback: Called with every iterate.
+        threads: Threads for the engine; default: one per core.
+        stop: Token that ends the search with the best result so far.
+        progress: False for no bar of progress in a notebook; a callback replaces the bar as well.
+
+    Returns:
+        The estimate of the payload and of the robot's parameters.
+
+    Raises:
+        ExperimentError: Something is wrong in the experiment or in the arguments.
+        RecordingError: A recording cannot be used.
+        SimulationDivergedError: The model diverges at the start.
+    """
+    with shown_progress("identifying the payload", callback, progress) as show:
+        prepared = PayloadTask.of(experiment, body=body, robot=robot, size=size, threads=threads)
+        found = prepared.identify(recordings, without=without, callback=show, stop=stop)
+    return found.estimate
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PayloadTask:
+    """A robot, what is known of it, and where its payload is.
+
+    Attributes:
+        robot: The experiment of the robot.
+        place: Where the payload is.
+        earlier: Earlier estimate of the robot, or None.
+        size: Edge of the cube of which the payload has the volume [m], or None.
+        threads: Threads for the engine, or None.
+        source: Words for where the earlier estimate is from.
+    """
+
+    robot: RobotExperiment
+    place: PayloadPlace
+    earlier: Estimate | None
+    size: float | None
+    threads: int | None
+    source: str
+
+    @classmethod
+    def of(
+        cls,
+        experiment: Experiment,
+        *,
+        body: str | None = None,
+        robot: Estimate | None = None,
+        size: float | None = None,
+        threads: int | None = None,
+        source: str = "the earlier estimate",
+    ) -> PayloadTask:
+        """Check what is stated. See `identify_payload` for the arguments.
+
+        Raises:
+            ExperimentError: The body cannot carry a payload, or the earlier estimate is one of
+                other parameters.
+            ModelError: The model cannot be used.
+        """
+        if size is not None and not (np.isfinite(size) and size > 0.0):
+            raise ExperimentError(f"size: {size!r}: give a positive length in metres")
+        if robot is not None and robot.selection is not None:
+            experiment = selected_experiment(experiment, robot.selection)
+        stated = RobotExperiment.of(experiment)
+        task = cls(
+            robot=stated,
+            place=stated.place(body),
+            earlier=robot,
+            size=size,
+            threads=threads,
+            source=source,
+        )
+        if robot is not None:
+            task.require_parameters(robot)
+        return task
+
+    def system(self, known: KnownRobot | None = None) -> System:
+        """The robot with the payload.
+
+        Args:
+            known: What is known of the robot; default: what its experiment and the earlier
+                estimate state.
+        """
+        known = self.known_robot() if known is None else known
+        return self._system(known, self._payload_tables())
+
+    def require_parameters(self, estimate: Estimate) -> None:
+        """Raise ExperimentError unless an estimate has the parameters of the robot.
+
+        Args:
+            estimate: An estimate of the robot.
+        """
+        wanted = self._robot_names()
+        lacking = [name for name in wanted if name not in estimate.parameters]
+        if lacking:
+            raise ExperimentError(
+                f"{self.source} lacks the robot's {listed(lacking)} of "
+                f"{self.robot.stated_by.source}; it has {listed(estimate.parameters)}. Identify "
+                "the robot with this experiment"
+            )
+
+    def identify(
+        self,
+        recordings: Sequence[Recording],
+        *,
+        without: Sequence[Recording] = (),
+        callback: Callback | None = None,
+        stop: StopToken | None = None,
+    ) -> IdentifiedPayload:
+        """Identify the payload. See `identify_payload` for the arguments.
+
+        Raises:
+            RecordingError: A recording cannot be used.
+            SimulationDivergedError: The model diverges at the start.
+        """
+        begun = time.perf_counter()
+        with one_blas_thread(), stop_on_interrupt(stop) as token:
+            known = self.known_robot()
+            if without:
+                known = self._known_after(known, without, callback, token)
+
+            # First with any inertia, which needs to be known only where recordings show it.
+            begin_stage("fitting the payload")
+            system = self.system(known)
+            budget = Budget(stop=token)
+            task = FitTask.of(system, recordings)
+            search = FitSearch(task=task, budget=budget, callback=callback)
+            fit, edge = fit_task(search), None
+            if not self._determines_inertia(fit) and not token.requested:
+                fit, edge = self._with_assumed_inertia(known, fit, search)
+            estimate = estimate_from(fit, budget)
+
+        system = fit.task.system
+        payload = self._payload(estimate, known, edge)
+        seconds = time.perf_counter() - begun
+        steps = system.plant.engine_steps
+        estimate = replace(estimate, payload=payload, seconds=seconds, steps=steps)
+        return IdentifiedPayload(estimate=estimate, system=system)
+
+    # ---- the robot
+
+    def known_robot(self) -> KnownRobot:
+        """What the experiment and the earlier estimate state about the robot.
+
+        Without an estimate, parameters with a stated prior are known by it, and the others are
+        held.
+        """
+        if self.earlier is not None:
+            system = System.resolve(self.robot.experiment, threads=self.threads)
+            return self._known_from(self.earlier, honest_covariance(system, self.earlier))
+
+        held = list(self.robot.values["fit"].get("hold", ()))
+        for name in self._robot_tables():
+            spec = self.robot.stated_by.parameters[name]
+            if spec.prior is None and not spec.per_recording:
+                held += [each for each, _ in parameters_of(name, spec)]
+        return KnownRobot(
+            tables=dict(self.robot.values["parameters"]),
+            known=(),
+            covariance=np.zeros((0, 0)),
+            held=tuple(dict.fromkeys(held)),
+            source="",
+        )
+
+    def _known_from(self, estimate: Estimate, covariance: Array) -> KnownRobot:
+        """What an estimate of the robot says.
+
+        Args:
+            estimate: The estimate.
+            covariance: (p, p) its honest covariance [products of theta-units].
+        """
+        names = self._robot_names()
+        index = np.array([estimate.parameters.index(name) for name in names], dtype=int)
+        variance = np.diag(covariance)[index]
+        is_known = np.isfinite(variance) & (variance > 0.0)
+        chosen = index[is_known]
+        theta = dict(zip(estimate.parameters, estimate.theta.tolist(), strict=True))
+        known = tuple(name for name, flag in zip(names, is_known, strict=True) if flag)
+        return KnownRobot(
+            tables=self.robot.known(self._robot_tables(), theta),
+            known=known,
+            covariance=covariance[np.ix_(chosen, chosen)],
+            held=tuple(name for name in names if name not in known),
+            source=self.source,
+        )
+
+    def _known_after(
+        self,
+        known: KnownRobot,
+        without: Sequence[Recording],
+        callback: Callback | None,
+        token: StopToken,
+    ) -> KnownRobot:
+        """What is known of the robot after recordings without the payload.
+
+        Args:
+            known: What is known before; without an earlier estimate, nothing but stated priors.
+            without: Recordings of the robot without the payload.
+            callback: Called with every iterate.
+            token: Token that ends the search.
+        """
+        if self.earlier is None:
+            known = replace(known, held=tuple(self.robot.values["fit"].get("hold", ())))
+        begin_stage("fitting the robot without the payload")
+        system = self._system(known, {})
+        estimate = identify_system(system, without, callback=callback, stop=token)
+        now = replace(self, source="the recordings without the payload")
+        return now._known_from(estimate, honest_covariance(system, estimate))
+
+    def _robot_tables(self) -> tuple[str, ...]:
+        """Names of the robot's tables of parameters that have one value in all recordings."""
+        parameters = self.robot.stated_by.parameters
+        return tuple(name for name in self.robot.parameters if not parameters[name].per_recording)
+
+    def _robot_names(self) -> tuple[str, ...]:
+        """Names of the robot's parameters that have one value in all recordings."""
+        parameters = self.robot.stated_by.parameters
+        tables = [(name, parameters[name]) for name in self._robot_tables()]
+        return tuple(each for name, spec in tables for each, _ in parameters_of(name, spec))
+
+    # ---- the robot with its payload
+
+    def _system(self, known: KnownRobot, payload: dict[str, Any]) -> System:
+        """The robot with what is known of it, and with the tables of a payload, if any."""
+        tables = known.tables
+        if payload:
+            tables = {name: {**table, "nuisance": True} for name, table in tables.items()}
+        values = {**self.robot.values, "parameters": {**payload, **tables}}
+        values["fit"] = {**self.robot.values["fit"], "hold": known.held}
+        if payload:
+            term = {"kind": KIND, "body": self.place.body}
+            values["terms"] = {**self.robot.values["terms"], self.place.term: term}
+
+        system = System.resolve(self.robot.stated_by.restated(values), threads=self.threads)
+        if not known.known:
+            return system
+        parameters = system.parameters
+        rows = np.zeros((len(known.known), len(parameters)))
+        columns = [parameters.names.index(name) for name in known.known]
+        rows[:, columns] = _whitening(known.covariance)
+        return replace(system, parameters=replace(parameters, earlier_rows=rows))
+
+    def _payload_tables(
+        self, values: dict[str, float] | None = None, inertia: float | None = None
+    ) -> dict[str, Any]:
+        """Tables of the parameters of the payload.
+
+        Args:
+            values: Values at which the search starts, by field; default: from the robot's sizes.
+            inertia: Assumed rotational inertia, known to as much [kg m²]; None where it is free.
+        """
+        place = self.place
+        edge = self._edge(place.mass)
+        default = {"mass": place.mass, "inertia": place.mass * edge**2 / 6.0}
+        start = {**default, **dict(zip(AXES, place.centre, strict=True)), **(values or {})}
+        tables: dict[str, Any] = {}
+        for field, name in place.names.items():
+            table = {"target": f"term/{place.term}:{field}", "guess": start[field]}
+            if field in AXES:
+                table |= {"guess": place.centre[AXES.index(field)], "prior": place.length}
+            if field == "inertia" and inertia is not None:
+                table |= {"guess": inertia, "prior": inertia, "nuisance": True}
+            tables[name] = table
+        return tables
+
+    def _edge(self, mass: float) -> float:
+        """Edge of the uniform cube with the volume of a payload of a mass [kg]: stated or water."""
+        return self.size if self.size is not None else float(np.cbrt(mass / DENSITY))
+
+    def _determines_inertia(self, fit: FitResult) -> bool:
+        """Whether the recordings determine the rotational inertia of the payload."""
+        names = fit.task.system.parameters.names
+        j = names.index(self.place.names["inertia"])
+        value = float(fit.theta[j])
+        half_width = float(np.max(np.abs(fit.accuracy.interval[j] - value)))
+        is_known = bool(np.isfinite(fit.accuracy.std[j]))
+        return is_known and value > 0.0 and half_width <= DETERMINED_SHARE * value
+
+    def _with_assumed_inertia(
+        self, known: KnownRobot, fit: FitResult, search: FitSearch
+    ) -> tuple[FitResult, float]:
+        """The fit with the rotational inertia of a uniform cube, and the edge of the cube [m].
+
+        The inertia has a prior as wide as itself, so that the intervals contain what it may be.
+
+        Args:
+            known: What is known of the robot.
+            fit: The fit with any inertia.
+            search: Its search.
+        """
+        names = fit.task.system.parameters.names
+        index = {field: names.index(name) for field, name in self.place.names.items()}
+        high = float(fit.accuracy.interval[index["mass"], 1])
+        mass = max(float(fit.theta[index["mass"]]), 0.5 * high if np.isfinite(high) else 0.0)
+        mass = mass or self.place.mass
+
+        edge = self._edge(mass)
+        inertia = mass * edge**2 / 6.0
+        values = {field: float(fit.theta[j]) for field, j in index.items()}
+        system = self._system(known, self._payload_tables(values, inertia))
+        start = np.array(fit.theta)
+        start[index["inertia"]] = inertia
+        begin_stage("fitting the payload with the inertia of a uniform cube")
+        task = FitTask.of(system, search.task.recordings)
+
+        # The length of the segments may be chosen already; the comparison of lengths still holds.
+        if fit.horizons is not None:
+            task = with_length(task, fit.task.settings.segments or "whole")
+        found = fit_task(replace(search, task=replace(task, start=start)))
+
+        # Nominal is the model at which the whole search began.
+        task = replace(found.task, start=search.task.start)
+        return replace(found, task=task, horizons=fit.horizons or found.horizons), edge
+
+    def _payload(
+        self, estimate: Estimate, known: KnownRobot, edge: float | None
+    ) -> PayloadEstimate:
+        """The payload of an estimate."""
+        names = self.place.names
+        index = {field: estimate.parameters.index(name) for field, name in names.items()}
+        axes = [index[axis] for axis in AXES]
+        half_widths = 0.5 * np.diff(estimate.interval[axes], axis=1).ravel()
+        limit = UNDETERMINED_SHARE * NORMAL_95 * self.place.length
+        is_determined = half_widths < limit
+        return PayloadEstimate(
+            body=self.place.body,
+            mass=float(estimate.theta[index["mass"]]),
+            mass_interval=estimate.interval[index["mass"]],
+            centre=estimate.theta[axes],
+            centre_interval=estimate.interval[axes],
+            undetermined=tuple(
+                axis for axis, flag in zip(AXES, is_determined, strict=True) if not flag
+            ),
+            inertia=float(estimate.theta[index["inertia"]]),
+            inertia_interval=estimate.interval[index["inertia"]],
+            edge=edge,
+            known=known.known,
+            held=known.held,
+            source=known.source,
+        )
+
+
+def _whitening(covariance: Array) -> Array:
+    """(k, k) rows R with `R.T @ R` the inverse of a covariance, of which some may be rounded off.
+
+    The eigenvalues are those of the correlation, so that they do not depend on units.
+
+    Args:
+        covariance: (k, k) covariance with positive variances.
+    """
+    std = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
+
+    # Rounding may make the smallest eigenvalues of a nearly singular correlation negative.
+    smallest = len(values) * np.finfo(np.float64).eps * float(values.max())
+    weights = 1.0 / np.sqrt(np.maximum(values, smallest))
+    return np.asarray((weights[:, None] * vectors.T) / std)
