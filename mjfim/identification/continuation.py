@@ -61,7 +61,7 @@ FEWEST_SEGMENT_ITERATIONS = 3
 # Length of a step [standard deviations], and decrease of the cost as a share of it, at which a fit
 # over segments ends; only its neighbourhood is needed.
 SEGMENT_TOLERANCE = 0.1
-SEGMENT_ROUGH_SHARE = 0.01
+SEGMENT_ROUGH_SHARE = 0.03
 
 # Difference of two costs that is not relevant. A step to the minimum that is 0.14 standard
 # deviations long lowers the cost by this much.

@@ -65,7 +65,7 @@ SMALLEST_NORM = 1e-300
 
 # Largest number of samples that a linearisation by parameters and candidates simulates, over all of
 # its differences. With more data, segments that are spread over them are enough for the tests.
-MAX_SIMULATED = 1_000_000
+MAX_SIMULATED = 400_000
 
 # Samples of the motion from which the speeds of the joints are taken.
 SPEED_SAMPLES = 2000

@@ -14,11 +14,11 @@ from mjfim.optimize.levenberg_marquardt import UnknownValues
 # Number of samples of a subset of segments that is quick to simulate, if there are more data.
 SUBSET_SAMPLES = 40_000
 
-# Largest share of the data on which the search begins, where that leaves enough samples and
-# segments.
+# Share of the data on which the search begins, where that leaves enough samples, and the least
+# number of segments, which are half of the data at most.
 FIRST_SHARE = 0.25
 MIN_FIRST_SAMPLES = 2_000
-MIN_FIRST_SEGMENTS = 5
+MIN_FIRST_SEGMENTS = 3
 
 # Number of samples, and least number of segments, that lead near enough to a minimum for a search
 # over all data to begin there.
@@ -53,13 +53,14 @@ def first_subset(problem: FitProblem) -> np.ndarray:
         The indices; with little data those of all segments.
     """
     quick = quick_subset(problem)
-    wanted = int(FIRST_SHARE * len(problem.segments))
+    count = len(problem.segments)
+    wanted = max(int(FIRST_SHARE * count), MIN_FIRST_SEGMENTS)
     enough = FIRST_SHARE * problem.sample_count >= MIN_FIRST_SAMPLES
-    if not enough or wanted < MIN_FIRST_SEGMENTS:
+    if not enough or 2 * wanted > count:
         return quick
 
     # Recordings that repeat in turn, such as one of each joint, are not met in step.
-    return spread_over_data(len(problem.segments), min(wanted, len(quick)))
+    return spread_over_data(count, min(wanted, len(quick)))
 
 
 def restart_subset(problem: FitProblem) -> np.ndarray:
