@@ -6,7 +6,7 @@ linearised rows are condensed block by block.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -323,6 +323,11 @@ class FitProblem:
     def prior_rows(self) -> PriorRows:
         """Rows of priors and pins."""
         return PriorRows(simulation=self.simulation, pins=self.pins, with_priors=self.with_priors)
+
+    @property
+    def curved_rows(self) -> Callable[[UnknownValues, Array], Array | None] | None:
+        """Rows of priors and pins along a step, where inertias of whole bodies are unknown."""
+        return self.prior_rows.along_step if self.layout.shared_bodies else None
 
     # ---- unknowns
 

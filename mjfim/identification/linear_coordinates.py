@@ -96,6 +96,13 @@ class UnknownBody:
         smallest = float(np.linalg.eigvalsh(inverse @ change @ inverse.T)[0])
         return min(1.0, -TO_BOUNDARY / smallest) if smallest < 0.0 else 1.0
 
+    def is_physical_after(self, values: Array, step: Array) -> bool:
+        """Whether `moved` leads to a body with a volume, from parameters (10,) by a step (10,)."""
+        if not self.is_logcholesky:
+            return True
+        change = barycentric_of(logcholesky_derivatives(values))
+        return self.is_physical(self.linear(values) + step @ change)
+
     def moved(self, values: Array, step: Array) -> Array:
         """(10,) parameters after a physical step along a straight line of linear coordinates.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -71,6 +71,42 @@ class PriorRows:
         own = self._cad.of_bodies(is_own)
         rows += [self._cad_rows(own, at, k) for k in range(layout.recordings) if own.bodies]
         return np.concatenate(rows)
+
+    def along_step(self, at: UnknownValues, common: Array) -> Array | None:
+        """Rows on the common unknowns at the end of a step of them, with derivatives by that step.
+
+        Inertias move along straight lines of their barycentric coordinates (`UnknownLayout.moved`).
+
+        Args:
+            at: Unknowns at the begin of the step.
+            common: (c,) the step.
+
+        Returns:
+            (l, c+1) rows `[J, r]`; None where a body is not physical at the end.
+        """
+        layout = self.simulation.layout
+        theta = np.array(at.theta)
+        own = np.array(at.per_recording)
+        count = len(layout.shared)
+        theta[layout.shared] += common[:count]
+        own += common[count:].reshape(own.shape)
+
+        follows = np.eye(len(theta))
+        for body in layout.shared_bodies:
+            begin = at.theta[body.columns]
+            step = theta[body.columns] - begin
+            if not body.is_physical_after(begin, step):
+                return None
+            theta[body.columns] = body.moved(begin, step)
+            place = np.ix_(body.columns, body.columns)
+            by_linear = body.derivative(body.linear(theta[body.columns]))
+            follows[place] = by_linear @ np.linalg.inv(body.derivative(body.linear(begin)))
+
+        end = replace(at, theta=theta, per_recording=own)
+        rows = self.common(end)
+        shared = np.ix_(layout.shared, layout.shared)
+        rows[:, :count] = rows[:, :count] @ follows[shared]
+        return rows
 
     def _cad_rows(self, prior: CadPrior, at: UnknownValues, recording: int) -> Array:
         """(l, c+1) rows of the priors on inertias, with the values of one recording."""

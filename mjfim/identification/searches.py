@@ -383,6 +383,7 @@ class FitSearch:
         settings = SearchSettings(
             max_iterations=iterations,
             tolerance=FINAL_TOLERANCE,
+            curved_rows=problem.curved_rows,
             begins_near=self.begins_near,
             in_true_deviations=True,
         )

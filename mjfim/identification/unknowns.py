@@ -171,7 +171,7 @@ class UnknownLayout:
         Returns:
             The moved unknowns.
         """
-        count, bodies = len(self.shared), self._shared_bodies
+        count, bodies = len(self.shared), self.shared_bodies
         by_theta = np.zeros(len(at.theta))
         by_theta[self.shared] = fraction * step.common[:count]
         shares = [
@@ -194,7 +194,7 @@ class UnknownLayout:
         )
 
     @cached_property
-    def _shared_bodies(self) -> tuple[UnknownBody, ...]:
+    def shared_bodies(self) -> tuple[UnknownBody, ...]:
         """Bodies whose whole inertia is unknown, with one value in all recordings."""
         bodies = unknown_bodies(self.parameters)
         return tuple(body for body in bodies if np.isin(body.columns, self.shared).all())

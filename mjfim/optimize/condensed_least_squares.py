@@ -303,19 +303,42 @@ class Condensed:
         Returns:
             The step with its predicted decrease.
         """
+        rows = triangle(np.concatenate([self.damped_rows(damping, scale), self.common_rows]))
+        common = bounded_least_squares(rows[:, :-1], -rows[:, -1], lower, upper)
+        return self.step_to(common, damping, scale)
+
+    def damped_rows(self, damping: float, scale: Array) -> Array:
+        """Rows of the common unknowns after elimination of the private ones, with damping.
+
+        Args:
+            damping: Damping factor.
+            scale: (n+c,) scale of every unknown.
+
+        Returns:
+            (k, c+1) rows `[J_common, r]`, without the `common_rows`.
+        """
         n = self.private_count
         c = self.common_count
         weight = np.sqrt(damping) * scale
-
-        # Eliminate the private unknowns.
         R = self._damped_triangles(weight[:n], scale[:n])
-
-        # Bounded problem in the common unknowns alone.
         segment_rows = R[:, n:, n:].reshape(-1, c + 1)
         damping_rows = np.concatenate([np.diag(weight[n:]), np.zeros((c, 1))], axis=1)
-        rows = triangle(np.concatenate([segment_rows, self.common_rows, damping_rows]))
-        common = bounded_least_squares(rows[:, :-1], -rows[:, -1], lower, upper)
+        return np.concatenate([segment_rows, damping_rows])
 
+    def step_to(self, common: Array, damping: float, scale: Array) -> Step:
+        """The step of all unknowns with a given step of the common ones.
+
+        Args:
+            common: (c,) step of the common unknowns.
+            damping: Damping factor of the private unknowns.
+            scale: (n+c,) scale of every unknown.
+
+        Returns:
+            The step with its predicted decrease.
+        """
+        n = self.private_count
+        weight = np.sqrt(damping) * scale
+        R = self._damped_triangles(weight[:n], scale[:n])
         return self._evaluated(common, self._substituted(R, common))
 
     def private_step(self, common: Array) -> Array:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopReason
 from mjfim.optimize.condensed_least_squares import Condensed, Step
+from mjfim.optimize.curved_rows import step_over_curved_rows
 
 T = TypeVar("T")
 
@@ -252,6 +254,8 @@ class SearchSettings:
             the last one. It serves searches that need not converge; 0 for the others.
         next_step_length: Estimates the length of the next step [standard deviations] at the end
             of a complete one, at less cost than a linearisation of all data. None without it.
+        curved_rows: The common rows at the end of a step from given unknowns, where they are not
+            linear along a step (`step_over_curved_rows`); None where they are.
         begins_near: Whether the search begins near the minimum, with hardly any damping. Damping
             would slow it down along combinations that the data determine little.
         in_true_deviations: True to measure lengths in standard deviations that allow for
@@ -267,6 +271,7 @@ class SearchSettings:
     relinearise_at_end: bool = True
     rough_share: float = 0.0
     next_step_length: NextStepLength | None = None
+    curved_rows: Callable[[UnknownValues, Array], Array | None] | None = None
     begins_near: bool = False
     in_true_deviations: bool = False
     cost_to_beat: float = np.inf
@@ -494,7 +499,11 @@ class _Search:
             upper = np.full(self.condensed.common_count, np.inf)
             lower = -upper
 
-        return self.condensed.step(damping, self.scale, lower, upper)
+        curved = self.settings.curved_rows
+        if curved is None:
+            return self.condensed.step(damping, self.scale, lower, upper)
+        along = partial(curved, self.unknowns)
+        return step_over_curved_rows(self.condensed, along, damping, self.scale, lower, upper)
 
     def _predicted_step(self) -> Step:
         """Step to the minimum of the linearised cost, without damping.

@@ -74,6 +74,7 @@ class Rough(OneParameter):
 
     step: float = 1e-7
     sample_count = COUNT
+    curved_rows = None
 
     def residuals(self, theta: float) -> Array:
         """(COUNT,) residuals."""
@@ -200,6 +201,7 @@ class Parts(OneParameter):
     limit: float = np.inf
     sample_count = 24_800
     workers = None
+    curved_rows = None
     layout = SimpleNamespace(free_starts=False)
 
     def residuals(self, theta: float) -> Array:
