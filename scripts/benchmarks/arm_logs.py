@@ -27,6 +27,7 @@ import argparse
 import json
 import tempfile
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -54,6 +55,7 @@ from mjfim.identification.task import FitTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.inertia_distance import barycentric_of, logcholesky_factor
 from mjfim.parallel import cores, one_blas_thread
+from mjfim.records.estimate import Whiteness
 from mjfim.records.recording import Recording
 from scripts.benchmarks.arm_models import TIMESTEP, Arm, panda, ur5e
 
@@ -133,6 +135,8 @@ class Outcome:
         lacks: Whether the fitted model lacks friction.
         base: Share of the base parameters inside their intervals.
         base_formal: Share inside the formal intervals.
+        base_scaled: Share inside the formal intervals, scaled by the size and the correlation of
+            the residuals.
         torque: Share of the torques along another trajectory inside their intervals.
         measured: Share of the measured held-out torques inside their intervals.
         ratio: Residual held-out torque over that of the true model, root mean square over joints.
@@ -149,6 +153,7 @@ class Outcome:
     lacks: bool
     base: float
     base_formal: float
+    base_scaled: float
     torque: float
     measured: float
     ratio: float
@@ -417,6 +422,8 @@ class Fitted:
         equations: (p,) the fit to the equation of motion.
         misfit: Whether a misfit is raised.
         success: Whether the search converged.
+        inflation: Mean square of the residuals over that of the noise, times the longest
+            autocorrelation time of an output [rows].
     """
 
     theta: Array
@@ -426,6 +433,7 @@ class Fitted:
     equations: Array
     misfit: bool
     success: bool
+    inflation: float
 
 
 @one_blas_thread()
@@ -443,6 +451,7 @@ def fitted(arm: Arm, system: System, recordings: list[Recording], whole: bool) -
             equations=estimate.inverse_dynamics.theta,
             misfit=estimate.misfit,
             success=estimate.success,
+            inflation=_inflation(estimate.chi2 / estimate.dof, estimate.whiteness),
         )
 
     task = FitTask.of(system, recordings)
@@ -458,7 +467,13 @@ def fitted(arm: Arm, system: System, recordings: list[Recording], whole: bool) -
         equations=result.inverse_dynamics.theta,
         misfit=bool(reasons),
         success=result.solution.success,
+        inflation=_inflation(quality.chi2 / quality.dof, quality.whiteness),
     )
+
+
+def _inflation(spread: float, whiteness: Sequence[Whiteness]) -> float:
+    """Factor by which variances are larger than the formal ones, if residuals are stationary."""
+    return max(spread, 1.0) * max(max(test.time for test in whiteness), 1.0)
 
 
 def run(job: Job) -> Outcome:
@@ -508,6 +523,7 @@ def run(job: Job) -> Outcome:
             lacks=job.lacks,
             base=_inside(error, by_theta @ found.covering @ by_theta.T),
             base_formal=_inside(error, by_theta @ found.formal @ by_theta.T),
+            base_scaled=_inside(error, found.inflation * by_theta @ found.formal @ by_theta.T),
             torque=float((np.abs(predicted - true) <= NORMAL_95 * np.sqrt(variance)).mean()),
             measured=float(within[is_measured].mean()),
             ratio=_ratio(residual[:, count:], of_truth),
@@ -602,11 +618,26 @@ def _median(rows: list[Outcome], key: str) -> float:
     return float(np.median([getattr(each, key) for each in rows]))
 
 
-def study(jobs: list[Job], processes: int) -> list[Outcome]:
-    """Outcomes of runs, on some processes."""
+def study(jobs: list[Job], processes: int, output: Path | None) -> list[Outcome]:
+    """Outcomes of runs, on some processes; a file has those of all runs so far."""
+    found: list[Outcome] = []
+    if not jobs:
+        return found
     context = get_context("spawn")
     with ProcessPoolExecutor(processes, mp_context=context) as pool:
-        return list(track(pool.map(run, jobs), total=len(jobs), description="runs"))
+        for outcome in track(pool.map(run, jobs), total=len(jobs), description="runs"):
+            found.append(outcome)
+            write(output, found, [])
+    return found
+
+
+def write(output: Path | None, runs: list[Outcome], timed: list[Outcome]) -> None:
+    """Write outcomes to a JSON file, if one is wanted."""
+    if output is None:
+        return
+    found = {"runs": [asdict(each) for each in runs], "timed": [asdict(each) for each in timed]}
+    with replacing(output) as temporary:
+        temporary.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 def main() -> int:
@@ -617,6 +648,7 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=50, help="runs in all")
     parser.add_argument("--seconds", type=float, default=18.0, help="data of a run [s]")
     parser.add_argument("--long", type=int, default=1, help="timed fits of each arm")
+    parser.add_argument("--processes", type=int, default=cores(), help="runs side by side")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--output", type=Path, help="JSON file with all outcomes")
     args = parser.parse_args()
@@ -639,7 +671,7 @@ def main() -> int:
         )
         for number in range(args.runs)
     ]
-    outcomes = study(jobs, cores()) if jobs else []
+    outcomes = study(jobs, args.processes, args.output)
     if outcomes:
         console.print(summary(outcomes), soft_wrap=True)
 
@@ -664,10 +696,7 @@ def main() -> int:
             f"{outcome.passes:.0f} passes for {LONG:.0f} s of data on {cores()} cores"
         )
 
-    if args.output is not None:
-        found = {"runs": [asdict(each) for each in outcomes], "timed": [asdict(t) for t in times]}
-        with replacing(args.output) as temporary:
-            temporary.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    write(args.output, outcomes, times)
     return 0 if _is_good(outcomes, times) else 1
 
 

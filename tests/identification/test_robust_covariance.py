@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from mjfim.identification.independent_blocks import block_length, merge_blocks
-from mjfim.identification.robust_covariance import robust_uncertainty
+from mjfim.identification.robust_covariance import covering_covariance, robust_uncertainty
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 from tests.support.numerics import Array
@@ -352,3 +352,14 @@ def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
     np.testing.assert_array_equal(
         merge_blocks(np.array([0, 0, 1, 1]), np.ones(4), 1.0), [0, 1, 2, 3]
     )
+
+
+def test_a_covering_covariance_is_at_least_both_in_every_direction() -> None:
+    rng = np.random.default_rng(3)
+    first, second = (B @ B.T for B in rng.normal(size=(2, 4, 4)))
+    second[:, 0] = second[0] = 0.0
+    found = covering_covariance(first, second)
+    for smaller in (first, second):
+        assert np.linalg.eigvalsh(found - smaller)[0] > -1e-9
+    np.testing.assert_allclose(covering_covariance(first, 0.1 * first), first, rtol=1e-6)
+    np.testing.assert_allclose(covering_covariance(first, 9.0 * first), 9.0 * first, rtol=1e-6)

@@ -1,0 +1,78 @@
+"""Steps over curved priors against a general minimiser and against linear steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy
+
+from mjfim.optimize.condensed_least_squares import Condensed
+from mjfim.optimize.curved_rows import step_over_curved_rows
+from tests.support.numerics import Array
+
+COUNT = 3
+
+
+def linearisation(rng: np.random.Generator, common_rows: Array) -> Condensed:
+    """Random rows of two segments with two private unknowns each."""
+    m = 2 + COUNT + 1
+    return Condensed(
+        blocks=np.linalg.qr(rng.normal(size=(2, 9, m)), mode="r"),
+        segment_of_block=np.arange(2),
+        private_rows=np.zeros((2, 0, m)),
+        common_rows=common_rows,
+    )
+
+
+def test_over_straight_rows_it_is_the_linear_step() -> None:
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(4, COUNT + 1))
+    condensed = linearisation(rng, rows)
+    scale, bound = condensed.column_norms, np.full(COUNT, 0.2)
+
+    def straight(step: Array) -> Array:
+        return np.column_stack([rows[:, :-1], rows[:, :-1] @ step + rows[:, -1]])
+
+    expected = condensed.step(1e-3, scale, -bound, bound)
+    found = step_over_curved_rows(condensed, straight, 1e-3, scale, -bound, bound)
+    np.testing.assert_allclose(found.common, expected.common, atol=1e-10)
+    np.testing.assert_allclose(found.private, expected.private, atol=1e-10)
+    assert np.isclose(found.predicted_decrease, expected.predicted_decrease)
+
+
+def test_over_a_barrier_it_is_the_minimum_inside() -> None:
+    rng = np.random.default_rng(1)
+    pull = np.array([[60.0, 0.0, 0.0, 120.0]])
+
+    def curved(step: Array) -> Array | None:
+        """Logarithms of the distances from the region's end, where each step is -1."""
+        if (step <= -1.0).any():
+            return None
+        barrier = np.column_stack([np.diag(1.0 / (1.0 + step)), np.log(1.0 + step)])
+        straight = np.append(pull[0, :-1], pull[0, :-1] @ step + pull[0, -1])
+        return np.concatenate([barrier, straight[None]])
+
+    begin = curved(np.zeros(COUNT))
+    assert begin is not None
+    condensed = linearisation(rng, begin)
+    scale, infinite = condensed.column_norms, np.full(COUNT, np.inf)
+    found = step_over_curved_rows(condensed, curved, 0.0, scale, -infinite, infinite)
+    data = condensed.reduced_rows()
+
+    def cost(step: Array) -> float:
+        rows = curved(step)
+        if rows is None:
+            return np.inf
+        residual = data[:, :-1] @ step + data[:, -1]
+        return 0.5 * float(residual @ residual + rows[:, -1] @ rows[:, -1])
+
+    best = scipy.optimize.minimize(
+        cost, np.zeros(COUNT), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}
+    )
+    assert -1.0 < found.common[0] < -0.99
+    assert cost(found.common) <= best.fun * (1.0 + 1e-5)
+    of_private = condensed.step_to(np.zeros(COUNT), 0.0, scale).predicted_decrease
+    decrease = cost(np.zeros(COUNT)) - cost(found.common) + of_private
+    assert np.isclose(found.predicted_decrease, decrease, rtol=1e-6)
+
+    # The linear step leaves the region.
+    assert condensed.step(0.0, scale, -infinite, infinite).common[0] < -1.0
