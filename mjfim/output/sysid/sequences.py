@@ -15,6 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, ModelError, listed
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align
+from mjfim.identification.cad_prior import CadPrior
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
 from mjfim.model.spec_writer import state_derived_values
@@ -98,7 +99,8 @@ class Exported:
         guess = self.system.parameters.guess
         prior_weights = np.sqrt(np.diag(self.system.parameters.prior_information))
         has_prior = prior_weights > 0.0
-        if not weighted or not has_prior.any():
+        from_model = CadPrior.of(self.system.parameters)
+        if not weighted or not (has_prior.any() or from_model.bodies):
             return residual_of_data
 
         def residual_with_priors(
@@ -109,7 +111,9 @@ class Exported:
 
             # theta is (p,), or (p, k) where sysid computes finite differences.
             of_priors = (prior_weights * (guess - theta.T)).T[has_prior]
-            return [*residuals, of_priors], predicted, measured
+            distances = [-from_model.rows(each)[:, -1] for each in np.atleast_2d(theta.T)]
+            of_model = np.array(distances).T.reshape(-1, *theta.shape[1:])
+            return [*residuals, of_priors, of_model], predicted, measured
 
         return residual_with_priors
 
