@@ -1,14 +1,16 @@
 """How often fits find the optimum from starts that are wrong by factors of 3 to 10.
 
-    python -m scripts.benchmarks starts [--runs 20] [--seed 0] [--robots NAME ...] [-o FILE.json]
+    python -m scripts.benchmarks starts [--runs 20] [--seed 0] [--robots NAME ...]
+        [--methods mjfim ...] [-o FILE.json]
 
 Each robot is simulated under a multisine, with the noise of its sensors. Every parameter of the
 start is too large or too small by a random factor between 3 and 10. `mjfim.identify` fits the
 recording with its default settings. In the time of the processors that it took,
 `scipy.optimize.least_squares` fits whole rollouts from the same start, with the same bounds and
-weights, and so does `mujoco.sysid` where its extra dependencies are installed. A fit counts as
-right where half of the sum of squares exceeds that of the fit from the true parameters by at most
-1/2: it is within one standard deviation of the optimum.
+weights, and so does `mujoco.sysid` with its own optimiser, where its extra dependencies are
+installed. Both scale the parameters by the Jacobian, and a trial that diverges costs much instead
+of ending the fit. A fit counts as right where half of the sum of squares exceeds that of the fit
+from the true parameters by at most 1/2: it is within one standard deviation of the optimum.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import identify_system
+from mjfim.identification.identify import identify_system, least_squares
 from mjfim.output.sysid.sequences import export, silenced
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
@@ -55,6 +57,12 @@ BOUNDS = (1.0 / 30.0, 30.0)
 
 # Excess of half of the sum of squares up to which a fit is at the optimum.
 SAME_OPTIMUM = 0.5
+
+# Whitened residuals of a simulation that diverges, for the methods beside.
+DIVERGED = 1e6
+
+# Names of the methods.
+METHODS = ("mjfim", "scipy", "sysid")
 
 # Wanted share of right fits by mjfim.
 WANTED = 0.95
@@ -193,7 +201,7 @@ def robots() -> tuple[Robot, ...]:
             name="rail",
             model=RAIL.format(**ROBOT),
             rate=1000.0,
-            seconds=6.0,
+            seconds=4.0,
             amplitude=(2.5,),
             parameters={
                 "mass": {"target": "body/carriage:mass"},
@@ -223,7 +231,7 @@ class Outcome:
         robot: Name of the robot.
         start: Factors of the start.
         excess: Excess of half of the sum of squares over the optimum, by method; infinite where a
-            method failed, NaN where it is not installed.
+            method failed, NaN where it is not installed or was not asked for.
         seconds: Time of the processors that mjfim took [s].
         restarted: Whether mjfim restarted its fit.
         by_dynamics: Whether the restart began at a fit to the equation of motion.
@@ -263,15 +271,32 @@ class Timed:
         return found
 
 
-def run(job: tuple[str, int, int]) -> Outcome:
-    """Fit one recording from one start by all methods.
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One run of the study.
+
+    Attributes:
+        robot: Name of the robot.
+        seed: Seed of the study.
+        number: Number of the run.
+        methods: Names of the methods.
+    """
+
+    robot: str
+    seed: int
+    number: int
+    methods: tuple[str, ...]
+
+
+def run(job: Job) -> Outcome:
+    """Fit one recording from one start by the methods of a job.
 
     Args:
-        job: Name of the robot, seed of the study, and number of the run.
+        job: The run.
     """
-    name, seed, number = job
+    name = job.robot
     robot = next(each for each in robots() if each.name == name)
-    rng = np.random.default_rng([seed, number])
+    rng = np.random.default_rng([job.seed, job.number])
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
         system = resolved(robot, Path(folder))
@@ -279,8 +304,7 @@ def run(job: tuple[str, int, int]) -> Outcome:
         recording = simulated(system, robot, rng)
 
         problem = FitProblem.of(system, [recording])
-        optimum = identify_system(system, [recording], start=true)
-        least = problem.cost(problem.begin(optimum.theta))
+        least = least_squares(problem, true).cost
 
         factors = np.exp(rng.uniform(np.log(FACTORS[0]), np.log(FACTORS[1]), len(true)))
         factors **= rng.choice([-1.0, 1.0], len(true))
@@ -294,17 +318,14 @@ def run(job: tuple[str, int, int]) -> Outcome:
             theta, restart = None, None
         seconds = time.process_time() - begun
 
-        found = {
-            "mjfim": theta,
-            "scipy": by_scipy(problem, start, seconds),
-            "sysid": by_sysid(system, recording, start, seconds),
-        }
-        excess = {
-            method: np.inf if x is None else problem.cost(problem.begin(x)) - least
-            for method, x in found.items()
-        }
-        if not hasattr(sysid, "optimize"):
-            excess["sysid"] = np.nan
+        found: dict[str, Array | None] = {"mjfim": theta}
+        if "scipy" in job.methods:
+            found["scipy"] = by_scipy(problem, start, seconds)
+        if "sysid" in job.methods and hasattr(sysid, "optimize"):
+            found["sysid"] = by_sysid(system, recording, start, seconds)
+        excess = dict.fromkeys(METHODS, np.nan)
+        for method, x in found.items():
+            excess[method] = np.inf if x is None else problem.cost(problem.begin(x)) - least
     return Outcome(
         robot=name,
         start=tuple(factors.tolist()),
@@ -374,7 +395,7 @@ def by_scipy(problem: FitProblem, start: Array, seconds: float) -> Array | None:
         """Whitened residuals of all outputs."""
         errors = problem.errors_at(problem.begin(x * sizes))
         if errors is None:
-            return np.full(problem.value_count, 1e6)
+            return np.full(problem.value_count, DIVERGED)
         return np.concatenate([e / s for e, s in zip(errors, sigma, strict=True)])
 
     timed = Timed(residuals, seconds)
@@ -391,31 +412,38 @@ def by_scipy(problem: FitProblem, start: Array, seconds: float) -> Array | None:
 
 
 def by_sysid(system: System, recording: Recording, start: Array, seconds: float) -> Array | None:
-    """Parameters of a fit by mujoco.sysid; None where it failed or is not installed.
+    """Parameters of a fit by mujoco.sysid; None where it failed.
 
     Args:
-        system: The system.
+        system: The system, whose guess is true.
         recording: The recording.
         start: (p,) parameters at which it starts.
         seconds: Time of the processors that it may take [s].
     """
-    if not hasattr(sysid, "optimize"):
-        return None
-
     exported = export(system, [recording])
     parameters = exported.parameters.copy()
+    residual = exported.residual(weighted=True)
+    sizes = [len(part) for part in residual(system.parameters.guess, parameters)[0]]
     lower, upper = parameters.get_bounds()
     parameters.update_from_vector(np.clip(start, lower, upper))
-    residual = exported.residual(weighted=True)
-    timed = Timed(lambda x: list(residual(x, parameters)[0]), seconds)
 
-    def limited(x: Array, _: Any) -> tuple[list[Array], None, None]:
-        """Residuals as sysid calls them."""
-        return timed(x), None, None
+    def residuals(x: Array) -> list[Array]:
+        """Residuals at x: (p,), or at several points as columns, which may diverge one by one."""
+        try:
+            return list(residual(x, parameters)[0])
+        except ValueError:
+            if x.ndim == 1:
+                return [np.full(size, DIVERGED) for size in sizes]
+            if x.shape[1] == 1:
+                return [np.full((size, 1), DIVERGED) for size in sizes]
+        columns = [residuals(x[:, [j]]) for j in range(x.shape[1])]
+        return [np.concatenate(parts, axis=1) for parts in zip(*columns, strict=True)]
 
+    timed = Timed(residuals, seconds)
+    options = {"x_scale": "jac", "verbose": False, "max_iters": 200, "output": io.StringIO()}
     with silenced():
         try:
-            sysid.optimize(parameters, limited, verbose=False, max_iters=200, output=io.StringIO())
+            sysid.optimize(parameters, lambda x, _: (timed(x), None, None), **options)
         except OutOfTimeError:
             pass
         except (ValueError, RuntimeError, np.linalg.LinAlgError):
@@ -431,10 +459,10 @@ def table_of(outcomes: Sequence[Outcome]) -> Table:
     for heading in headings:
         table.add_column(heading, justify="left" if heading == "robot" else "right")
 
-    names = list(dict.fromkeys(outcome.robot for outcome in outcomes))
+    names = dict.fromkeys(outcome.robot for outcome in outcomes)
     for name in [*names, "all"]:
         chosen = [outcome for outcome in outcomes if name in (outcome.robot, "all")]
-        shares = [share_of(chosen, method) for method in ("mjfim", "scipy", "sysid")]
+        shares = [share_of(chosen, method) for method in METHODS]
         restarted = sum(outcome.restarted for outcome in chosen)
         by_dynamics = sum(outcome.by_dynamics for outcome in chosen)
         table.add_row(
@@ -453,6 +481,13 @@ def share_of(outcomes: Sequence[Outcome], method: str) -> float:
     return float("nan") if np.isnan(excess).any() else float(np.mean(excess <= SAME_OPTIMUM))
 
 
+def save(outcomes: Sequence[Outcome], file: Path) -> None:
+    """Write the runs so far to a JSON file."""
+    with replacing(file) as temporary:
+        text = json.dumps([asdict(outcome) for outcome in outcomes], indent=2)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
 def main() -> int:
     """Print the table; return 1 where mjfim finds the optimum too rarely."""
     parser = argparse.ArgumentParser(
@@ -462,21 +497,27 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robots", nargs="*", choices=known, default=known)
+    parser.add_argument("--methods", nargs="*", choices=METHODS, default=METHODS)
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("-o", "--output", type=Path, help="JSON file with all runs")
     args = parser.parse_args()
 
-    jobs = [(name, args.seed, number) for name in args.robots for number in range(args.runs)]
+    methods = tuple(args.methods)
+    jobs = [
+        Job(robot=name, seed=args.seed, number=number, methods=methods)
+        for number in range(args.runs)
+        for name in args.robots
+    ]
+    outcomes = []
     with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
-        outcomes = list(track(pool.map(run, jobs), "fitting", total=len(jobs)))
+        for outcome in track(pool.map(run, jobs), "fitting", total=len(jobs)):
+            outcomes.append(outcome)
+            if args.output is not None:
+                save(outcomes, args.output)
 
     console = Console(width=100)
     console.print(table_of(outcomes))
     console.print("restarted: fits that mjfim repeated (of these, from the equation of motion)")
-    if args.output is not None:
-        with replacing(args.output) as temporary:
-            text = json.dumps([asdict(outcome) for outcome in outcomes], indent=2)
-            temporary.write_text(text + "\n", encoding="utf-8")
     return 0 if share_of(outcomes, "mjfim") >= WANTED else 1
 
 
