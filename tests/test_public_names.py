@@ -18,6 +18,7 @@ VERBS_WITH_CALLBACK = (
     "design",
     "design_jointly",
     "identify",
+    "identify_payload",
     "monte_carlo",
     "run_campaign",
     "shortest_experiment",

@@ -1,0 +1,230 @@
+"""A payload on a known arm: true values inside intervals, its inertia, and wrong inputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
+from mjfim.identification.parameter_draws import honest_covariance
+from mjfim.studies.payload import PayloadTask
+from mjfim.studies.payload_experiment import RobotExperiment
+
+# Two hinges about different axes, so that gravity and inertia show every coordinate of a load.
+ARM = """
+<mujoco>
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="stand"/>
+    <body name="upper">
+      <inertial pos="0 0 -0.15" mass="0.5" diaginertia="0.004 0.004 0.0005"/>
+      <joint name="pitch" axis="0 1 0" damping="0.1"/>
+      <body name="hand" pos="0 0 -0.3">
+        <inertial pos="0 0 -0.1" mass="0.3" diaginertia="0.001 0.001 0.0002"/>
+        <joint name="roll" axis="1 0 0" damping="0.05"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="pitch" joint="pitch"/>
+    <motor name="roll" joint="roll"/>
+  </actuator>
+</mujoco>
+"""
+
+# True values of the robot and of its load.
+ROBOT = {"pitch_damping": 0.12, "roll_damping": 0.045, "hand_mass": 0.31}
+LOAD = {"mass": 0.2, "x": 0.03, "y": -0.02, "z": -0.12}
+INERTIA = 2e-4
+
+
+def experiment(home: Path, **load: float) -> mjfim.Experiment:
+    """An arm with unknown dampings and an unknown mass of the hand, with a load or without.
+
+    Args:
+        home: Folder that receives the model.
+        **load: Fields of the load.
+    """
+    (home / "arm.xml").write_text(ARM, encoding="utf-8")
+    swing = {"kind": "multisine", "frequency": 0.5, "harmonics": 4}
+    tables = {
+        "model": "arm.xml",
+        "rate": 50.0,
+        "horizon": 4.0,
+        "initial": {"control": {**swing, "amplitude": {"pitch": 1.2, "roll": 0.7}}},
+        "parameters": {
+            "pitch_damping": {"target": "joint/pitch:damping", "true": 0.12},
+            "roll_damping": {"target": "joint/roll:damping", "true": 0.045},
+            "hand_mass": {"target": "body/hand:mass", "true": 0.31},
+        },
+        "noise": {"qpos:pitch": 0.003, "qpos:roll": 0.003},
+        "directory": home,
+        "source": "arm.toml",
+    }
+    if load:
+        tables["terms"] = {"load": {"kind": "payload", "body": "hand", "values": load}}
+    return mjfim.Experiment(**tables)
+
+
+def log(stated: mjfim.Experiment, seed: int) -> mjfim.Recording:
+    """A recording of the initial control."""
+    trajectory = DesignTask.resolve(stated).initial
+    return mjfim.simulate(stated, trajectory, seed=seed)
+
+
+def inside(found: mjfim.Estimate) -> dict[str, bool]:
+    """Whether the true values of the load are inside the intervals, by field."""
+    payload = found.payload
+    assert payload is not None
+    intervals = [payload.mass_interval, *payload.centre_interval]
+    return {
+        field: bool(low <= LOAD[field] <= high)
+        for field, (low, high) in zip(LOAD, intervals, strict=True)
+    }
+
+
+def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Path) -> None:
+    robot = experiment(tmp_path)
+    system = System.resolve(robot)
+    covariance = np.array([[4e-4, 1e-4, -4e-6], [1e-4, 9e-4, 6e-6], [-4e-6, 6e-6, 1e-6]])
+    std = np.sqrt(np.diag(covariance))
+    theta = np.array(list(ROBOT.values()))
+    estimate = mjfim.Estimate(
+        parameters=system.parameters.names,
+        theta=theta,
+        std=std,
+        covariance=covariance,
+        initial_theta=theta,
+        chi2=1.0,
+        dof=1,
+        status="converged",
+        success=True,
+        misfit=False,
+        iterations=1,
+        residual_rms={},
+        at_bound=(),
+        predicted=(),
+        recordings=(),
+    )
+    task = PayloadTask.of(robot, body="hand", robot=estimate)
+    parameters = task.system().parameters
+    index = [parameters.names.index(name) for name in ROBOT]
+    information = parameters.prior_information[np.ix_(index, index)]
+    expected = np.linalg.inv(honest_covariance(system, estimate))
+    np.testing.assert_allclose(information, expected, rtol=1e-8)
+    np.testing.assert_array_equal(parameters.guess[index], theta)
+
+    # A parameter that the estimate does not determine is held.
+    unknown = replace(
+        estimate,
+        std=np.array([np.inf, *std[1:]]),
+        std_sandwich=np.zeros(0),
+        interval=np.zeros((0, 2)),
+    )
+    held = PayloadTask.of(robot, body="hand", robot=unknown).known_robot()
+    assert held.held == ("pitch_damping",)
+    assert held.known == ("roll_damping", "hand_mass")
+
+    # An estimate of another robot, and bodies that cannot carry a load.
+    other = replace(estimate, parameters=("pitch_damping", "roll_damping", "mass"))
+    with pytest.raises(ExperimentError, match=r"lacks the robot's hand_mass of arm.toml"):
+        PayloadTask.of(robot, body="hand", robot=other)
+    for body, words in (("hnad", "did you mean 'hand'"), ("world", "move"), ("stand", "move")):
+        with pytest.raises(ExperimentError, match=f"^body: .*{words}"):
+            PayloadTask.of(robot, body=body)
+    with pytest.raises(ExperimentError, match=r"valid: upper, hand$"):
+        PayloadTask.of(robot)
+    with pytest.raises(ExperimentError, match=r"^size: -1"):
+        PayloadTask.of(robot, body="hand", size=-1.0)
+
+
+def test_a_payload_that_the_experiment_states_is_left_out_of_the_robot(tmp_path: Path) -> None:
+    stated = experiment(tmp_path, **LOAD).replace(
+        parameters={"load": {"target": "term/load:mass", "guess": 0.1}}, fit={"hold": ["load"]}
+    )
+    robot = RobotExperiment.of(stated)
+    assert robot.parameters == tuple(ROBOT)
+    assert robot.experiment.terms == {}
+    assert robot.experiment.fit.hold == ()
+    assert robot.place(None).body == "hand"
+
+    mixed = {"targets": [{"path": "term/load:mass"}, {"path": "body/upper:mass"}]}
+    with pytest.raises(ExperimentError, match=r"parameters\.both: sets numbers of the payload"):
+        RobotExperiment.of(stated.replace(parameters={"both": mixed}))
+
+
+def test_a_whole_inertia_of_the_robot_becomes_ten_known_parameters(tmp_path: Path) -> None:
+    stated = experiment(tmp_path)
+    values = stated.model_dump(exclude_unset=True)
+    values["parameters"] = {"hand": {"inertial": "hand"}}
+    whole = stated.restated(values)
+    system = System.resolve(whole)
+    names, theta = system.parameters.names, system.parameters.guess
+    tables = RobotExperiment.of(whole).known(("hand",), dict(zip(names, theta, strict=True)))
+    again = System.resolve(whole.restated({**values, "parameters": tables}))
+    assert again.parameters.names == names
+    moved = theta + 0.1 * system.parameters.magnitude
+    for vector in (theta, moved):
+        expected, found = system.model_at(vector), again.model_at(vector)
+        np.testing.assert_allclose(found.body_mass, expected.body_mass, rtol=1e-12)
+        np.testing.assert_allclose(found.body_inertia, expected.body_inertia, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
+    robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=INERTIA)
+    found = []
+    for seed in range(20):
+        robots = mjfim.identify(robot, [log(robot, seed)])
+        estimate = mjfim.identify_payload(
+            robot, [log(loaded, 100 + seed)], body="hand", robot=robots
+        )
+        assert estimate.success
+        assert estimate.payload is not None
+        assert estimate.payload.is_seen
+        found.append(list(inside(estimate).values()))
+    assert np.mean(found) >= 0.9
+    assert (np.mean(found, axis=0) >= 0.8).all()
+
+
+@pytest.mark.slow
+def test_recordings_without_the_payload_take_the_place_of_an_estimate(tmp_path: Path) -> None:
+    robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=INERTIA)
+    reference, recording = log(robot, 1), log(loaded, 2)
+    estimate = mjfim.identify_payload(robot, [recording], body="hand", without=[reference])
+    earlier = mjfim.identify(robot, [reference])
+    other = mjfim.identify_payload(robot, [recording], body="hand", robot=earlier)
+    np.testing.assert_allclose(estimate.theta, other.theta, rtol=1e-9)
+    assert all(inside(estimate).values())
+
+    # With a robot that is held at its guess, which is wrong, the load is not what it is.
+    held = mjfim.identify_payload(robot, [recording], body="hand")
+    assert held.payload is not None
+    assert held.payload.held == tuple(ROBOT)
+    assert held.misfit
+
+    # Where there is no load, none is found.
+    nothing = mjfim.identify_payload(robot, [log(robot, 3)], body="hand", robot=earlier)
+    assert nothing.payload is not None
+    assert not nothing.payload.is_seen
+    assert "show no payload at hand" in str(nothing.payload)
+
+
+@pytest.mark.slow
+def test_an_inertia_that_recordings_show_is_determined(tmp_path: Path) -> None:
+    robot = experiment(tmp_path)
+    loaded = experiment(tmp_path, **LOAD, inertia=0.02)
+    estimate = mjfim.identify_payload(
+        robot, [log(loaded, 5)], body="hand", robot=mjfim.identify(robot, [log(robot, 4)])
+    )
+    payload = estimate.payload
+    assert payload is not None
+    assert payload.edge is None
+    low, high = payload.inertia_interval
+    assert low <= 0.02 <= high
