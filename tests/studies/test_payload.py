@@ -228,3 +228,24 @@ def test_an_inertia_that_recordings_show_is_determined(tmp_path: Path) -> None:
     assert payload.edge is None
     low, high = payload.inertia_interval
     assert low <= 0.02 <= high
+
+
+@pytest.mark.slow
+def test_terms_that_a_selection_has_added_are_taken_over(tmp_path: Path) -> None:
+    robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=INERTIA)
+
+    def with_dry_friction(stated: mjfim.Experiment, seed: int) -> mjfim.Recording:
+        """A recording of an arm whose pitch has dry friction, which the model does not have."""
+        rubbing = ARM.replace('name="pitch" axis', 'name="pitch" frictionloss="0.08" axis')
+        (tmp_path / "arm.xml").write_text(rubbing, encoding="utf-8")
+        recording = log(stated, seed)
+        (tmp_path / "arm.xml").write_text(ARM, encoding="utf-8")
+        return recording
+
+    reference, recording = with_dry_friction(robot, 1), with_dry_friction(loaded, 2)
+    selected = mjfim.select_terms(robot, [reference])
+    estimate = mjfim.identify_payload(robot, [recording], body="hand", robot=selected)
+    assert estimate.payload is not None
+    assert "pitch_frictionloss" in estimate.payload.known
+    assert not estimate.misfit
+    assert all(inside(estimate).values())
