@@ -429,15 +429,31 @@ def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
     determine as well, and one difference step is enough to see it, unless an effect is so weak that
     it may be round-off.
     """
+    tested = _tested_parameters(task)
+    if not tested.any():
+        count = len(task.system.parameters)
+        nothing = np.zeros((count, 0))
+        return NullSpace(directions=nothing, silent=(), basis=np.eye(count), smallest=1.0)
+
     for part in _parts_that_determine(problem):
         J, change = _stacked_sensitivity(task, part, with_error=False)
-        free = ~np.isin(task.system.parameters.names, task.settings.hold)
-        if has_weak_column(J[:, free], task.system.parameters.magnitude[free]):
+        if has_weak_column(J[:, tested], task.system.parameters.magnitude[tested]):
             continue
         quick = _null_space(task, J, change)
         if not quick.count and quick.smallest > CLEAR_SINGULAR_VALUE:
             return quick
     return _null_space(task, *_stacked_sensitivity(task, problem, with_error=True))
+
+
+def _tested_parameters(task: FitTask) -> np.ndarray:
+    """(p,) True for the parameters of which the data may contain no information.
+
+    Those that are held are none, and no direction of inertias with a CAD prior is without it.
+    """
+    parameters = task.system.parameters
+    tested = ~np.isin(parameters.names, task.settings.hold)
+    tested[CadPrior.of(parameters).columns] = False
+    return tested
 
 
 def _parts_that_determine(problem: FitProblem) -> Iterator[FitProblem]:
@@ -462,24 +478,23 @@ def _stacked_sensitivity(
         problem: Problem of the segments.
         with_error: Whether to simulate with a second difference step, which shows round-off.
     """
-    rows = sensitivity_rows(problem, problem.begin(task.start), with_error=with_error)
+    begin, tested = problem.begin(task.start), _tested_parameters(task)
+    rows = sensitivity_rows(problem, begin, with_error=with_error, wanted=tested)
     J = np.concatenate([row for row, _ in rows])
     change = np.concatenate([error for _, error in rows])
 
     # Priors are further rows, which have no error of finite differences.
-    parameters = task.system.parameters
-    from_model = CadPrior.of(parameters).rows(task.start)[:, :-1]
-    prior = np.concatenate([parameters.prior_rows, from_model])
+    prior = task.system.parameters.prior_rows
     return np.concatenate([J, prior]), np.concatenate([change, np.zeros_like(prior)])
 
 
 def _null_space(task: FitTask, J: Array, change: Array) -> NullSpace:
     """Directions of theta without effect on (n, p) rows, whose error is `change`.
 
-    Parameters that are held are in none of them.
+    Only tested parameters are in them.
     """
     parameters = task.system.parameters
-    free = np.flatnonzero(~np.isin(parameters.names, task.settings.hold))
+    free = np.flatnonzero(_tested_parameters(task))
     count = len(free)
     found = find_null_space(
         J[:, free],

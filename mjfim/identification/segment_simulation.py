@@ -237,7 +237,7 @@ class SegmentSimulation:
         derivatives: bool,
         central: bool | None = None,
         step: float = SENSITIVITY_STEP,
-        by_all_parameters: bool = False,
+        wanted: np.ndarray | None = None,
     ) -> Iterator[SegmentBatch]:
         """Divide all segments into batches that fit into memory; every segment is in one of them.
 
@@ -245,14 +245,14 @@ class SegmentSimulation:
             derivatives: Whether to compute derivatives.
             central: True for two-sided differences; default: two-sided unless there is much data.
             step: Relative step of two-sided differences.
-            by_all_parameters: Whether to differentiate also by parameters without common columns.
+            wanted: (p,) True for the parameters by which to differentiate; default: those that have
+                common columns.
 
         Yields:
             The batches.
         """
-        wanted = self.layout.estimated
-        if by_all_parameters:
-            wanted = np.ones(len(self.system.parameters), dtype=bool)
+        if wanted is None:
+            wanted = self.layout.estimated
 
         # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count

@@ -20,7 +20,11 @@ from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
 
 
 def sensitivity_rows(
-    problem: FitProblem, at: UnknownValues, *, with_error: bool = True
+    problem: FitProblem,
+    at: UnknownValues,
+    *,
+    with_error: bool = True,
+    wanted: np.ndarray | None = None,
 ) -> list[tuple[Array, Array]]:
     """Condensed rows of the whitened sensitivity G, and their change with a longer step.
 
@@ -31,6 +35,7 @@ def sensitivity_rows(
         problem: The problem.
         at: The unknowns.
         with_error: False for changes of zero and one-sided differences, at a quarter of the cost.
+        wanted: (p,) True for the parameters whose columns are wanted; default: all of them.
 
     Returns:
         (k, p) rows and (k, p) changes of every segment [standard deviations / theta-unit], k at
@@ -39,7 +44,9 @@ def sensitivity_rows(
     Raises:
         SimulationDivergedError: A perturbed simulation diverges.
     """
-    condensed = _condensed_sensitivity(problem, at, with_error)
+    if wanted is None:
+        wanted = np.ones(len(problem.system.parameters), dtype=bool)
+    condensed = _condensed_sensitivity(problem, at, with_error, wanted)
     n = problem.simulation.private_count if problem.layout.free_starts else 0
 
     found = []
@@ -57,7 +64,7 @@ def sensitivity_rows(
 
 
 def _condensed_sensitivity(
-    problem: FitProblem, at: UnknownValues, with_error: bool
+    problem: FitProblem, at: UnknownValues, with_error: bool, wanted: np.ndarray
 ) -> dict[int, Array]:
     """Triangle of the whitened sensitivity and its change with a longer step, by segment.
 
@@ -68,7 +75,7 @@ def _condensed_sensitivity(
         work = sensitivities_of_batch
     batches = list(
         problem.simulation.batches(
-            derivatives=True, central=with_error, step=SENSITIVITY_STEP, by_all_parameters=True
+            derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted
         )
     )
     condensed: dict[int, Array] = {}

@@ -14,7 +14,9 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.identify import _unseen_directions
 from mjfim.identification.prior_share import prior_directions
+from mjfim.identification.task import FitTask
 from mjfim.model.inertia_distance import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step
 from mjfim.records.recording import Recording
@@ -196,3 +198,17 @@ def test_what_no_recording_shows_stays_as_in_the_model(tmp_path: Path, log: Reco
     # Without the prior, such combinations are held and said one by one.
     without = mjfim.identify(arm(tmp_path, cad_prior=False), [log], progress=False)
     assert without.combinations and without.prior_directions is None
+
+
+def test_no_data_are_simulated_to_test_inertias_with_a_prior(
+    tmp_path: Path, log: Recording
+) -> None:
+    task = FitTask.resolve(arm(tmp_path), [log], threads=1)
+    problem = task.problem()
+    steps = problem.system.plant.engine_steps
+    assert _unseen_directions(task, problem).count == 0
+    assert problem.system.plant.engine_steps == steps
+
+    # Without the prior, hardly any single inertia is determined.
+    task = FitTask.resolve(arm(tmp_path, cad_prior=False), [log], threads=1)
+    assert _unseen_directions(task, task.problem()).count > 5

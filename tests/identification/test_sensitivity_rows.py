@@ -95,7 +95,9 @@ def test_an_effect_that_may_be_round_off_is_tested_with_its_error(
     task = FitTask.resolve(experiment, [recording], threads=1)
     count = len(task.start)
 
-    def rows(problem: FitProblem, at: Any, *, with_error: bool) -> list[tuple[Array, Array]]:
+    def rows(
+        problem: FitProblem, at: Any, *, with_error: bool, wanted: Any
+    ) -> list[tuple[Array, Array]]:
         """The last parameter has an effect of the size of its error."""
         J = 1e3 * np.eye(count) / task.system.parameters.magnitude
         J[-1] *= 1e-8
