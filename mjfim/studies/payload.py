@@ -17,7 +17,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, listed
+from mjfim.errors import ExperimentError, explain_renamed_arguments, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.horizons import with_length
@@ -84,6 +84,7 @@ class IdentifiedPayload:
     system: System
 
 
+@explain_renamed_arguments
 def identify_payload(
     experiment: Experiment,
     recordings: Sequence[Recording],

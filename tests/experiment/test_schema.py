@@ -123,7 +123,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The cart-pendulum's files beside faulty models and tables."""
     home = tmp_path_factory.mktemp("experiments")
     for source in MODELS.iterdir():
-        shutil.copy(source, home)
+        if source.is_file():
+            shutil.copy(source, home)
     for name, text in BAD_MODELS.items():
         (home / name).write_text(text, encoding="utf-8")
     for name, data in BAD_TABLES.items():
