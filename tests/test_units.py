@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -252,15 +254,18 @@ def fit_in_units(rescaled: Rescaled, found: Estimate) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def own_fits(tmp_path_factory, recording: Recording) -> dict[str, dict[str, Any]]:
-    """Numbers and verdicts of each fit of `FITS` in the units of the experiment."""
-    found = {}
-    for key, tables in FITS.items():
+def own_fits(tmp_path_factory, recording: Recording) -> Callable[[str], dict[str, Any]]:
+    """Numbers and verdicts of a fit of `FITS` in the units of the experiment."""
+
+    @cache
+    def fit(key: str) -> dict[str, Any]:
+        """The fit of a key, made when it is first needed."""
         folder = tmp_path_factory.mktemp("own")
-        original = stated(folder / "original", **tables)
+        original = stated(folder / "original", **FITS[key])
         own = rescale(original, Units(), folder / "own")
-        found[key] = fit_in_units(own, identify(original, [recording]))
-    return found
+        return fit_in_units(own, identify(original, [recording]))
+
+    return fit
 
 
 # All units change together in the fast tests, each of them alone in the slow ones.
@@ -281,9 +286,9 @@ UNITS_OF_FITS = [
 
 @pytest.mark.parametrize(("path", "name"), UNITS_OF_FITS)
 def test_estimates_and_misfits_are_the_same_in_all_units(
-    tmp_path, recording: Recording, own_fits: dict[str, dict[str, Any]], name: str, path: str
+    tmp_path, recording: Recording, own_fits: Callable[[str], dict[str, Any]], name: str, path: str
 ) -> None:
-    expected = own_fits[path]
+    expected = own_fits(path)
     assert expected["misfit"]
     if path == "stated start":
         assert "dry friction of slide" in expected["terms"]

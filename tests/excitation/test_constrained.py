@@ -475,6 +475,7 @@ def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "weight", [1e-3, pytest.param({"force": 1e-5}, marks=pytest.mark.slow)], ids=["one", "named"]
 )
+@pytest.mark.slow
 def test_a_design_does_not_use_a_clamp(weight: Any, tmp_path: Path) -> None:
     """A force that only a clamp keeps within its range violates its limit."""
     weak = CART_PENDULUM.format(integrator="RK4").replace(
@@ -808,6 +809,7 @@ def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_p
 
 
 @pytest.mark.parametrize("bandwidth", [30.0, 50.0])
+@pytest.mark.slow
 def test_a_bandwidth_near_that_of_the_samples_works(bandwidth: float, tmp_path: Path) -> None:
     """There are nearly as many splines as samples, and about twice as many on a coarse level."""
     task = cart_inside(
@@ -949,6 +951,7 @@ def test_repeated_designs_work_with_weights_and_with_odd_samples(
     ],
     ids=["A", "D", "c", "robust"],
 )
+@pytest.mark.slow
 def test_every_criterion_improves_within_limits(tmp_path: Path, tables: dict[str, Any]) -> None:
     known = {
         name: {**stated, **tables.get("parameters", {}).get(name, {})}

@@ -34,6 +34,7 @@ def data_information(design: mjfim.Design) -> np.ndarray:
     return design.final.information - design.prior
 
 
+@pytest.mark.slow
 def test_the_sum_is_at_least_as_good_as_that_of_separate_designs(tmp_path) -> None:
     experiments = pair(tmp_path)
     task = DesignTask.resolve(experiments[0])

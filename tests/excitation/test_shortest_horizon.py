@@ -64,6 +64,7 @@ def test_it_reaches_every_target(shorter: mjfim.ShortestExperiment) -> None:
     assert shorter.summary()["horizon"] == shorter.horizon
 
 
+@pytest.mark.slow
 def test_an_experiment_shorter_by_the_tolerance_does_not(shorter: mjfim.ShortestExperiment) -> None:
     """Checked by a separate design from the initial control."""
     below = shorter.missed

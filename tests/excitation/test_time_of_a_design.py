@@ -133,6 +133,7 @@ def test_the_time_of_few_evaluations_is_enough_for_a_good_control(
     assert design.final.cost < bound
 
 
+@pytest.mark.slow
 def test_time_for_a_few_random_controls_is_not_spent_on_a_descent_with_dry_friction(
     clock: StepClock, tmp_path: Path
 ) -> None:

@@ -159,6 +159,7 @@ def test_bounds_are_kept_and_named(design: mjfim.Design, recording: Recording) -
     assert estimate.at_bound == ("m",)
 
 
+@pytest.mark.slow
 def test_prior_pulls_the_estimate_and_shrinks_its_deviation(
     design: mjfim.Design, recording: Recording
 ) -> None:

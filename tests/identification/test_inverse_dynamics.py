@@ -178,6 +178,7 @@ def arm_forces(joints: int, theta: Array, experiment: Experiment) -> Array:
 
 
 @pytest.mark.parametrize("coordinates", ["logcholesky", "barycentric"])
+@pytest.mark.slow
 def test_base_parameters_of_an_arm_with_hardly_any_noise(coordinates: str, tmp_path: Path) -> None:
     joints = 3
     log, _ = arm_log(joints, 8.0, np.random.default_rng(1), sigma=1e-7)

@@ -118,6 +118,7 @@ def test_a_complete_model_has_no_missing_terms() -> None:
     assert not any(e.missing_terms or e.misfit for e in found)
 
 
+@pytest.mark.slow
 def test_estimated_parameters_are_no_missing_terms(tmp_path: Path) -> None:
     recording = robot(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>')
     friction = {"f": {"target": "joint/slide:frictionloss", "guess": 0.1, "bounds": [0.0, 5.0]}}

@@ -61,6 +61,7 @@ def system() -> System:
     return System.resolve(stated())
 
 
+@pytest.mark.slow
 def test_the_moments_are_those_of_the_formal_covariance(system: System) -> None:
     estimate = estimated(system, COVARIANCE)
     draws = draw_parameters(stated(), estimate, 2000, np.random.default_rng(1))

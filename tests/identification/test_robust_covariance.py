@@ -173,6 +173,7 @@ def test_with_white_noise_all_deviations_agree(with_offsets: bool) -> None:
 @pytest.mark.parametrize(
     ("phi", "with_offsets"), [(0.0, False), (0.0, True), (0.6, False), (0.9, False), (0.9, True)]
 )
+@pytest.mark.slow
 def test_the_interval_covers_the_truth(phi: float, with_offsets: bool) -> None:
     """The coverage is nearly 95 % and not 100 %; formal intervals cover less."""
     s = study(phi, with_offsets)

@@ -205,6 +205,7 @@ def log_of_another_rate(
     "rate",
     [125, *(pytest.param(rate, marks=pytest.mark.slow) for rate in OTHER_RATES)],
 )
+@pytest.mark.slow
 def test_a_log_of_any_rate_is_fitted_where_engine_steps_end_at_its_rows(
     rate: int | str, tmp_path: Path
 ) -> None:
@@ -232,6 +233,7 @@ def test_a_log_of_any_rate_is_fitted_where_engine_steps_end_at_its_rows(
         pytest.param(1000, 'timestep="0.001", and rate = 1000', marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_a_log_with_jumps_inside_engine_steps_is_a_misfit_with_its_remedy(
     rate: int, remedy: str, tmp_path: Path
 ) -> None:

@@ -92,6 +92,7 @@ def test_earlier_information_of_a_design_leaves_every_sigma_known(tmp_path) -> N
     assert {row.name for row in told.rows if not np.isfinite(row.std)} == {"m1r1", "I1", "m2"}
 
 
+@pytest.mark.slow
 def test_an_estimate_keeps_what_no_recording_shows_and_determines_the_rest(tmp_path) -> None:
     parameters = {
         **PARAMETERS,
@@ -115,6 +116,7 @@ def test_an_estimate_keeps_what_no_recording_shows_and_determines_the_rest(tmp_p
     )  # there at the guess
 
 
+@pytest.mark.slow
 def test_an_estimate_of_combinations_serves_as_earlier_information(tmp_path) -> None:
     task = pendulum(tmp_path)
     estimate = identify_system(task.system, [simulate_system(task.system, task.initial, seed=3)])

@@ -768,6 +768,7 @@ def test_estimate_summary(task: DesignTask, recording: Recording) -> None:
     assert data["prior"] == np.zeros((P, P)).tolist()
 
 
+@pytest.mark.slow
 def test_study_summary(task: DesignTask, design: Design) -> None:
     """montecarlo.json has the documented keys for each trajectory."""
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}

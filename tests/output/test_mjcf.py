@@ -671,6 +671,7 @@ def test_other_contacts_of_a_body_that_only_slides_are_said(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.slow
 def test_models_of_other_projects(name: str, tmp_path: Path) -> None:
     shared_model(EXPERIMENTS[name]["model"])
     task = DesignTask.resolve(

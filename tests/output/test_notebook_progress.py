@@ -73,6 +73,7 @@ def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:
 
 
 @pytest.mark.parametrize(("begin", "call"), list(verbs()), ids=lambda value: str(value)[:9])
+@pytest.mark.slow
 def test_a_notebook_shows_the_progress_of_each_verb_once(
     begin: str, call: Callable[..., Any], experiment: mjfim.Experiment, places: list[Shown]
 ) -> None:

@@ -101,6 +101,7 @@ def played(player: ModuleType, robot: SimulatedRobot, path: Path, **options: Any
 
 
 @pytest.mark.parametrize("feedback", [False, True])
+@pytest.mark.slow
 def test_parameters_are_identified_from_what_the_player_records(
     feedback: bool,
     player: ModuleType,

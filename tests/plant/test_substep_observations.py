@@ -241,6 +241,7 @@ def test_derivatives_of_observations_are_differences_of_independent_simulations(
     ids=["draft", "fast", "central"],
 )
 @pytest.mark.parametrize("sensors", [False, True], ids=["states", "sensors"])
+@pytest.mark.slow
 def test_bilinear_derivatives_contain_those_of_the_observations(
     sensors: bool, accuracy, tmp_path: Path
 ) -> None:

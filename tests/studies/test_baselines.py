@@ -166,6 +166,7 @@ def test_numbers_are_reflected_at_their_ends() -> None:
         for name in METHODS
     ],
 )
+@pytest.mark.slow
 def test_every_baseline_keeps_the_limits_and_its_budget(method: str) -> None:
     result = found(method)
     assert result.control is not None

@@ -285,6 +285,7 @@ def test_recorded_rounds_are_not_repeated(campaign: Campaign) -> None:
     np.testing.assert_allclose(found.pending.theta, campaign.rounds[1].theta, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_interrupted_while_recording(campaign: Campaign) -> None:
     token = StopToken()
 

@@ -376,6 +376,7 @@ def test_a_servo_is_commanded_to_where_its_joint_is() -> None:
     assert start.act == pytest.approx([position])
 
 
+@pytest.mark.slow
 def test_controls_of_an_actuator_with_several_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / "ball.xml"
     path.write_text(
@@ -507,6 +508,7 @@ def test_a_horizon_that_the_user_wants_stays_and_the_limit_is_named(tmp_path: Pa
     assert "no motion about this start keeps all limits: position of lift is" in warning
 
 
+@pytest.mark.slow
 def test_wishes_are_fulfilled(tmp_path: Path) -> None:
     wished: dict[str, object] = {
         "keyframe": "settled",

@@ -494,6 +494,7 @@ def test_margins_of_servo_forces_hold_at_every_engine_step(
         ),
     ],
 )
+@pytest.mark.slow
 def test_without_noise_the_true_values_are_found(
     cart: tuple[mjfim.Experiment, Path], feedback: bool, latency: float
 ) -> None:

@@ -70,6 +70,7 @@ def test_the_estimates_do_not_depend_on_the_executor_nor_on_lost_tasks(
 
 
 @pytest.mark.parametrize("smallest", [1, 6])
+@pytest.mark.slow
 def test_the_estimates_do_not_depend_on_the_division_into_chunks(
     smallest: int,
     experiment: mjfim.Experiment,

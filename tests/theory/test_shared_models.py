@@ -69,6 +69,7 @@ def test_every_shared_model_loads() -> None:
 
 
 @pytest.mark.parametrize("name", EXPERIMENT_NAMES)
+@pytest.mark.slow
 def test_every_initial_trajectory_is_identifiable(name: str) -> None:
     start = mjfim.design(experiment(name).replace(descent={"max_iterations": 0}))
     assert start.final.eigenvalues[0] > 0.0
