@@ -79,6 +79,7 @@ def accuracy_of(
     solution: Solution,
     null_space: NullSpace,
     correlation_rows: Sequence[float],
+    inflation: float = 1.0,
 ) -> Accuracy:
     """Assess the accuracy of a solution.
 
@@ -88,6 +89,7 @@ def accuracy_of(
         null_space: Directions of theta about which neither recordings nor priors contain
             information.
         correlation_rows: Autocorrelation time of the residuals of every output [rows].
+        inflation: Factor by which the residuals' size and correlation widen variances.
 
     Returns:
         The accuracy.
@@ -107,7 +109,7 @@ def accuracy_of(
     declared_alone = np.array([not parameter.group for parameter in parameters.parameters])
 
     data = _data_information(problem, solution)
-    robust = _robust(problem, solution, correlation_rows)
+    robust = _robust(problem, solution, correlation_rows, inflation)
     sandwich, interval, between = _intervals(problem, theta, std, robust)
     return Accuracy(
         std=std,
@@ -184,7 +186,10 @@ def _private_covariance(
 
 
 def _robust(
-    problem: FitProblem, solution: Solution, correlation_rows: Sequence[float]
+    problem: FitProblem,
+    solution: Solution,
+    correlation_rows: Sequence[float],
+    inflation: float,
 ) -> Uncertainty | None:
     """Robust uncertainty from the blocks of the last linearisation.
 
@@ -204,6 +209,7 @@ def _robust(
         draws=settings.bootstrap,
         rng=np.random.default_rng(settings.seed),
         own=problem.layout.own_columns,
+        inflation=inflation,
     )
 
 

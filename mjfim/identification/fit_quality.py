@@ -42,6 +42,15 @@ class FitQuality:
     worst_residual: WorstResidual | None
     unexplained: tuple[str, ...]
 
+    @property
+    def inflation(self) -> float:
+        """Ratio of the variance of sums of the residuals to that of the noise, at least 1.
+
+        It is that of residuals that are as large and as correlated everywhere as on average.
+        """
+        longest = max((test.time for test in self.whiteness), default=1.0)
+        return max(self.chi2 / self.dof, 1.0) * max(longest, 1.0)
+
     def correlation_rows(self, rows: int) -> list[float]:
         """Autocorrelation times of the residuals.
 

@@ -114,7 +114,8 @@ class FitResult:
     def accuracy(self) -> Accuracy:
         """Accuracy of the estimate."""
         rows = self.quality.correlation_rows(self.problem.row_count)
-        return accuracy_of(self.problem, self.solution, self.null_space, rows)
+        inflation = self.quality.inflation
+        return accuracy_of(self.problem, self.solution, self.null_space, rows, inflation)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

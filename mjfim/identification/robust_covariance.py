@@ -82,6 +82,7 @@ def robust_uncertainty(
     draws: int,
     rng: np.random.Generator,
     own: np.ndarray | None = None,
+    inflation: float = 1.0,
 ) -> Uncertainty:
     """Uncertainty of the common unknowns at a minimum.
 
@@ -95,6 +96,8 @@ def robust_uncertainty(
         draws: Number of bootstrap replicates.
         rng: Random generator of the bootstrap.
         own: (K, e) columns of the unknowns that belong to each of K recordings; default: none.
+        inflation: Factor of the formal variances from which the covariance of combinations begins.
+            The scatter of few blocks says nothing about most combinations of many unknowns.
 
     Returns:
         The uncertainty.
@@ -110,6 +113,10 @@ def robust_uncertainty(
     of_scatter = inverse @ S @ inverse
     sandwich = np.sqrt(np.maximum(np.diag(of_scatter), 0.0))
     formal = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+
+    # Larger and correlated residuals widen what the data say, but not the priors.
+    data = inflation * blocks.information.sum(axis=0) + blocks.prior_information
+    of_noise = inverse @ data @ inverse
 
     replicates = _bootstrap(blocks, draws, rng)
 
@@ -135,7 +142,7 @@ def robust_uncertainty(
         each=each,
         blocks=count,
         draws=theta + replicates,
-        covariance=covering_covariance(inverse, _student_factor(count) ** 2 * of_scatter),
+        covariance=covering_covariance(of_noise, _student_factor(count) ** 2 * of_scatter),
     )
 
 

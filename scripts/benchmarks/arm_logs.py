@@ -467,7 +467,7 @@ def fitted(arm: Arm, system: System, recordings: list[Recording], whole: bool) -
         equations=result.inverse_dynamics.theta,
         misfit=bool(reasons),
         success=result.solution.success,
-        inflation=_inflation(quality.chi2 / quality.dof, quality.whiteness),
+        inflation=quality.inflation,
     )
 
 

@@ -364,3 +364,26 @@ def test_a_covering_covariance_is_at_least_both_in_every_direction() -> None:
         assert np.linalg.eigvalsh(found - smaller)[0] > -1e-9
     np.testing.assert_allclose(covering_covariance(first, 0.1 * first), first, rtol=1e-6)
     np.testing.assert_allclose(covering_covariance(first, 9.0 * first), 9.0 * first, rtol=1e-6)
+
+
+def test_inflated_residuals_widen_what_the_data_say_but_not_the_prior() -> None:
+    X, y = waves(1, 480, 2), noise(0.0, (1, 480), np.random.default_rng(6))
+    for prior, factor in ((np.inf, 100.0), (1e-6, 1.0)):
+        theta, condensed = Linear(X, prior=prior).fitted(y)
+        rows = np.full(len(condensed.segment_of_block), float(FINE))
+        plain, wide = (
+            robust_uncertainty(
+                condensed,
+                theta,
+                condensed.segment_of_block,
+                rows,
+                min_rows=1.0,
+                draws=0,
+                rng=np.random.default_rng(0),
+                inflation=inflation,
+            )
+            for inflation in (1.0, 100.0)
+        )
+        np.testing.assert_array_equal(plain.interval, wide.interval)
+        ratio = np.diag(wide.covariance) / np.diag(plain.covariance)
+        np.testing.assert_allclose(ratio, factor, rtol=0.35)
