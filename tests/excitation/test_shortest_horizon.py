@@ -100,6 +100,7 @@ def test_the_message_names_targets_out_of_reach_with_numbers() -> None:
         mjfim.shortest_experiment(hard, longest=0.8)
 
 
+@pytest.mark.slow
 def test_it_is_saved_and_loaded_with_its_experiment(
     shorter: mjfim.ShortestExperiment, tmp_path: Path
 ) -> None:

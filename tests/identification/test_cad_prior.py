@@ -200,6 +200,7 @@ def test_what_no_recording_shows_stays_as_in_the_model(tmp_path: Path, log: Reco
     assert without.combinations and without.prior_directions is None
 
 
+@pytest.mark.slow
 def test_no_data_are_simulated_to_test_inertias_with_a_prior(
     tmp_path: Path, log: Recording
 ) -> None:

@@ -102,6 +102,7 @@ def test_plant_gains_and_latency_are_found_from_references_alone() -> None:
     assert found.summary()["controllers"][0]["numbers"]["kp"] == found.theta[2]
 
 
+@pytest.mark.slow
 def test_the_law_at_another_rate_does_not_explain_a_log() -> None:
     """The rate matters: a slow law brakes less, and the plant would be blamed for it."""
     laws = {"shoulder": {**SHOULDER, "rate": 50.0}, "elbow": ELBOW}

@@ -35,6 +35,7 @@ def estimate(folder: Path, log: Recording) -> Estimate:
     return mjfim.identify(experiment, [log], start=wrong, progress=False)
 
 
+@pytest.mark.slow
 def test_the_estimate_starts_from_the_equation_of_motion(folder: Path, estimate: Estimate) -> None:
     true = System.resolve(cart(folder)).parameters.guess
     assert estimate.success and not estimate.misfit

@@ -44,6 +44,7 @@ def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> 
         pytest.param('armature="0.5"', "joint/slide:armature", 0.5, 4.0, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_the_missing_term_comes_first_and_in_about_its_size(
     tmp_path: Path, added: str, path: str, amount: float, horizon: float
 ) -> None:

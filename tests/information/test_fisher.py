@@ -252,6 +252,7 @@ EXACT = {"initial": 1e-9, "bias": 1e-9, "delay": 1e-9}
 VAGUE = {"initial": 0.1, "bias": 0.1, "delay": 0.01}
 
 
+@pytest.mark.slow
 def test_exactly_known_nuisances_change_neither_design_criterion_nor_estimate(tmp_path) -> None:
     plain, exact, vague = (
         cart_task(tmp_path, **t) for t in ({}, {"nuisance": EXACT}, {"nuisance": VAGUE})

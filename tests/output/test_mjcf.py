@@ -638,6 +638,7 @@ def test_shortcuts_set_the_entries_that_mujoco_sets(element: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in MODELS.glob("*.toml")))
+@pytest.mark.slow
 def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
     task = DesignTask.resolve(mjfim.Experiment.from_file(design_file(name, tmp_path)))
     theta = task.parameters.guess * (

@@ -183,6 +183,7 @@ def test_every_baseline_keeps_the_limits_and_its_budget(method: str) -> None:
     )  # of a start that even leaves the limits
 
 
+@pytest.mark.slow
 def test_amplitudes_go_up_to_the_limits() -> None:
     for method in ("chirp", "multisine", "steps"):
         control = found(method).control

@@ -128,6 +128,7 @@ def test_rows_hold_the_numbers_of_their_controls() -> None:
         assert np.abs(ctrl).max() <= 5.0
 
 
+@pytest.mark.slow
 def test_a_control_that_violates_limits_is_shrunk_until_it_is_feasible() -> None:
     task, found = DesignTask.resolve(pendulum()), small().rows[0]
     assert found.control is not None

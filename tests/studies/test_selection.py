@@ -68,6 +68,7 @@ def test_the_missing_term_is_added_and_nothing_else(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.theta, found.theta, rtol=2e-2)
 
 
+@pytest.mark.slow
 def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
     found = mjfim.select_terms(stated(), recorded(tmp_path, "", count=2))
     assert found.selection is not None

@@ -84,6 +84,7 @@ def test_the_estimates_do_not_depend_on_the_division_into_chunks(
     assert same(estimates(experiment, final), expected)
 
 
+@pytest.mark.slow
 def test_a_request_to_stop_keeps_the_trials_of_finished_workers(
     experiment: mjfim.Experiment, curves: dict[str, mjfim.Trajectory]
 ) -> None:
