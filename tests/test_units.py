@@ -269,10 +269,7 @@ def own_fits(tmp_path_factory, recording: Recording) -> Callable[[str], dict[str
 
 
 # All units change together in the fast tests, each of them alone in the slow ones.
-FAST_UNITS = [
-    *(("stated start", name) for name in COMBINED),
-    *((path, COMBINED[0]) for path in FITS),
-]
+FAST_UNITS = [("stated start", COMBINED[0]), ("segments", COMBINED[1])]
 UNITS_OF_FITS = [
     *dict.fromkeys(FAST_UNITS),
     *(

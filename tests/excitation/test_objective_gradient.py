@@ -286,11 +286,9 @@ OFF = [
 @pytest.mark.parametrize(
     ("case", "feedback"),
     [
-        *((case, False) for case in SETUPS),
-        *(
-            pytest.param(case, True, marks=[] if case in OFF else pytest.mark.slow)
-            for case in SETUPS
-        ),
+        pytest.param(case, feedback, marks=[] if case in OFF else pytest.mark.slow)
+        for feedback in (False, True)
+        for case in SETUPS
     ],
     ids=lambda value: {False: "open loop", True: "feedback"}.get(value, value),
 )
