@@ -1,8 +1,9 @@
-"""The start of a fit: the stated one, or a fit to the equation of motion.
+"""The start of a fit: the stated one, or one at which the model does not diverge.
 
 A fit to the equation of motion compares forces, not motions, and so needs no start from which the
 model can be simulated. It is the start where the user asks for it, and where the model diverges at
-the stated one.
+the stated one. Where it is not possible, fits over short segments from starts spread about the
+stated one lead to another one.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from mjfim.identification.extreme_values import describe_extreme_value
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equations
 from mjfim.identification.searches import FitSearch
+from mjfim.identification.segment_fits import start_from_segments
+from mjfim.identification.spread_starts import SPREAD_STARTS, best_spread_start
 from mjfim.identification.subsets import of_subset, quick_subset
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import completed
@@ -25,6 +28,10 @@ from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergen
 from mjfim.plant.plant import UNSTABLE_LOOP
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.progress import begin_stage
+
+# Starts instead of that at which the model diverges, in words.
+AT_EQUATION = "at a fit to the equation of motion"
+AT_SPREAD_START = f"at the best of {SPREAD_STARTS} starts spread about it"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,12 +42,13 @@ class BegunFit:
         search: The searches, from a start at which the model does not diverge.
         inverse_dynamics: The fit to the equation of motion at which they start; None where they
             start at the stated parameters.
-        start_diverged: Whether they start there because the model diverges at the stated start.
+        instead: Where they start instead of the stated start, at which the model diverges, in
+            words; empty where it does not diverge there.
     """
 
     search: FitSearch
     inverse_dynamics: InverseDynamicsFit | None = None
-    start_diverged: bool = False
+    instead: str = ""
 
 
 def begin_fit(search: FitSearch, problem: FitProblem) -> BegunFit:
@@ -71,10 +79,9 @@ def begin_fit(search: FitSearch, problem: FitProblem) -> BegunFit:
     task = search.task
     extreme = describe_extreme_value(task.recordings, task.system.channels.control_columns)
     if not extreme and task.method != "newton":
-        found = try_fit_equations(problem.system, problem.recordings, task.start)
-        if found is not None and _is_finite(problem, found.theta):
-            begun = _from(search, found.theta)
-            return BegunFit(search=begun, inverse_dynamics=found, start_diverged=True)
+        begun = _begun_elsewhere(search, problem)
+        if begun is not None:
+            return begun
     raise _divergence(task, problem, extreme)
 
 
@@ -107,6 +114,25 @@ def _begun_by_dynamics(search: FitSearch, problem: FitProblem) -> BegunFit:
         return BegunFit(search=search, inverse_dynamics=found)
     extreme = describe_extreme_value(task.recordings, task.system.channels.control_columns)
     raise _divergence(task, problem, extreme)
+
+
+def _begun_elsewhere(search: FitSearch, problem: FitProblem) -> BegunFit | None:
+    """The searches from another start than that at which the model diverges; None without any."""
+    task = search.task
+    found = try_fit_equations(problem.system, problem.recordings, task.start)
+    if found is not None and _is_finite(problem, found.theta):
+        begun = _from(search, found.theta)
+        return BegunFit(search=begun, inverse_dynamics=found, instead=AT_EQUATION)
+
+    # The length of the segments is that of the user where it is stated.
+    if task.settings.segment_length is not None:
+        theta = completed(partial(best_spread_start, search, problem, task.start))
+    else:
+        start = start_from_segments(search, problem, spread=True).start
+        theta = None if start is None else problem.theta(start)
+    if theta is None or not _is_finite(problem, theta):
+        return None
+    return BegunFit(search=_from(search, theta), instead=AT_SPREAD_START)
 
 
 def _from(search: FitSearch, theta: Array) -> FitSearch:

@@ -17,7 +17,7 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.identification.continuation import WholeFit, problem_of_segments, segment_lengths
+from mjfim.identification.continuation import WholeFit
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.held_out_losses import BLOCKS, HeldOutLosses, losses_by_block
 from mjfim.identification.leave_out_fits import fit_to_others, leave_out_steps
@@ -29,6 +29,7 @@ from mjfim.identification.left_out_parts import (
 )
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.searches import FitSearch
+from mjfim.identification.segment_fits import problem_of_segments, segment_lengths
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution

@@ -234,7 +234,7 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
         subset=subset,
         restart=fit.restart,
         inverse_dynamics=begun.inverse_dynamics or fit.inverse_dynamics,
-        start_diverged=begun.start_diverged,
+        begun_instead=begun.instead,
     )
 
     # Where the model does not explain whole recordings, the length of the segments matters.

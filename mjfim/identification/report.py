@@ -90,7 +90,8 @@ class FitResult:
         restart: How the fit was repeated from fits over segments; None where it was not.
         horizons: Lengths of segments that were compared; None where they were not.
         inverse_dynamics: The fit to the equation of motion from which the search started, or None.
-        start_diverged: Whether it started there because the model diverges at the stated start.
+        begun_instead: Where it began instead of the stated start, at which the model diverges, in
+            words; empty where it does not diverge there.
     """
 
     task: FitTask
@@ -103,7 +104,7 @@ class FitResult:
     restart: Restart | None
     horizons: HorizonStudy | None = None
     inverse_dynamics: InverseDynamicsFit | None = None
-    start_diverged: bool = False
+    begun_instead: str = ""
 
     @property
     def theta(self) -> Array:
@@ -499,16 +500,17 @@ def _warnings_of_search(findings: _Findings) -> Iterator[str]:
     """Warnings about an interrupted search, a poor minimum and undetermined parameters."""
     quality = findings.quality
     accuracy = findings.accuracy
-    if findings.result.start_diverged:
+    result = findings.result
+    if result.begun_instead:
         yield (
-            f"the model diverges at the start ({values_of_start(findings.result.task)}): the "
-            "search began at a fit to the equation of motion instead"
+            f"the model diverges at the start ({values_of_start(result.task)}): the search began "
+            f"{result.begun_instead} instead"
         )
 
     if findings.unpredictable is not None:
         yield str(findings.unpredictable)
 
-    if findings.interrupted and not findings.result.solution.interrupted:
+    if findings.interrupted and not result.solution.interrupted:
         yield "interrupted after the search: there are no predictions of data that were not fitted"
 
     if quality.unexplained:

@@ -73,7 +73,7 @@ def sample_parameters(
 
     if unphysical is not None:
         for sample in samples[1:]:
-            _make_physical(sample, theta, unphysical)
+            make_physical(sample, theta, unphysical)
     return samples
 
 
@@ -99,10 +99,17 @@ def _values(parameter: Parameter, value: float, quantiles: Array) -> Array:
     return np.asarray(np.clip(value + parameter.prior * deviations, low, high))
 
 
-def _make_physical(
+def make_physical(
     sample: Array, theta: Array, unphysical: Callable[[Array], Sequence[int]]
 ) -> None:
-    """Move a sample: (p,) in place towards theta: (p,) until its bodies are physical."""
+    """Move a sample in place towards theta until its bodies are physical.
+
+    Args:
+        sample: (p,) parameters, which are changed.
+        theta: (p,) parameters of physical bodies.
+        unphysical: Gives for a sample the indices of the parameters that determine unphysical
+            bodies.
+    """
     for _ in range(MAX_HALVINGS):
         columns = list(unphysical(sample))
         if not columns:

@@ -288,12 +288,15 @@ class Restart:
         cost: That of the fit that was kept, with the noise of the first fit.
         by_dynamics: Whether the fits over segments began at a fit to the equation of motion, which
             costs less there than the start.
+        starts: Number of starts, spread about the guess, from the best of which they began; 1 where
+            they began at the guess or at a fit to the equation of motion.
     """
 
     lengths: tuple[float, ...]
     cost_before: float
     cost: float
     by_dynamics: bool = False
+    starts: int = 1
 
     def __str__(self) -> str:
         lengths = join_names([f"{length:.2g}" for length in self.lengths])
@@ -303,6 +306,8 @@ class Restart:
         )
         if self.by_dynamics:
             begin += ", which began at a fit to the equation of motion"
+        if self.starts > 1:
+            begin += f", which began at the best of {self.starts} starts spread about the guess"
         if not self.cost < self.cost_before:
             return f"{begin}. This found nothing better, and the first result stands."
         return (
@@ -317,6 +322,7 @@ class Restart:
             "cost_before": self.cost_before,
             "cost": self.cost,
             "by_dynamics": self.by_dynamics,
+            "starts": self.starts,
             "words": str(self),
         }
 

@@ -80,7 +80,7 @@ REASONS = {
     "flipped_signs": "suspects",
     "_unseen_directions": "what is determined",
     "best_start": "starts",
-    "_start_from_segments": "starts",
+    "start_from_segments": "starts",
     "solve": "main search",
 }
 WITH_ESTIMATED_NOISE = "noise estimated"

@@ -10,10 +10,9 @@ import pytest
 import mjfim
 from mjfim.budget import StopToken
 from mjfim.experiment.system import System
-from mjfim.identification import continuation
-from mjfim.identification.continuation import MIN_ROWS, segment_lengths
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system
+from mjfim.identification.segment_fits import MIN_ROWS, problem_of_segments, segment_lengths
 from mjfim.identification.task import FitTask
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import FitEvent
@@ -169,7 +168,7 @@ def test_segments_share_the_recordings_of_the_whole_problem(tmp_path: Path) -> N
     system = pendulum(tmp_path, 4.0)
     task = FitTask.resolve(system.experiment, [swings(system, 4.0)], threads=1)
     problem = task.problem()
-    part = continuation.problem_of_segments(problem, task, task.system, 1.0)
+    part = problem_of_segments(problem, task, task.system, 1.0)
     assert part is not None
     assert len(part.segments) == 4
     assert all(a is b for a, b in zip(part.recordings, problem.recordings, strict=True))

@@ -1,0 +1,92 @@
+"""Starts that are spread about a guess, where a fit found no minimum from it or cannot begin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.arrays import Array
+from mjfim.errors import SimulationDivergedError
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.identification.spread_starts import SPREAD_STARTS, spread_starts
+from mjfim.records.recording import Recording
+from tests.identification.test_inverse_dynamics import CART, cart, cart_log
+
+# The angle alone tells enough of the motion, but there is no equation of motion without the cart.
+ANGLE = ("qpos:hinge", "qvel:hinge")
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+    folder = tmp_path_factory.mktemp("cart")
+    return cart(folder, fit={"bootstrap": 0}, noise=dict.fromkeys(ANGLE, 0.01))
+
+
+@pytest.fixture(scope="module")
+def log(experiment: Experiment) -> Recording:
+    return cart_log(experiment, 0.01, seconds=4.0, measured=ANGLE)
+
+
+def true_values(experiment: Experiment) -> Array:
+    return System.resolve(experiment).parameters.guess
+
+
+def test_starts_cover_factors_of_ten_within_bounds(experiment: Experiment) -> None:
+    tables = {name: dict(table) for name, table in CART.items()}
+    tables["c"]["bounds"] = [0.2, 0.9]
+    system = System.resolve(experiment.replace(parameters=tables))
+    parameters, theta = system.parameters, system.parameters.guess
+    rng = np.random.default_rng(1)
+    starts = spread_starts(parameters, theta, ("d",), system.impossible, rng)
+    assert starts.shape == (SPREAD_STARTS, len(theta))
+    np.testing.assert_array_equal(starts[0], theta)
+
+    # One start in each of the equal parts of the logarithm.
+    m, c, d = (parameters.names.index(name) for name in ("m", "c", "d"))
+    shares = np.log10(starts[1:, m] / theta[m])
+    strata = np.floor((shares + 1.0) / 2.0 * (SPREAD_STARTS - 1)).astype(int)
+    np.testing.assert_array_equal(np.sort(strata), np.arange(SPREAD_STARTS - 1))
+
+    assert starts[:, c].min() == 0.2 and starts[:, c].max() == 0.9
+    np.testing.assert_array_equal(starts[:, d], theta[d])
+
+
+@pytest.mark.slow
+def test_a_start_that_diverges_is_left(experiment: Experiment, log: Recording) -> None:
+    true = true_values(experiment)
+    wrong = true * np.array([10.0, 0.1, 10.0, 0.1])
+    found = mjfim.identify(experiment, [log], start=wrong, progress=False)
+    assert found.success and not found.misfit
+    assert (np.abs(found.theta - true) < 5.0 * found.std).all()
+    assert found.inverse_dynamics is None
+    assert found.warnings[0].startswith("the model diverges at the start (m = 15, l = 0.08, ")
+    where = f"at the best of {SPREAD_STARTS} starts spread about it instead"
+    assert found.warnings[0].endswith(where)
+
+
+def test_a_model_that_diverges_everywhere_is_an_error(
+    experiment: Experiment, log: Recording
+) -> None:
+    tables = {name: dict(table) for name, table in CART.items()}
+    tables["c"].update(guess=1e7, bounds=[1e6, 1e9])
+    stiff = experiment.replace(parameters=tables)
+    with pytest.raises(SimulationDivergedError, match="diverges at the start"):
+        mjfim.identify(stiff, [log], progress=False)
+
+
+@pytest.mark.slow
+def test_starts_are_spread_where_the_restart_explains_no_motion(
+    experiment: Experiment, log: Recording
+) -> None:
+    true = true_values(experiment)
+    rng = np.random.default_rng([7, 0])
+    factors = np.exp(rng.uniform(np.log(3.0), np.log(10.0), 4)) ** rng.choice([-1.0, 1.0], 4)
+    found = mjfim.identify(experiment, [log], start=true * factors, progress=False)
+    assert found.success and not found.misfit
+    assert (np.abs(found.theta - true) < 5.0 * found.std).all()
+    assert found.restart is not None
+    assert found.restart.starts == SPREAD_STARTS
+    assert f"at the best of {SPREAD_STARTS} starts spread about the guess" in str(found.restart)
+    assert found.restart.cost < 0.01 * found.restart.cost_before
