@@ -125,16 +125,16 @@ class Robot:
     offset: tuple[float, ...] = (0.0,)
 
 
-def of_file(name: str, seconds: float, amplitude: tuple[float, ...], **changes: Any) -> Robot:
+def of_file(file: str, seconds: float, amplitude: tuple[float, ...], **changes: Any) -> Robot:
     """A robot of an experiment file of the repository.
 
     Args:
-        name: Name of the file.
+        file: Name of the file.
         seconds: Duration of the recording [s].
         amplitude: Amplitude of each control.
         **changes: Attributes with other values.
     """
-    experiment = mjfim.Experiment.from_file(ROOT / "models" / f"{name}.toml")
+    experiment = mjfim.Experiment.from_file(ROOT / "models" / f"{file}.toml")
     parameters = {}
     for key, spec in experiment.parameters.items():
         stated = spec.model_dump(exclude_none=True, include={"target", "targets", "unit", "scale"})
@@ -143,7 +143,7 @@ def of_file(name: str, seconds: float, amplitude: tuple[float, ...], **changes: 
         parameters[key] = stated
     keyframe = experiment.initial.keyframe
     values: dict[str, Any] = {
-        "name": name,
+        "name": file,
         "model": ROOT / "models" / experiment.model,
         "rate": experiment.rate,
         "seconds": seconds,
@@ -157,7 +157,7 @@ def of_file(name: str, seconds: float, amplitude: tuple[float, ...], **changes: 
 
 def robots() -> tuple[Robot, ...]:
     """The robots of the study."""
-    state = {"hinge": 0.01}
+    angle = {"qpos:hinge": 0.05, "qvel:hinge": 0.05}
     furuta = {
         "arm_damping": {"target": "joint/theta:damping"},
         "pole_damping": {"target": "joint/alpha:damping"},
@@ -183,10 +183,12 @@ def robots() -> tuple[Robot, ...]:
                 "com": {"targets": [{"path": "body/pole:ipos[2]", "scale": -1.0}]},
                 "damping": {"target": "joint/hinge:damping"},
             },
-            noise={"qpos:hinge": state["hinge"]},
+            noise={"qpos:hinge": 0.01},
             initial={},
         ),
         of_file("cart_pendulum", 6.0, (4.0,), noise={"state": 0.05}),
+        # Without the motion of the cart, no equation of motion can be fitted.
+        of_file("cart_pendulum", 6.0, (4.0,), name="cart_unseen", noise=angle),
         Robot(
             name="furuta",
             model=FURUTA,
