@@ -21,7 +21,7 @@ from mjfim.identification.inverse_dynamics import fit_equations, try_fit_equatio
 from mjfim.identification.searches import FitSearch
 from mjfim.identification.segment_fits import start_from_segments
 from mjfim.identification.spread_starts import SPREAD_STARTS, best_spread_start
-from mjfim.identification.subsets import of_subset, quick_subset
+from mjfim.identification.subsets import of_subset, quick_subset, restart_subset
 from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import completed
 from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
@@ -126,7 +126,8 @@ def _begun_elsewhere(search: FitSearch, problem: FitProblem) -> BegunFit | None:
 
     # The length of the segments is that of the user where it is stated.
     if task.settings.segment_length is not None:
-        theta = completed(partial(best_spread_start, search, problem, task.start))
+        part = problem.of_segments(restart_subset(problem))
+        theta = completed(partial(best_spread_start, search, part, task.start))
     else:
         start = start_from_segments(search, problem, spread=True).start
         theta = None if start is None else problem.theta(start)
