@@ -172,10 +172,12 @@ def counted() -> Iterator[Counter[str]]:
     counts: Counter[str] = Counter()
     original = BatchSimulator.rollout
 
-    def rollout(self: BatchSimulator, models: Any, start: Any, ctrl: Any, *more: Any) -> Any:
+    def rollout(
+        self: BatchSimulator, models: Any, start: Any, ctrl: Any, *more: Any, **options: Any
+    ) -> Any:
         """Simulate, and count the steps."""
         counts[_reason()] += len(ctrl) * ctrl.shape[1] * self.substeps
-        return original(self, models, start, ctrl, *more)
+        return original(self, models, start, ctrl, *more, **options)
 
     with patch.object(BatchSimulator, "rollout", rollout):
         yield counts
