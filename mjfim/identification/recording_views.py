@@ -154,8 +154,10 @@ def _inflation(
         scores = evidence.scores[of_recording] @ directions
         moved = evidence.information[of_recording] @ directions
         scores = scores + np.einsum("sr,bsq,q->br", directions, moved, step)
-        centred = scores - scores.mean(axis=0)
-        count = len(centred)
+
+        # An interrupted fit may have used no segment of a recording.
+        count = len(scores)
+        centred = scores - scores.sum(axis=0) / max(count, 1)
         scatters.append(centred.T @ centred * (count / max(count - 1, 1)))
 
     # A few blocks often scatter little by chance.

@@ -24,7 +24,9 @@ def system() -> System:
     base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     return System.resolve(
         base.replace(
-            initial={"control": CONTROL}, fit={"bootstrap": 0, "max_iterations": 15}, horizon=3.0
+            initial={"control": CONTROL},
+            fit={"bootstrap": 0, "max_iterations": 15, "segments": "whole"},
+            horizon=3.0,
         )
     )
 

@@ -50,6 +50,7 @@ def few_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few segments are tested."""
     monkeypatch.setattr(next_step, "TESTED_SHARE", 0.5)
     monkeypatch.setattr(next_step, "MIN_TESTED_SEGMENTS", 4)
+    monkeypatch.setattr(next_step, "LARGEST_TESTED_SHARE", 1.0)
 
 
 class Counting:
@@ -78,8 +79,8 @@ def test_the_first_step_ends_a_search_that_began_near_the_minimum(task: FitTask)
     # A step of 0.35 standard deviations beside the minimum.
     away = np.linalg.cholesky(np.linalg.inv(exact.condensed.information())) @ np.full(3, 0.2)
     near = replace(exact.unknowns, theta=exact.unknowns.theta + away)
-    settings = SearchSettings(tolerance=0.1, relinearise_at_end=False)
-    fast = replace(settings, next_step_length=next_step_on_part(problem))
+    settings = SearchSettings(tolerance=0.02, relinearise_at_end=False)
+    fast = replace(settings, begins_near=True, next_step_length=next_step_on_part(problem))
     counting = Counting(problem)
     found = minimise(counting, near, fast, Budget())
     assert found is not None and found.success
