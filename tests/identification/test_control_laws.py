@@ -382,7 +382,7 @@ def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
     true = system.parameters.true
     trajectory = system.plant.simulate(true, references(400, 11))
 
-    study = mjfim.monte_carlo(experiment, trajectory, trials=200, seed=1, progress=False)
+    study = mjfim.monte_carlo(experiment, trajectory, trials=100, seed=1, progress=False)
 
     found = study.sets["final"]
     assert found.failed == 0
@@ -392,7 +392,7 @@ def test_estimates_reach_the_bound_and_intervals_cover_the_truth() -> None:
     assert (found.efficiency < 1.4).all()
 
     inside = []
-    for seed in range(20):
+    for seed in range(10):
         log = recorded(experiment, 400, 100 + seed)
         settings = {"segments": 0.2, "bootstrap": 200}
         estimate = mjfim.identify(experiment.replace(fit=settings), [log], progress=False)

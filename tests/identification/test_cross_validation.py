@@ -21,7 +21,7 @@ from tests.support.paths import ROOT
 @pytest.fixture(scope="module")
 def base() -> mjfim.Experiment:
     return mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(
-        fit={"bootstrap": 0}
+        fit={"bootstrap": 0, "segments": "whole"}
     )
 
 

@@ -180,7 +180,7 @@ def test_a_whole_inertia_of_the_robot_becomes_ten_known_parameters(tmp_path: Pat
 def test_true_values_are_inside_the_intervals(tmp_path: Path) -> None:
     robot, loaded = experiment(tmp_path), experiment(tmp_path, **LOAD, inertia=INERTIA)
     found = []
-    for seed in range(20):
+    for seed in range(10):
         robots = mjfim.identify(robot, [log(robot, seed)])
         estimate = mjfim.identify_payload(
             robot, [log(loaded, 100 + seed)], body="hand", robot=robots
