@@ -531,7 +531,11 @@ def test_intervals_hold_the_true_values(
     least = binom.ppf(1e-3, RUNS, 0.95)
     assert found.inside.min() >= least
     assert min(found.joint) >= least
-    assert found.misfits == 0 and not found.troubles
+
+    # Each run makes some thirty tests at a joint level of about 0.01, so that a false alarm is
+    # possible in 30 runs.
+    assert found.misfits <= 1
+    assert not found.troubles
     ratio = found.observed / found.formal
     assert (ratio > 0.6).all() and (ratio < 1.45).all()
     np.testing.assert_allclose(found.formal[:3], found.predicted[:3], rtol=0.35)
