@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError
+from mjfim.errors import ExperimentError, ModelError
 from mjfim.experiment.system import System
 from mjfim.identification.candidates import (
     Candidate,
@@ -239,7 +239,7 @@ def _extended_system(
             threads=system.threads,
             source=system.source,
         )
-    except ExperimentError:
+    except (ExperimentError, ModelError):
         return None
 
 
