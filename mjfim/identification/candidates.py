@@ -110,22 +110,16 @@ def candidates_of(system: System, speeds: Array) -> Iterator[Candidate]:
         system: The system.
         speeds: (nv,) root mean square of the speeds in the recordings [m/s or rad/s].
     """
-    parameters = system.parameters
-    targets = {
-        target.path.removesuffix("[0]")
-        for parameter in parameters.parameters
-        for target in parameter.targets
-    }
-
+    targets = targeted_paths(system)
     of_model = (*_joint_terms(system), *_gains(system), *_tilts(system))
     of_library = (*_frictions(system, speeds, targets), *_lags(system))
     of_sensors = (*_misalignments(system), *_output_errors(system))
     for candidate in (*of_model, *of_library, *of_sensors):
-        if not targets & {each.path.removesuffix("[0]") for each in candidate.tested}:
+        if not targets & {_without_index(each.path) for each in candidate.tested}:
             yield candidate
 
     # The delay is negative where the controls act later than the readings are late.
-    if not parameters.delay_derivative.any():
+    if not system.parameters.delay_derivative.any():
         delay = CandidateParameter(
             path="output:delay",
             unit="s",
@@ -147,26 +141,26 @@ def load_candidates_of(system: System) -> Iterator[Candidate]:
     """
     model: Any = system.model
     kind = "load_dependent_friction"
-    targets = {target.path for p in system.parameters.parameters for target in p.targets}
+    targets = targeted_paths(system)
     for actuator in range(model.nactuator):
         name = element_name(model, "actuator", actuator)
         if not name or int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
             continue
 
-        number = int(model.actuator_trnid[actuator, 0])
-        joint = element_name(model, "joint", number)
-        rubs = bool(model.dof_frictionloss[int(model.jnt_dofadr[number])])
-        rubs = rubs or f"joint/{joint}:frictionloss" in targets
+        joint = int(model.actuator_trnid[actuator, 0])
+        rubs = _has_dry_friction(
+            system, element_name(model, "joint", joint), int(model.jnt_dofadr[joint]), targets
+        )
         if not rubs or has_term(system, kind, name):
             continue
 
         # The term may be impossible at this actuator, at a servo for example.
-        table = TermTable(name=f"{name}_{kind}", element=(("actuator", name),))
+        added = added_term(system, kind, name)
+        table = TermTable(name=added.name, element=(("actuator", name),))
         try:
             least = KINDS[kind].of(table, system.source.stated.model, period_of(system))
         except ExperimentError:
             continue
-        added = added_term(system, kind, name)
         coefficient = CandidateParameter(
             path=f"term/{added.name}:coefficient",
             unit="",
@@ -181,6 +175,30 @@ def load_candidates_of(system: System) -> Iterator[Candidate]:
             added=added,
             source=KINDS[kind].sources[0],
         )
+
+
+def targeted_paths(system: System) -> set[str]:
+    """Paths of the numbers that parameters set, those of first entries without their index.
+
+    Args:
+        system: The system.
+    """
+    return {
+        _without_index(target.path)
+        for parameter in system.parameters.parameters
+        for target in parameter.targets
+    }
+
+
+def _without_index(path: str) -> str:
+    """A path without the index of a first entry, which may be stated or not."""
+    return path.removesuffix("[0]")
+
+
+def _has_dry_friction(system: System, joint: str, v: int, targets: set[str]) -> bool:
+    """Whether a joint with the degree of freedom v has dry friction, stated or as a parameter."""
+    model: Any = system.model
+    return bool(model.dof_frictionloss[v]) or f"joint/{joint}:frictionloss" in targets
 
 
 def period_of(system: System) -> float:
@@ -348,8 +366,7 @@ def _frictions(system: System, speeds: Array, targets: set[str]) -> Iterator[Can
     for joint in stated_joints(system):
         if not element_name(model, "joint", joint.joint):
             continue
-        rubs = bool(model.dof_frictionloss[joint.v])
-        if not rubs and f"joint/{joint.name}:frictionloss" not in targets:
+        if not _has_dry_friction(system, joint.name, joint.v, targets):
             continue
 
         size = LINEARISATION_SIZE * float(force[joint.v])

@@ -1,13 +1,15 @@
-"""The least-squares problem of an extended model, at the solution of the stated one."""
+"""Extended models, and their least-squares problems at the solution of the stated one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, ModelError
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.known_activations import KnownActivations
@@ -15,6 +17,26 @@ from mjfim.identification.segments import Segment
 from mjfim.model.coordinates import state_names, tangent_names
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.recording import Recording
+
+
+def extended_system(
+    system: System, parameters: dict[str, Any], terms: dict[str, Any]
+) -> System | None:
+    """The system with further parameters and terms; None where the model cannot have them.
+
+    Args:
+        system: The system.
+        parameters: Tables of the further parameters by name.
+        terms: Tables of the library of terms by name.
+    """
+    try:
+        return System.resolve(
+            system.experiment.replace(parameters=parameters, terms=terms),
+            threads=system.threads,
+            source=system.source,
+        )
+    except (ExperimentError, ModelError):
+        return None
 
 
 def extended_problem(

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, ModelError
 from mjfim.experiment.system import System
 from mjfim.identification.candidates import (
     Candidate,
@@ -27,7 +27,11 @@ from mjfim.identification.candidates import (
     candidates_of,
     load_candidates_of,
 )
-from mjfim.identification.extended_problems import extended_problem, with_residuals_of
+from mjfim.identification.extended_problems import (
+    extended_problem,
+    extended_system,
+    with_residuals_of,
+)
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.screened_terms import screened_terms
@@ -201,7 +205,7 @@ def _linearise(
         [f"?{i}.{k}" for k in range(len(candidate.tested))]
         for i, candidate in enumerate(candidates)
     ]
-    extended = _extended_system(problem.system, names, candidates)
+    extended = _with_candidates(problem.system, names, candidates)
     if extended is None:
         return None
 
@@ -218,11 +222,12 @@ def _linearise(
     return _normal_equations(condensed, columns)
 
 
-def _extended_system(
+def _with_candidates(
     system: System, names: Sequence[Sequence[str]], candidates: Sequence[Candidate]
 ) -> System | None:
     """The system with candidates as further parameters of given names; None where it is invalid."""
-    parameters, terms = {}, {}
+    parameters: dict[str, Any] = {}
+    terms: dict[str, Any] = {}
     for i, (of_candidate, candidate) in enumerate(zip(names, candidates, strict=True)):
         if candidate.added is not None:
             terms[f"?{i}"] = candidate.added.table
@@ -232,15 +237,7 @@ def _extended_system(
                 "guess": number.linearised_at,
                 "scale": number.size,
             }
-
-    try:
-        return System.resolve(
-            system.experiment.replace(parameters=parameters, terms=terms),
-            threads=system.threads,
-            source=system.source,
-        )
-    except (ExperimentError, ModelError):
-        return None
+    return extended_system(system, parameters, terms)
 
 
 def _path_under(name: str, candidate: Candidate, number: CandidateParameter) -> str:

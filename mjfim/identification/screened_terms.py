@@ -14,10 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.errors import ExperimentError, ModelError
 from mjfim.experiment.system import System
-from mjfim.identification.candidates import added_term, has_term, stated_joints
-from mjfim.identification.extended_problems import extended_problem
+from mjfim.identification.candidates import (
+    added_term,
+    has_term,
+    stated_joints,
+    targeted_paths,
+)
+from mjfim.identification.extended_problems import extended_problem, extended_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.elements import element_name
@@ -91,7 +95,7 @@ def _driven_joints(system: System) -> Iterator[ScalarJoint]:
     Without the inertia of a rotor in the model, an elastic joint would add one.
     """
     model: Any = system.model
-    targets = {target.path for p in system.parameters.parameters for target in p.targets}
+    targets = targeted_paths(system)
     joints = {
         int(model.actuator_trnid[actuator, 0])
         for actuator in range(model.nactuator)
@@ -120,7 +124,7 @@ def _screened(
 
     added = added_term(system, screening.kind, joint.name)
     path = f"term/{added.name}:{screening.field}"
-    extended = _extended_system(system, added, path)
+    extended = extended_system(system, {NAME: {"target": path}}, {added.name: added.table})
     if extended is None:
         return None
     wider, begin = extended_problem(problem, recordings, at, extended, differentiated=False)
@@ -154,20 +158,6 @@ def _screened(
         added=added,
         source=KINDS[screening.kind].sources[0],
     )
-
-
-def _extended_system(system: System, added: AddedTerm, path: str) -> System | None:
-    """The system with a term; None where the model cannot have it."""
-    try:
-        return System.resolve(
-            system.experiment.replace(
-                terms={added.name: added.table}, parameters={NAME: {"target": path}}
-            ),
-            threads=system.threads,
-            source=system.source,
-        )
-    except (ExperimentError, ModelError):
-        return None
 
 
 def _with_value(problem: FitProblem, at: UnknownValues, value: float) -> UnknownValues:

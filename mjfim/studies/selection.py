@@ -310,21 +310,18 @@ class _Selector:
             The chosen model, and why no more terms were added.
         """
         length = result.task.settings.segment_length
-        losses = self._losses(result, first.result)
-        if losses is None or length is None:
+        cut = self._assessed(model, first, result)
+        if cut is None or length is None:
             return replace(model, result=result), ending
 
-        words = f"segments of {length:.2g} s"
         steps.append(
             SelectionStep(
                 decision=Decision.SHORTENED,
-                description=words,
+                description=f"segments of {length:.2g} s",
                 count=len(model.terms),
-                error=losses.error,
+                error=cut.losses.error,
             )
         )
-        cost = result.problem.with_noise(first.result.problem.noise).cost(result.solution.unknowns)
-        cut = replace(model, result=result, losses=losses, cost=cost)
         stated = replace(first.result, task=with_length(first.result.task, length))
         return self._chosen(cut, replace(first, result=stated), steps)
 
@@ -574,21 +571,27 @@ class _Selector:
         task = FitTask.of(system, first.result.task.recordings, start=start)
         try:
             result = refit_task(self._search(task), model.result, self.workers)
-            losses = self._losses(result, first.result)
-            weighted = result.problem.with_noise(first.result.problem.noise)
+        except InterruptedPassError:
+            return None
+        return self._assessed(replace(model, terms=terms), first, result)
+
+    def _assessed(
+        self, model: FittedModel, first: FittedModel, result: FitResult
+    ) -> FittedModel | None:
+        """A model with a new fit, its losses and its cost; None after a request to stop.
+
+        Args:
+            model: The terms of the model, with an earlier fit.
+            first: The stated model, whose noise weights the cost.
+            result: The new fit.
+        """
+        losses = self._losses(result, first.result)
+        weighted = result.problem.with_noise(first.result.problem.noise)
+        try:
             cost = weighted.cost(result.solution.unknowns)
         except InterruptedPassError:
             return None
-        if losses is None:
-            return None
-        return FittedModel(
-            result=result,
-            losses=losses,
-            cost=cost,
-            terms=terms,
-            pooled=model.pooled,
-            held=model.held,
-        )
+        return None if losses is None else replace(model, result=result, losses=losses, cost=cost)
 
     def _candidates(self, model: FittedModel) -> tuple[MissingTerm, ...]:
         """Significant terms that the model lacks, the most promising one first."""
