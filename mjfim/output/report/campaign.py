@@ -7,7 +7,15 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.report.correlations import correlation_of_covariance
-from mjfim.output.report.curves import axis, correlation_panel, curve, dots, level, log_axis
+from mjfim.output.report.curves import (
+    axis,
+    correlation_panel,
+    curve,
+    dots,
+    error_bars,
+    level,
+    log_axis,
+)
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Plotly, Section
 from mjfim.output.summaries.campaign import describe_campaign
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
@@ -126,13 +134,7 @@ def _estimate_plots(campaign: Campaign, parameters: CampaignParameters) -> PlotG
         theta = np.array([r.estimate.theta[j] for r in campaign.rounds])
         std = np.array([r.attained[j] for r in campaign.rounds])
         trace = _joined(dots(numbers, theta, ESTIMATED, IDENTIFIED.word, size=7))
-        trace["error_y"] = {
-            "type": "data",
-            "array": [2.0 * float(s) if np.isfinite(s) else None for s in std],
-            "color": f"role:{IDENTIFIED.word}",
-            "thickness": 1.5,
-            "width": 5,
-        }
+        trace["error_y"] = error_bars(IDENTIFIED.word, 2.0 * std, thickness=1.5)
         guess = float(parameters.guess[j])
         reach = np.where(np.isfinite(std), 2.0 * std, 0.0)
         ends = np.concatenate([theta - reach, theta + reach, [guess]])

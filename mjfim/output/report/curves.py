@@ -221,6 +221,39 @@ def dots(
     return trace
 
 
+def error_bars(
+    role: str, above: Array, below: Array | None = None, *, width: int = 5, thickness: float = 2
+) -> Plotly:
+    """Error bars of a trace; values without a finite length have none.
+
+    Args:
+        role: Role of the colour.
+        above: Lengths of the bars above the values, and below them if no others are given.
+        below: Lengths of the bars below the values, or None.
+        width: Width of the caps [pixel].
+        thickness: Thickness of the lines [pixel].
+    """
+    lengths: Plotly = {"array": finite_or_null(above)}
+    if below is not None:
+        lengths = {"symmetric": False, **lengths, "arrayminus": finite_or_null(below)}
+    return {
+        "type": "data",
+        **lengths,
+        "color": f"role:{role}",
+        "thickness": thickness,
+        "width": width,
+    }
+
+
+def finite_or_null(values: Array) -> list[float | None]:
+    """Numbers for JSON, which has no NaN.
+
+    Args:
+        values: (n,) numbers.
+    """
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
 def rows_of_bars(
     values: Array, name: str, role: str, *, texts: Sequence[str], outside: bool = True
 ) -> Plotly:

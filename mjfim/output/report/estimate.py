@@ -19,6 +19,7 @@ from mjfim.output.report.curves import (
     correlation_panel,
     curve,
     dots,
+    error_bars,
     level,
     log_axis,
     row_axis,
@@ -186,15 +187,8 @@ def _interval_panel(estimate: Estimate, shown: Sequence[int]) -> Panel:
         texts.append(f"{text} (95 %: {left:.4g} to {right:.4g})" if known[row] else text)
 
     estimates = dots(centre, rows, WITH_INTERVAL, IDENTIFIED.word, size=9, texts=texts)
-    estimates["error_x"] = {
-        "type": "data",
-        "symmetric": False,
-        "array": _list(np.where(known, high - centre, np.nan)),
-        "arrayminus": _list(np.where(known, centre - low, np.nan)),
-        "color": f"role:{IDENTIFIED.word}",
-        "thickness": 2,
-        "width": 6,
-    }
+    above, below = (np.where(known, reach, np.nan) for reach in (high - centre, centre - low))
+    estimates["error_x"] = error_bars(IDENTIFIED.word, above, below, width=6)
     zero = dots(
         np.zeros(len(rows)), rows, NOMINAL.word, NOMINAL.word, size=12, symbol="line-ns-open"
     )
@@ -210,11 +204,6 @@ def _interval_panel(estimate: Estimate, shown: Sequence[int]) -> Panel:
         },
         height=rows_height(len(chosen), 44),
     )
-
-
-def _list(values: Array) -> list[float | None]:
-    """Return numbers for JSON, which has no NaN."""
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 # ---- predictions

@@ -14,6 +14,7 @@ from mjfim.output.report.curves import (
     correlation_panel,
     curve,
     dots,
+    error_bars,
     level,
     packed,
     row_axis,
@@ -91,15 +92,9 @@ def _efficiency_plot(study: MonteCarloStudy) -> PlotGroup:
             for j, parameter in enumerate(study.parameters)
         ]
         trace = dots(trials.efficiency, rows, shown_word(name), _role(name), size=8, texts=texts)
-        trace["error_x"] = {
-            "type": "data",
-            "symmetric": False,
-            "array": _list(high - trials.efficiency),
-            "arrayminus": _list(trials.efficiency - low),
-            "color": f"role:{_role(name)}",
-            "thickness": 2,
-            "width": 5,
-        }
+        trace["error_x"] = error_bars(
+            _role(name), high - trials.efficiency, trials.efficiency - low
+        )
         traces.append(trace)
     panel = Panel(
         title="efficiency of every estimate, with 95 % interval [–]",
@@ -115,11 +110,6 @@ def _efficiency_plot(study: MonteCarloStudy) -> PlotGroup:
     )
     note = "The dashed line is 1: the estimates scatter no more than the bound."
     return PlotGroup(title="", panels=[panel], keys=_keys(study, "dot"), note=note)
-
-
-def _list(values: Array) -> list[float | None]:
-    """Return numbers for JSON, which has no NaN."""
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _histograms(study: MonteCarloStudy, labels: list[str]) -> PlotGroup:

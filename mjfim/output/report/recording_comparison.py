@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.output.report.curves import axis, band, dots, level, row_axis, rows_height
+from mjfim.output.report.curves import (
+    axis,
+    band,
+    dots,
+    error_bars,
+    level,
+    row_axis,
+    rows_height,
+)
 from mjfim.output.report.page import Key, Panel, PlotGroup, Plotly, Section
 from mjfim.output.summaries.recording_comparison import describe_recordings
 from mjfim.output.vocabulary import DESIGNED, IDENTIFIED, MEASURED
@@ -92,11 +100,5 @@ def _intervals(
         for k, value, width in zip(members, values, reach, strict=True)
     ]
     trace = dots(values, np.array(members, dtype=float), name, role, size=8, texts=texts)
-    trace["error_x"] = {
-        "type": "data",
-        "array": [float(width) if np.isfinite(width) else None for width in reach],
-        "color": f"role:{role}",
-        "thickness": 2,
-        "width": 5,
-    }
+    trace["error_x"] = error_bars(role, reach)
     return trace

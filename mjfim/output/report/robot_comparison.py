@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.output.report.curves import axis, band, dots, level, row_axis, rows_height
+from mjfim.output.report.curves import (
+    axis,
+    band,
+    dots,
+    error_bars,
+    level,
+    row_axis,
+    rows_height,
+)
 from mjfim.output.report.page import Key, Page, Panel, PlotGroup, Section
 from mjfim.output.summaries.robot_comparison import describe_robots
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
@@ -62,15 +70,7 @@ def _differences(comparison: RobotComparison) -> PlotGroup:
         low, high = (comparison.interval[members] / size[members, None]).T
         texts = [comparison.sentence(j) for j in members]
         trace = dots(centre, rows, name, role, size=9, texts=texts)
-        trace["error_x"] = {
-            "type": "data",
-            "symmetric": False,
-            "array": [float(x) if np.isfinite(x) else None for x in high - centre],
-            "arrayminus": [float(x) if np.isfinite(x) else None for x in centre - low],
-            "color": f"role:{role}",
-            "thickness": 2,
-            "width": 6,
-        }
+        trace["error_x"] = error_bars(role, high - centre, centre - low, width=6)
         traces.append(trace)
 
     panel = Panel(
