@@ -10,6 +10,7 @@ import numpy as np
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.controller_tables import ControllerSpec
 from mjfim.experiment.schema import Experiment
+from mjfim.experiment.time_grid import possible_rates, whole_timesteps
 from mjfim.model.control_laws import (
     KINDS,
     ControlLaw,
@@ -24,9 +25,6 @@ from mjfim.model.coordinates import ScalarJoint, actuator_names
 from mjfim.model.loading import ModelSource
 from mjfim.model.servos import AT_JOINT
 from mjfim.model.units import per_second
-
-# A ratio of two rates counts as a whole number within this relative tolerance.
-RATE_TOLERANCE = 1e-6
 
 # Numbers of a law that give it an integral if they are parameters.
 INTEGRAL_NUMBERS = ("ki", "integral")
@@ -177,14 +175,12 @@ def _tick(experiment: Experiment, actuator: str, spec: ControllerSpec, timestep:
     Raises ExperimentError if this is not a whole number.
     """
     rate = spec.rate or experiment.rate
-    exact = 1.0 / (rate * timestep)
-    ticks = round(exact)
-    if ticks < 1 or abs(exact - ticks) > RATE_TOLERANCE * ticks:
-        valid = ", ".join(f"{1.0 / (k * timestep):g}" for k in (1, 2, 4, 5, 10))
+    ticks = whole_timesteps(rate, timestep)
+    if ticks is None:
         raise ExperimentError(
             f"controllers.{actuator}.rate: {rate:g} Hz does not divide the rate of the engine "
             f"({1.0 / timestep:g} Hz, timestep {timestep:g} s of the MJCF); valid for example: "
-            f"{valid} Hz"
+            f"{possible_rates(timestep)} Hz"
         )
     return ticks
 

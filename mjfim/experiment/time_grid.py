@@ -104,19 +104,37 @@ def noise_strides(experiment: Experiment) -> dict[str, int]:
     return strides
 
 
+def whole_timesteps(rate: float, timestep: float) -> int | None:
+    """Number of timesteps in a period; None if it is not a whole number.
+
+    Args:
+        rate: The rate [Hz].
+        timestep: The timestep [s].
+    """
+    ratio = 1.0 / (rate * timestep)
+    n = round(ratio)
+    return n if n >= 1 and abs(ratio - n) <= RATE_TOLERANCE * n else None
+
+
+def possible_rates(timestep: float) -> str:
+    """Some rates whose periods are whole numbers of timesteps [Hz], for a message.
+
+    Args:
+        timestep: The timestep [s].
+    """
+    return ", ".join(f"{1.0 / (k * timestep):g}" for k in (1, 2, 4, 5, 10))
+
+
 def _substeps(rate: float, timestep: float) -> int:
     """Engine steps per sample.
 
     Raises ExperimentError if a sample is not a whole number of timesteps [s], or too many of them.
     """
-    ratio = 1.0 / (rate * timestep)
-    n = round(ratio)
-
-    if n < 1 or abs(ratio - n) > RATE_TOLERANCE * n:
-        valid = ", ".join(f"{1.0 / (k * timestep):g}" for k in (1, 2, 4, 5, 10))
+    n = whole_timesteps(rate, timestep)
+    if n is None:
         raise ExperimentError(
             f"rate: at {rate:g} Hz, a sample is not a whole number of timesteps ({timestep:g} s); "
-            f"valid for example: {valid} Hz"
+            f"valid for example: {possible_rates(timestep)} Hz"
         )
     if n > MAX_SUBSTEPS:
         raise ExperimentError(

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from xml.parsers import expat
 
 from mjfim.errors import ModelError
-from mjfim.model.included_files import read_with_included_files
+from mjfim.model.included_files import read_elements, read_with_included_files
 from mjfim.model.model_files import FOLDERS
 
 # Factors of the letters with which MuJoCo states the size of the arena.
@@ -209,7 +208,7 @@ class _Parts:
             """Return to the number of repetitions outside an element."""
             factors.pop()
 
-        return included if _parse(path, start, end) else []
+        return included if read_elements(path, start, end) else []
 
     def _add_names(self, tag: str, attributes: Mapping[str, str], repeated: float) -> None:
         """Keep the names of other models and of the files of assets."""
@@ -250,20 +249,6 @@ def _size_of_element(tag: str, attributes: Mapping[str, str]) -> ModelSize:
     return ModelSize()
 
 
-def _parse(
-    path: Path, start: Callable[[str, dict[str, str]], None], end: Callable[[str], None]
-) -> bool:
-    """Read the elements of an XML file; False if it is not readable XML."""
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    try:
-        parser.Parse(path.read_bytes(), True)
-    except (expat.ExpatError, OSError):
-        return False
-    return True
-
-
 def _model_name(path: Path) -> str:
     """Name that a model gives itself, by which it can be attached."""
     names: list[str] = []
@@ -273,7 +258,7 @@ def _model_name(path: Path) -> str:
         if tag == "mujoco":
             names.append(attributes.get("model", ""))
 
-    _parse(path, start, lambda tag: None)
+    read_elements(path, start)
     return names[0] if names else ""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
+from xml.parsers import expat
 
 Context = TypeVar("Context")
 
@@ -28,6 +29,33 @@ def included_file(main: Path, including: Path, name: str) -> Path | None:
     """
     places = (main.parent / name, including.parent / name)
     return next((place for place in places if place.is_file()), None)
+
+
+def read_elements(
+    path: Path,
+    start: Callable[[str, dict[str, str]], None],
+    end: Callable[[str], None] | None = None,
+) -> bool:
+    """Read the elements of an XML file.
+
+    A file that is not readable is left to MuJoCo, which describes the fault.
+
+    Args:
+        path: The file.
+        start: Called with the name and the attributes of each element.
+        end: Called with its name where it ends; None where that does not matter.
+
+    Returns:
+        False if the file is not readable XML.
+    """
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    try:
+        parser.Parse(path.read_bytes(), True)
+    except (expat.ExpatError, OSError):
+        return False
+    return True
 
 
 def read_with_included_files(path: Path, context: Context, read: Reader[Context]) -> None:

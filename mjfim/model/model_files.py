@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from xml.parsers import expat
 
-from mjfim.model.included_files import read_with_included_files
+from mjfim.model.included_files import read_elements, read_with_included_files
 
 # Attributes of <compiler> that state the folder of meshes or images.
 FOLDERS = ("assetdir", "meshdir", "texturedir")
@@ -96,11 +95,4 @@ class _FileNames:
             if tag == "compiler":
                 self._folders.update(Path(attributes[key]) for key in FOLDERS if key in attributes)
 
-        parser = expat.ParserCreate()
-        parser.StartElementHandler = start
-        try:
-            parser.Parse(path.read_bytes(), True)
-        except (expat.ExpatError, OSError):
-            # MuJoCo describes the fault.
-            return []
-        return included
+        return included if read_elements(path, start) else []

@@ -6,9 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
-from xml.parsers import expat
 
-from mjfim.model.included_files import included_file, read_with_included_files
+from mjfim.model.included_files import (
+    included_file,
+    read_elements,
+    read_with_included_files,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,14 +93,7 @@ class _Attached:
             elif tag == "attach" and "model" in attributes:
                 self.attachments.append((attributes["model"], attributes.get("prefix", "")))
 
-        parser = expat.ParserCreate()
-        parser.StartElementHandler = start
-        try:
-            parser.Parse(path.read_bytes(), True)
-        except (expat.ExpatError, OSError):
-            # MuJoCo describes the fault.
-            return []
-        return included
+        return included if read_elements(path, start) else []
 
 
 def _names_of(attributes: dict[str, str], file: Path) -> Iterator[str]:
