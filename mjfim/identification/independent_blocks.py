@@ -52,7 +52,7 @@ class Blocks:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordingEvidence:
-    """What single recordings say about the s unknowns that all K recordings share.
+    """Evidence of single recordings about the s unknowns that all K recordings share.
 
     Unknowns that belong to a single recording are eliminated: they follow at their optimum.
 

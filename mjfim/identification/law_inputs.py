@@ -1,4 +1,4 @@
-"""What control laws read of a recording, on the sample grid."""
+"""Inputs that control laws read from a recording, on the sample grid."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ def _weighted_squares(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Information:
-    """What is known about s unknowns, possibly in some directions only.
+    """Knowledge about s unknowns, possibly in some directions only.
 
     Attributes:
         matrix: (s, s) information A.
@@ -161,7 +161,7 @@ class Information:
         return Information(matrix=self.matrix + other.matrix, vector=self.vector + other.vector)
 
     def with_scatter(self, tau2: Array) -> Information:
-        """What is known about the mean of recordings that scatter.
+        """Knowledge about the mean of recordings that scatter.
 
         The information is `(A^-1 + T)^-1 = A (1 + T A)^-1`, which exists for a singular A as well.
 

@@ -1,4 +1,4 @@
-"""What single recordings say alone, in coordinates in which all of them have unit information.
+"""Values and information of single recordings, in coordinates in which all of them have unit information.
 
 Recordings may determine some directions of the parameters only. The scatter of the scores within
 recordings says how far their information is too large.
@@ -25,7 +25,7 @@ UNKNOWN_SHARE = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordingViews:
-    """What single recordings say, in coordinates z in which all of them have unit information.
+    """Evidence of single recordings, in coordinates z in which all of them have unit information.
 
     Attributes:
         theta: (s,) estimate from all recordings, where z = 0; NaN for unknowns that they do not

@@ -13,7 +13,7 @@ from mjfim.plant.running_law import LawMemory
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InputContext:
-    """What a rollout with control laws needs beside the inputs of its samples.
+    """Inputs that a rollout with control laws needs beside those of its samples.
 
     Attributes:
         before: (m, L, w) inputs of the samples before the curves; none at the begin of recordings.
@@ -96,7 +96,7 @@ class InputContext:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoopTrace:
-    """What control laws have done along m curves of N samples.
+    """Record of control laws along m curves of N samples.
 
     Attributes:
         controls: (m, N, nu) controls at the begin of every sample [u-unit].

@@ -26,7 +26,7 @@ from mjfim.plant.law_numbers import LawNumbers, filter_shares
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LawMemory:
-    """What c laws with one period remember from one evaluation to the next, for m curves.
+    """Memory of c laws with one period from one evaluation to the next, for m curves.
 
     Attributes:
         held: (m, c) controls that the laws hold [u-unit].
@@ -144,7 +144,7 @@ class RunningLaws:
 
     @property
     def memory(self) -> LawMemory:
-        """What the laws remember now."""
+        """Present memory of the laws."""
         order = (self._latest + np.arange(len(self._positions))) % len(self._positions)
         return LawMemory(
             held=self.held,
@@ -275,7 +275,7 @@ def memory_at_begin(
     state: tuple[Array, Array],
     sums: Array | None,
 ) -> LawMemory:
-    """What laws remember where a curve begins.
+    """Memory of laws where a curve begins.
 
     Before it, the joints count as moving with their velocity at the begin. The control that is held
     up to the first tick is that of the law at the tick before, without a limit of its change.

@@ -54,7 +54,7 @@ UNDETERMINED_SHARE = 0.5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KnownRobot:
-    """What is known of a robot's parameters.
+    """Prior knowledge of a robot's parameters.
 
     Attributes:
         tables: Tables of its parameters, with guesses from the earlier estimate.
@@ -253,7 +253,7 @@ class PayloadTask:
     # ---- the robot
 
     def known_robot(self) -> KnownRobot:
-        """What the experiment and the earlier estimate state about the robot.
+        """Prior knowledge of the experiment and of the earlier estimate about the robot.
 
         Without an estimate, parameters with a stated prior are known by it, and the others are
         held.
@@ -276,7 +276,7 @@ class PayloadTask:
         )
 
     def _known_from(self, estimate: Estimate, covariance: Array) -> KnownRobot:
-        """What an estimate of the robot says.
+        """Prior knowledge from an estimate of the robot.
 
         Args:
             estimate: The estimate.
@@ -304,7 +304,7 @@ class PayloadTask:
         callback: Callback | None,
         token: StopToken,
     ) -> KnownRobot:
-        """What is known of the robot after recordings without the payload.
+        """Prior knowledge of the robot after recordings without the payload.
 
         Args:
             known: What is known before; without an earlier estimate, nothing but stated priors.

@@ -31,7 +31,7 @@ REPLACED_KEYS = ("guess", "prior", "cad_prior", "inertial", "coordinates", "scal
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PayloadPlace:
-    """Where a payload is fixed, and sizes of the robot from which its search starts.
+    """Place at which a payload is fixed, and sizes of the robot from which its search starts.
 
     Attributes:
         body: Name of the body that carries it.

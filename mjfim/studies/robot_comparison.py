@@ -116,7 +116,7 @@ class _Robot:
 
     @staticmethod
     def of(estimate: Estimate, parameters: Sequence[str], scatter: _Scatter) -> _Robot:
-        """What an estimate says about some of its parameters.
+        """Evidence of an estimate about some of its parameters.
 
         Args:
             estimate: The estimate.
