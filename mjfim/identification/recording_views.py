@@ -1,4 +1,4 @@
-"""Values and information of single recordings, in coordinates in which all of them have unit information.
+"""Values and information of single recordings, in coordinates with unit information of all of them.
 
 Recordings may determine some directions of the parameters only. The scatter of the scores within
 recordings says how far their information is too large.
