@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from enum import Enum
+from itertools import pairwise
 from math import isfinite
 from typing import Any
 
@@ -232,18 +233,32 @@ class Selection:
         return {"parameters": self.parameters, "terms": self.library_terms}
 
     @property
+    def phases(self) -> tuple[tuple[SelectionStep, ...], ...]:
+        """Kept steps in groups of comparable errors: whole recordings, then segments, if any."""
+        kept = [step for step in self.steps if step.is_kept]
+        begins = [i for i, step in enumerate(kept) if step.decision is Decision.SHORTENED]
+        edges = [0, *begins, len(kept)]
+        return tuple(tuple(kept[first:last]) for first, last in pairwise(edges))
+
+    @property
     def errors(self) -> tuple[float, float]:
-        """Held-out error of the stated and of the final model [sigma]."""
-        kept = [step.error for step in self.steps if step.is_kept]
-        return kept[0], kept[-1]
+        """Held-out error of the first and of the last model with comparable errors [sigma].
+
+        The first one is the stated model, or where recordings were cut into segments in the end,
+        the model that was chosen by whole recordings.
+        """
+        last = self.phases[-1]
+        return last[0].error, last[-1].error
 
     def __str__(self) -> str:
         before, after = self.errors
         words = ", ".join(term.description for term in self.terms)
         added = f"Added: {words}." if self.terms else "No term was added."
-        error = f"Held-out error {before:.3g} → {after:.3g} σ."
+        begin = self.phases[-1][0]
+        over = f" over {begin.description}" if begin.decision is Decision.SHORTENED else ""
+        error = f"Held-out error{over} {before:.3g} → {after:.3g} σ."
         if not (self.terms or self.pooled or self.held):
-            error = f"Held-out error {before:.3g} σ."
+            error = f"Held-out error{over} {before:.3g} σ."
         return " ".join([added, *self._simplifications, error, self.ending])
 
     @property

@@ -284,8 +284,22 @@ def selection_figure(size: Size) -> Figure:
         )
         added = dataclasses.replace(rejected, decision=Decision.ADDED, count=i + 1, error=error)
         steps += [rejected, added]
+
+    # Then terms are chosen over segments.
+    cut = SelectionStep(
+        decision=Decision.SHORTENED,
+        description="segments of 0.5 s",
+        count=size.joints,
+        error=0.6,
+    )
+    last = SelectionStep(
+        decision=Decision.ADDED, description="a delay", count=size.joints + 1, error=0.5
+    )
+    steps += [cut, last]
     ending = "No further term that was tested is significant."
     selection = Selection(terms=(), steps=tuple(steps), ending=ending)
+    assert selection.errors == (0.6, 0.5)
+    assert "over segments of 0.5 s 0.6" in str(selection)
     return plots.selection_figure(dataclasses.replace(estimate(size), selection=selection))
 
 

@@ -37,9 +37,13 @@ def selection_figure(estimate: Estimate) -> Figure:
 
     # A row for each kept step, the stated model on top; the crosses of a row are the terms that
     # were tried in its place.
-    errors = np.array([step.error for step in kept])
-    axes.plot(errors, np.arange(len(kept)), "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
-    right = LARGEST_DRAWN_RATIO * float(errors.max())
+    first = 0
+    for phase in selection.phases:
+        rows = first + np.arange(len(phase))
+        errors = [step.error for step in phase]
+        axes.plot(errors, rows, "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
+        first += len(phase)
+    right = LARGEST_DRAWN_RATIO * max(step.error for step in kept)
     row = 0
     for step in selection.steps:
         if step.is_kept:
@@ -64,6 +68,8 @@ def selection_figure(estimate: Estimate) -> Figure:
         "noise, the error is about 1 σ. A term is added if it lowers the mean loss of left-out "
         f"data by more than one standard error. {selection.ending}"
     )
+    if len(selection.phases) > 1:
+        note += " Errors over segments are not comparable with those over whole recordings above."
     style.add_title(figure, _title(estimate), handles, note)
     return figure
 
