@@ -269,9 +269,9 @@ def own_fits(tmp_path_factory, recording: Recording) -> Callable[[str], dict[str
 
 
 # All units change together in the fast tests, each of them alone in the slow ones.
-FAST_UNITS = [("stated start", COMBINED[0]), ("segments", COMBINED[1])]
+FAST_UNITS = [("segments", COMBINED[1])]
 UNITS_OF_FITS = [
-    *dict.fromkeys(FAST_UNITS),
+    *FAST_UNITS,
     *(
         pytest.param(path, name, marks=pytest.mark.slow)
         for path in FITS

@@ -32,6 +32,7 @@ def test_identify_leaves_its_files(home: Path, identified: Result) -> None:
 
 
 @pytest.mark.usefixtures("empty_figures")
+@pytest.mark.slow
 def test_identify_several_recordings(
     home: Path, study: Path, recorded: Path, identified: Result, tmp_path: Path
 ) -> None:
@@ -113,6 +114,7 @@ def test_stale_pictures_of_an_older_estimate_are_removed(
 
 
 @pytest.mark.usefixtures("empty_figures")
+@pytest.mark.slow
 def test_drawn_robots(study: Path, recorded: Path, tmp_path: Path) -> None:
     """A table and a model for each robot; the next run into the folder replaces or removes them."""
     out = tmp_path / "fit"
@@ -143,6 +145,7 @@ def test_drawn_robots(study: Path, recorded: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("empty_figures")
+@pytest.mark.slow
 def test_no_robots_are_drawn_from_undetermined_parameters(
     study: Path, recorded: Path, tmp_path: Path
 ) -> None:

@@ -78,6 +78,7 @@ def asked(file: Path, *answers: str) -> Result:
     return run(*words, answers="".join(f"{each}\n" for each in answers))
 
 
+@pytest.mark.slow
 def test_enter_takes_what_init_proposes_without_questions(tmp_path: Path) -> None:
     assert asked(tmp_path / "asked.toml", *[""] * 5).exit_code == 0
     assert run("init", MODELS / "cart_pendulum.xml", "-o", tmp_path / "silent.toml").exit_code == 0

@@ -19,6 +19,7 @@ from tests.support.cli import (
 
 
 @pytest.mark.usefixtures("no_files")
+@pytest.mark.slow
 def test_reports_name_the_parameters(
     study: Path, recorded: Path, archived: Path, tmp_path: Path
 ) -> None:

@@ -450,6 +450,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     assert np.isfinite(results[1].cost)
 
 
+@pytest.mark.slow
 def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> None:
     """The design equals that without limits.
 
@@ -524,6 +525,7 @@ def test_limits_that_are_not_enforced_may_be_violated_while_the_boundary_holds(
     assert len(said) == 1 and "checked, not enforced" in said[0]
 
 
+@pytest.mark.slow
 def test_the_stated_tolerance_ends_the_last_stage_once_the_limits_hold(tmp_path: Path) -> None:
     """With a tolerance above every slope, a run ends at the first feasible iterate."""
     descent = {"max_iterations": 80, "tolerance": 100.0, "coarse": 1}
@@ -678,6 +680,7 @@ def test_an_interrupted_multistart_keeps_the_best_so_far(tmp_path: Path) -> None
     assert len(early.starts) == 1
 
 
+@pytest.mark.slow
 def test_a_fourier_start_is_optimised_as_a_series_in_the_first_round(tmp_path: Path) -> None:
     task = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
     starts = list(initial_controls_of(task, None))
@@ -742,6 +745,7 @@ def standstill(task: DesignTask) -> Array:
     return np.array(data.qfrc_inverse) / np.array([40.0, 25.0])
 
 
+@pytest.mark.slow
 def test_a_design_from_rest_to_rest_begins_and_ends_with_the_holding_control(
     tmp_path: Path,
 ) -> None:
@@ -762,6 +766,7 @@ def test_a_design_from_rest_to_rest_begins_and_ends_with_the_holding_control(
     )
 
 
+@pytest.mark.slow
 def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
     """Its control does not jump between repetitions, and its state returns to the first one."""
     task, design = arm_design(

@@ -191,6 +191,7 @@ def test_a_design_that_knows_its_nuisance_parameters_beats_one_that_does_not(
     np.testing.assert_allclose(aware.final.eigenvalues, seen, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_design_for_one_combination_determines_it_better_than_one_for_all(tmp_path: Path) -> None:
     wanted = {"criterion": "c", "combination": {"m": 1.0, "l": -1.0}, "control": 1e-3}
     task = cart_task(tmp_path, horizon=1.0, cost=wanted)

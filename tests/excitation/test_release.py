@@ -145,6 +145,7 @@ def test_a_request_to_stop_before_the_first_release_leaves_the_stated_one(tmp_pa
     assert len(design.history) == 1
 
 
+@pytest.mark.slow
 def test_an_optimum_at_the_end_of_a_range_is_said(tmp_path: Path) -> None:
     design = mjfim.design(
         short(tmp_path, horizon=0.3, initial={"free": {"qpos:hinge": (-1.0, 1.0)}})

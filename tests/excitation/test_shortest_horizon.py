@@ -148,6 +148,7 @@ def test_messages_about_faulty_requests_name_valid_values() -> None:
         mjfim.shortest_experiment(wanting(SIGMA), longest=0.01)
 
 
+@pytest.mark.slow
 def test_a_stopped_search_returns_the_shortest_so_far() -> None:
     stop = StopToken()
     horizons: list[str] = []
@@ -175,6 +176,7 @@ def test_a_search_that_is_stopped_in_its_first_design_returns_it() -> None:
     assert "σ of m is" in str(found)
 
 
+@pytest.mark.slow
 def test_a_duration_without_a_measurement_does_not_reach() -> None:
     """One measurement in 1.4 s: shorter experiments measure nothing."""
     loose = wanting(dict.fromkeys(SIGMA, 10.0), measure_rate=100.0 / 140.0)

@@ -70,6 +70,7 @@ def is_found(system: System, estimate: Estimate) -> bool:
     return bool(near.all() and estimate.success and not estimate.misfit)
 
 
+@pytest.mark.slow
 def test_a_wrong_start_finds_the_truth_over_many_swings(tmp_path: Path) -> None:
     system = pendulum(tmp_path, 12.0, fit={"bootstrap": 0, "max_iterations": 15})
     recording = swings(system, 12.0)

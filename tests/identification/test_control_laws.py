@@ -243,6 +243,7 @@ def test_a_fit_on_workers_is_the_same_to_the_last_digit(
     assert np.array_equal(found.blocks, condensed.blocks)
 
 
+@pytest.mark.slow
 def test_a_check_of_a_log_knows_the_law() -> None:
     """Gain of the motor and gains of the law have one effect, which no reference tells apart."""
     motor = {"target": "actuator/shoulder:gainprm[0]", "guess": 1.0}
@@ -472,6 +473,7 @@ def test_a_seven_joint_arm_with_feedforward(tmp_path: Path) -> None:
     assert len(found.controllers) == 7
 
 
+@pytest.mark.slow
 def test_a_law_acts_on_a_motor_with_a_lag() -> None:
     """No log shows what a law commands, so that the state of the lag is free in every segment."""
     terms = {"lag": {"kind": "actuator_lag", "actuator": "shoulder"}}

@@ -51,6 +51,7 @@ def made_study(**changes: object) -> HorizonStudy:
     return HorizonStudy(**values)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_nothing_is_compared_where_the_model_explains_the_recordings() -> None:
     found = mjfim.identify(stated(), recorded(0.0, 2))
     assert not found.misfit

@@ -69,6 +69,7 @@ def errors(fit: InverseDynamicsFit, true: Array) -> Array:
     return np.abs(fit.theta - true) / np.where(true != 0.0, np.abs(true), 1.0)
 
 
+@pytest.mark.slow
 def test_cart_pendulum_is_found_from_starts_wrong_by_ten(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
     true = System.resolve(experiment).parameters.guess
@@ -94,6 +95,7 @@ def test_positions_or_velocities_are_enough(measured: tuple[str, ...], tmp_path:
     assert errors(fit, true).max() < 0.03
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_stated_accuracy(tmp_path: Path) -> None:
     experiment = cart(tmp_path)
     true = System.resolve(experiment).parameters.guess

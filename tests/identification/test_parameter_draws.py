@@ -89,6 +89,7 @@ def test_wide_intervals_stretch_the_formal_covariance(system: System) -> None:
     np.testing.assert_allclose(found, COVARIANCE * np.outer(factor, factor), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
     """The damping ends at its lower bound, and cannot be negative."""
     bounded = estimated(

@@ -51,7 +51,7 @@ def some_fast(kinds: Iterable[str], fast: Collection[str]) -> list[Any]:
     return [pytest.param(k, marks=[] if k in fast else pytest.mark.slow) for k in kinds]
 
 
-@pytest.mark.parametrize("kind", some_fast(KINDS, {"asymmetric_friction", "actuator_lag", "tilt"}))
+@pytest.mark.parametrize("kind", some_fast(KINDS, {"actuator_lag", "tilt"}))
 def test_a_term_is_identified_from_a_log(tmp_path: Path, kind: str) -> None:
     guesses = GUESSES.get(kind, {})
     parameters = {field: {"guess": value} for field, value in guesses.items()}
@@ -147,6 +147,7 @@ def solution_near(problem: FitProblem, theta: Any) -> Any:
 
 
 @pytest.mark.parametrize("kind", some_fast(MISSED, {"stribeck"}))
+@pytest.mark.slow
 def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind: str) -> None:
     stated, robot = without_term(tmp_path, kind)
     logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]

@@ -78,6 +78,7 @@ def test_joint_experiments_do_not_take_round_off_for_information(tmp_path) -> No
     assert direction @ design.data @ direction < 1e-9 * np.abs(design.data).max()
 
 
+@pytest.mark.slow
 def test_earlier_information_of_a_design_leaves_every_sigma_known(tmp_path) -> None:
     task = pendulum(tmp_path)
     design = design_task(task)

@@ -210,6 +210,7 @@ def test_histogram_is_a_density() -> None:
 
 
 @pytest.mark.parametrize("survivors", [0, 1])
+@pytest.mark.slow
 def test_histogram_is_drawn_when_nearly_all_trials_fail(survivors: int, tmp_path: Path) -> None:
     study = make_study(2, failed=200 - survivors)
     render(plots.histogram(study, 1, make_labels(2, 2)), tmp_path)
@@ -267,6 +268,7 @@ def test_zero_parameter_has_no_relative_accuracy(tmp_path: Path) -> None:
     render(figure, tmp_path)
 
 
+@pytest.mark.slow
 def test_convergence_of_empty_short_and_negative_histories(tmp_path: Path) -> None:
     design = make_design()
     negative = tuple(dataclasses.replace(row, cost=-1.0, slope=0.0) for row in design.history)
@@ -307,6 +309,7 @@ def test_fit_draws_data_residuals_and_band() -> None:
     assert "±2σ" in all_text(figure)
 
 
+@pytest.mark.slow
 def test_fit_without_measurements_of_an_output(tmp_path: Path) -> None:
     estimate = make_estimate()
     y = estimate.recordings[0].y.copy()

@@ -275,7 +275,12 @@ def test_a_fit_keeps_its_iterates_its_segments_and_the_nominal_model(
 
 
 @pytest.mark.parametrize(
-    ("ending", "start"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")]
+    ("ending", "start"),
+    [
+        ("png", b"\x89PNG"),
+        pytest.param("svg", b"<?xml", marks=pytest.mark.slow),
+        pytest.param("pdf", b"%PDF", marks=pytest.mark.slow),
+    ],
 )
 def test_plot_writes_the_format_that_the_file_names(
     robustness: Robustness, ending: str, start: bytes, tmp_path: Path

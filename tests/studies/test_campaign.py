@@ -268,6 +268,7 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
 
 
+@pytest.mark.slow
 def test_recorded_rounds_are_not_repeated(campaign: Campaign) -> None:
     """The next design of a continued campaign is that of an uninterrupted one."""
     first = campaign.rounds[0]

@@ -147,6 +147,7 @@ def test_a_control_that_violates_limits_is_shrunk_until_it_is_feasible() -> None
     assert (nothing.outcome, nothing.control) == (MethodOutcome.NONE, None)
 
 
+@pytest.mark.slow
 def test_the_designs_control_is_never_shrunk() -> None:
     task, found = DesignTask.resolve(pendulum()), small().rows[2]
     assert found.control is not None

@@ -202,6 +202,7 @@ def test_proposals_scale_with_the_size_of_the_robot(
     assert [each.name for each in other.chosen] == [each.name for each in small.chosen]
 
 
+@pytest.mark.slow
 def test_a_urdf_gets_motors_and_keeps_its_limits(tmp_path: Path) -> None:
     path = tmp_path / "two.urdf"
     path.write_text(URDF, encoding="utf-8")
@@ -462,6 +463,7 @@ def test_the_driven_joints_of_a_robot_on_the_floor_may_stay_where_they_are() -> 
     assert choose_start(model).drift <= standing.drift < 0.1 * reference.drift
 
 
+@pytest.mark.slow
 def test_the_horizon_ends_where_a_small_disturbance_has_grown_too_much(tmp_path: Path) -> None:
     # Seen from this small drone, a slight tilt soon leads far away.
     path = tmp_path / "drone.xml"

@@ -36,6 +36,7 @@ def recorded(
     return [simulate_system(task.system, task.initial, begin + seed) for seed in range(count)]
 
 
+@pytest.mark.slow
 def test_the_missing_term_is_added_and_nothing_else(tmp_path: Path) -> None:
     logs = recorded(tmp_path, 'frictionloss="0.5"', count=3)
     *fitted, kept = logs
