@@ -79,7 +79,10 @@ def continued_fit(
         SimulationDivergedError: The simulation diverges at the solution of the first fit.
     """
     kept = _better_of_two(search, problem, first, null_space)
-    found = search.over_roughness(kept.problem, kept.solution)
+
+    # The first fit was judged before it has converged.
+    found = search.converged(kept.problem, kept.solution)
+    found = search.over_roughness(*found)
     if found[1] is kept.solution:
         return kept
     return replace(kept, problem=found[0], solution=found[1], quality=fit_quality(*found))

@@ -410,7 +410,7 @@ def _first_fit(
     try:
         begin = search.best_start(problem, begin)
         if not search.interrupted() or len(searched) == count:
-            return problem, subset, search.solve(problem, begin)
+            return problem, subset, search.solve(problem, begin, is_judged=True)
     except InterruptedPassError:
         pass
 

@@ -70,8 +70,12 @@ INITIAL_STATE_ROUGH_SHARE = 0.01
 
 # Decrease of the cost, as a share of it, that a last step over the first data may still bring, and
 # that share where the stated noise is estimated afterwards.
-FIRST_ROUGH_SHARE = 1e-3
+FIRST_ROUGH_SHARE = 1e-2
 ROUGH_SHARE = 0.1
+
+# Decrease of the cost, as a share of it, that a last step may bring in a fit to much data that is
+# judged before it goes on: another start may lead to a lower minimum.
+JUDGED_ROUGH_SHARE = 1e-3
 
 # Decrease of the cost, as a share of it, that a last step may bring in a fit that is only compared
 # with others by its predictions. They differ by far more.
@@ -240,6 +244,7 @@ class FitSearch:
         max_iterations: int | None = None,
         *,
         is_rough: bool = False,
+        is_judged: bool = False,
         cost_to_beat: float = np.inf,
     ) -> tuple[FitProblem, Solution]:
         """Search over all data.
@@ -254,6 +259,8 @@ class FitSearch:
             max_iterations: Largest number of iterations, if it is below that of the settings.
             is_rough: True for a fit whose predictions alone count, which hardly change any more
                 long before the search converges.
+            is_judged: True for a fit that is judged before it converges (`converged`). With much
+                data, it ends near the minimum.
             cost_to_beat: Cost with the stated noise above which a minimum is of no use, so that
                 the search for it ends early.
 
@@ -270,6 +277,8 @@ class FitSearch:
             )
         if self.task.noise_is_stated:
             settings = replace(settings, cost_to_beat=cost_to_beat)
+            if is_judged and self._is_much(problem):
+                settings = replace(settings, rough_share=JUDGED_ROUGH_SHARE)
             return problem, self._minimise(problem, begin, settings, phase)
         if self.task.settings.loss != "linear":
             return self._solve_in_turn_with_noise(problem, begin, max_iterations, phase)
@@ -301,6 +310,31 @@ class FitSearch:
         weighted = likelihood.linearised
         cost = completed(partial(likelihood.cost_of_squares, weighted.noise, found.unknowns))
         return weighted, replace(found, cost=cost, iterates=(*first.iterates, *found.iterates[1:]))
+
+    def converged(self, problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
+        """Continue a search that ended near the minimum because it was judged first.
+
+        Args:
+            problem: Problem of all segments.
+            solution: Where the search ended.
+
+        Returns:
+            The problem and its solution, unchanged after a search that ended otherwise.
+        """
+        if not solution.rough or self.interrupted():
+            return problem, solution
+
+        settings = replace(self._final_settings(problem), begins_near=True)
+        try:
+            found = self._minimise(problem, solution.unknowns, settings, "all data")
+        except InterruptedPassError:
+            return problem, replace(solution, interrupted=True)
+        except SimulationDivergedError:
+            return problem, _without_neighbourhood(solution)
+        iterates = (*solution.iterates, *found.iterates[1:])
+        return problem, replace(
+            found, iterates=iterates, iterations=solution.iterations + found.iterations
+        )
 
     def _solve_in_turn_with_noise(
         self, problem: FitProblem, begin: UnknownValues, max_iterations: int | None, phase: str
@@ -387,8 +421,7 @@ class FitSearch:
             begins_near=self.begins_near,
             in_true_deviations=True,
         )
-        samples = problem.sample_count * 2 * len(self.task.system.parameters)
-        if samples < SAMPLES_OF_MUCH_DATA:
+        if not self._is_much(problem):
             return settings
 
         # A search over a part of the data has led near the minimum, where there is such a part.
@@ -401,6 +434,11 @@ class FitSearch:
             next_step_length=next_step_length,
             begins_near=self.begins_near or next_step_length is not None,
         )
+
+    def _is_much(self, problem: FitProblem) -> bool:
+        """Whether one linearisation of a problem takes long."""
+        samples = problem.sample_count * 2 * len(self.task.system.parameters)
+        return samples >= SAMPLES_OF_MUCH_DATA
 
     def with_initial_states(
         self,

@@ -225,6 +225,7 @@ class Solution:
         iterates: The begin and all accepted values, with the private unknowns of the first segment
             only.
         stuck: True where no step lowered the cost, although the linearisation predicts one.
+        rough: True where the search ended near the minimum, by `SearchSettings.rough_share`.
     """
 
     unknowns: UnknownValues
@@ -236,6 +237,7 @@ class Solution:
     interrupted: bool = False
     iterates: tuple[UnknownValues, ...] = ()
     stuck: bool = False
+    rough: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -428,7 +430,7 @@ class _Search:
             return self._finished(trial.step)
         if trial.fraction == 1.0 and self._is_near(predicted):
             self.condensed = self.condensed.after(trial.step)
-            return self._solution("near the minimum", success=True)
+            return replace(self._solution("near the minimum", success=True), rough=True)
         if futile:
             return self._solution("stopped: another minimum costs less", success=False)
         if self._needs_no_relinearisation(trial, predicted):
