@@ -46,7 +46,7 @@ SIGNIFICANCE = 1e-3
 # Smallest share of the sum of squared residuals that a reported term explains.
 MIN_EXPLAINED_SHARE = 2e-3
 
-# Largest number of numbers that are tested.
+# Largest number of numbers that one linearisation tests; more of them are tested in groups.
 MAX_TESTED = 100
 
 # Largest number of terms that are reported.
@@ -111,9 +111,9 @@ def find_missing_terms(
     """
     system = problem.system
     groups = [
-        _affordable(list(candidates_of(system, _typical_speeds(problem, at)))),
+        *in_groups(list(candidates_of(system, _typical_speeds(problem, at)))),
         # Contacts would slow down all simulations of the other candidates.
-        _affordable(list(load_candidates_of(system))),
+        *in_groups(list(load_candidates_of(system))),
     ]
     problem, at = _affordable_data(problem, at, groups)
 
@@ -130,7 +130,8 @@ def _affordable_data(
 ) -> tuple[FitProblem, UnknownValues]:
     """The segments on which groups of candidates are tested, and their unknowns."""
     tested = [sum(len(each.tested) for each in candidates) for candidates in groups]
-    columns = problem.layout.column_count + problem.simulation.private_count + max(tested)
+    largest = max(tested, default=0)
+    columns = problem.layout.column_count + problem.simulation.private_count + largest
     count = len(problem.segments)
     wanted = max(int(MAX_SIMULATED * count / (problem.sample_count * columns)), 1)
     if wanted >= count:
@@ -152,8 +153,6 @@ def _by_score(
     # Of the variants of one term, the most significant one stands for it.
     found: dict[str, MissingTerm] = {}
     for candidates in groups:
-        if not candidates:
-            continue
         linearisation = _linearise(problem, recordings, at, candidates)
         if linearisation is None:
             continue
@@ -165,10 +164,30 @@ def _by_score(
     return list(found.values())
 
 
-def _affordable(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """The first candidates, of which not too many numbers have to be tested."""
-    counts = np.cumsum([len(candidate.tested) for candidate in candidates])
-    return list(candidates[: int(np.searchsorted(counts, MAX_TESTED, side="right"))])
+def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Divide candidates into groups that are linearised one after the other.
+
+    They are about equally large, because the largest one decides how many data all are tested on.
+
+    Args:
+        candidates: The candidates.
+
+    Returns:
+        The groups, in the order of the candidates, with at most `MAX_TESTED` numbers each.
+    """
+    total = sum(len(candidate.tested) for candidate in candidates)
+    count = max(-(-total // MAX_TESTED), 1)
+    most = -(-total // count)
+
+    groups: list[list[Candidate]] = []
+    size = most
+    for candidate in candidates:
+        size += len(candidate.tested)
+        if size > most:
+            groups.append([])
+            size = len(candidate.tested)
+        groups[-1].append(candidate)
+    return groups
 
 
 def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:
