@@ -13,7 +13,7 @@ are screened by simulations with some of their values (`mjfim/identification/scr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,17 +27,17 @@ from mjfim.identification.candidates import (
     candidates_of,
     load_candidates_of,
 )
+from mjfim.identification.data_parts import part_of_data
 from mjfim.identification.extended_problems import (
     extended_problem,
     extended_system,
     with_residuals_of,
 )
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.screened_terms import screened_terms
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.records.missing_term import MissingTerm, TermParameter
+from mjfim.records.missing_term import MissingTerm, TermParameter, TermTestData
 from mjfim.records.recording import Recording
 
 # Probability, over all candidates, that one is reported although the model is complete.
@@ -68,7 +68,7 @@ INVERSE_TOLERANCE = 1e-12
 SMALLEST_NORM = 1e-300
 
 # Largest number of samples that a linearisation by parameters and candidates simulates, over all of
-# its differences. With more data, segments that are spread over them are enough for the tests.
+# its differences. With more data, a part of every recording is enough for the tests.
 MAX_SIMULATED = 400_000
 
 # Samples of the motion from which the speeds of the joints are taken.
@@ -96,18 +96,36 @@ class _Linearisation:
     inverse: Array
 
 
+@dataclass(frozen=True, kw_only=True)
+class TermTests:
+    """Result of the tests of all terms that a model may lack.
+
+    Attributes:
+        terms: The significant terms, most significant first.
+        data: The data on which they were tested; None where no test was possible.
+    """
+
+    terms: tuple[MissingTerm, ...] = ()
+    data: TermTestData | None = None
+
+    @property
+    def remark(self) -> str:
+        """Sentence about the tested data, with a space before it; empty where that is all data."""
+        return "" if self.data is None or self.data.is_complete else f" {self.data}"
+
+
 def find_missing_terms(
     problem: FitProblem, recordings: Sequence[Recording], at: UnknownValues
-) -> tuple[MissingTerm, ...]:
+) -> TermTests:
     """Terms that would explain significant residuals.
 
     Args:
-        problem: The least-squares problem of some segments.
+        problem: The least-squares problem, of which a part is tested where there are much data.
         recordings: All recordings.
         at: Solution of the problem.
 
     Returns:
-        The terms, most significant first; empty where no term is significant.
+        The terms, and the data on which they were tested.
     """
     system = problem.system
     groups = [
@@ -115,29 +133,27 @@ def find_missing_terms(
         # Contacts would slow down all simulations of the other candidates.
         *in_groups(list(load_candidates_of(system))),
     ]
-    problem, at = _affordable_data(problem, at, groups)
+    part = part_of_data(problem, _affordable_samples(problem, groups))
+    tested, at = part.problem, part.unknowns(at)
 
-    squares = 2.0 * problem.cost(at)
-    found = _by_score(problem, recordings, at, squares, groups)
-    found += screened_terms(problem, recordings, at, squares)
+    squares = 2.0 * tested.cost(at)
+    found = _by_score(tested, recordings, at, squares, groups)
+    found += screened_terms(tested, recordings, at, squares)
 
     wanted = [term for term in found if term.share > MIN_EXPLAINED_SHARE]
-    return tuple(_by_significance(wanted)[:MAX_NAMED_TERMS])
+    return TermTests(
+        terms=tuple(_by_significance(wanted)[:MAX_NAMED_TERMS]),
+        data=TermTestData(
+            share=part.share, recordings=part.recording_count, count=len(problem.recordings)
+        ),
+    )
 
 
-def _affordable_data(
-    problem: FitProblem, at: UnknownValues, groups: Sequence[Sequence[Candidate]]
-) -> tuple[FitProblem, UnknownValues]:
-    """The segments on which groups of candidates are tested, and their unknowns."""
+def _affordable_samples(problem: FitProblem, groups: Sequence[Sequence[Candidate]]) -> float:
+    """Number of samples on which groups of candidates are tested, at most."""
     tested = [sum(len(each.tested) for each in candidates) for candidates in groups]
-    largest = max(tested, default=0)
-    columns = problem.layout.column_count + problem.simulation.private_count + largest
-    count = len(problem.segments)
-    wanted = max(int(MAX_SIMULATED * count / (problem.sample_count * columns)), 1)
-    if wanted >= count:
-        return problem, at
-    chosen = spread_over_data(count, wanted)
-    return problem.of_segments(chosen), replace(at, private=at.private[chosen])
+    of_problem = problem.layout.column_count + problem.simulation.private_count
+    return MAX_SIMULATED / (of_problem + max(tested, default=0))
 
 
 def _by_score(

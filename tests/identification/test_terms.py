@@ -156,7 +156,7 @@ def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind
     system = System.resolve(stated)
     problem = FitProblem.of(system, logs)
     at = solution_near(problem, system.parameters.guess)
-    found = find_missing_terms(problem, logs, at)
+    found = find_missing_terms(problem, logs, at).terms
 
     # Score tests are linear, so that a selection of terms compares fits with the first ones.
     compared = [t for t in found if t.sigmas**2 >= SIMILAR_SHARE * found[0].sigmas ** 2]
@@ -189,7 +189,7 @@ def test_a_complete_model_with_terms_lacks_none(tmp_path: Path) -> None:
     logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
     problem = FitProblem.of(System.resolve(whole), logs)
     at = solution_near(problem, [0.01, 0.0105, 0.02, 0.03])
-    assert find_missing_terms(problem, logs, at) == ()
+    assert find_missing_terms(problem, logs, at).terms == ()
 
 
 def test_a_term_with_several_numbers_has_one_test() -> None:
@@ -211,11 +211,11 @@ def test_many_candidates_are_tested_in_groups(
     logs = [recorded(robot, motor_torque(1.5, RATE, 0, size=0.08), 0)]
     problem = FitProblem.of(System.resolve(stated), logs)
     at = solution_near(problem, problem.system.parameters.guess)
-    whole = find_missing_terms(problem, logs, at)
+    whole = find_missing_terms(problem, logs, at).terms
     assert "output:delay" in {term.path for term in whole}
 
     monkeypatch.setattr(missing_terms, "MAX_TESTED", 4)
-    in_groups = find_missing_terms(problem, logs, at)
+    in_groups = find_missing_terms(problem, logs, at).terms
     assert [term.path for term in in_groups] == [term.path for term in whole]
     for part, complete in zip(in_groups, whole, strict=True):
         assert part.sigmas == pytest.approx(complete.sigmas, rel=0.02)
