@@ -65,7 +65,9 @@ class MissingTerm:
         value: Estimated value of that parameter [unit].
         unit: Its unit; may be empty.
         sigmas: `value` divided by its standard deviation; for a term with several parameters, the
-            size of the deviation of a normal variable with the same probability.
+            size of the deviation of a normal variable with the same probability. For an elastic
+            joint or backlash, the root of the reduction of the sum of squares by the best of a few
+            values, which is no probability.
         share: Fraction of the sum of squared residuals that the term explains, 0 to 1.
         further: Further parameters that belong to the term.
         added: Table of the library of terms that it needs; None for a number of the model.
