@@ -142,3 +142,22 @@ def test_a_term_that_the_first_recording_does_not_show_is_found(
     assert found.data.recordings == 4
     assert 0.4 < found.data.share <= 0.5
     assert "term/pivot_asymmetric_friction:offset" in {term.path for term in found.terms}
+
+
+@pytest.mark.slow
+def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = experiment_of(tmp_path, "tilt", fit={"bootstrap": 0})
+    system = System.resolve(experiment)
+    logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in (0, 1)]
+    monkeypatch.setattr(missing_terms, "_affordable_samples", lambda *_: 100)
+    found = mjfim.select_terms(experiment, logs)
+    assert not found.misfit
+    words = "Terms that the model may lack were tested on 25 % of the data, from all 2 recordings."
+    assert found.selection is not None
+    assert found.selection.ending == f"No further term that was tested is significant. {words}"
+    assert str(found.tested_data) == words
+
+    found.save(tmp_path / "out")
+    assert mjfim.Estimate.load(tmp_path / "out").tested_data == found.tested_data
