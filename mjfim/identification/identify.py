@@ -25,7 +25,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.fit_start import begin_fit
 from mjfim.identification.fit_workers import FitWorkers
-from mjfim.identification.horizons import choose_horizon, with_length
+from mjfim.identification.horizons import HorizonChoice, choose_horizon, with_length
 from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import NEWTON, FitSearch
@@ -59,6 +59,10 @@ SHARES_THAT_DETERMINE = (0.2, 0.5)
 # A smaller share that is tried first where it has enough segments.
 SMALL_SHARE = 0.05
 SEGMENTS_OF_SMALL_SHARE = 3
+
+# Reasons for an estimate over whole recordings, although segments predict left-out data better.
+DIVERGED = "the fit over this length diverged"
+STOPPED = "the search was stopped before the fit over this length was complete"
 
 Callback = Callable[[FitEvent], None]
 
@@ -267,8 +271,10 @@ def _over_chosen_length(
     choice = choose_horizon(search, problem, fit, result.null_space)
     if choice is None:
         return result
-    if choice.length is None or search.interrupted():
+    if choice.length is None:
         return replace(result, horizons=choice.study)
+    if search.interrupted():
+        return _not_over_length(result, choice, STOPPED)
 
     task = with_length(search.task, choice.length)
     cut, held_out = _problems(task, workers)
@@ -277,18 +283,32 @@ def _over_chosen_length(
     try:
         begin = chosen.with_initial_states(cut, cut.begin(choice.theta))
         weighted, solution = chosen.solve(cut, begin, f"segments of {choice.length:.2g} s")
-    except (InterruptedPassError, SimulationDivergedError):
-        return replace(result, horizons=choice.study)
+        quality = fit_quality(weighted, solution)
+    except InterruptedPassError:
+        return _not_over_length(result, choice, STOPPED)
+    except SimulationDivergedError:
+        return _not_over_length(result, choice, DIVERGED)
     return replace(
         result,
         task=replace(task, start=result.task.start),
         problem=weighted,
         solution=solution,
-        quality=fit_quality(weighted, solution),
+        quality=quality,
         held_out=held_out,
         subset=quick_subset(cut),
         horizons=choice.study,
     )
+
+
+def _not_over_length(result: FitResult, choice: HorizonChoice, reason: str) -> FitResult:
+    """The fit over whole recordings, in place of one over the chosen length.
+
+    Args:
+        result: The fit.
+        choice: The chosen length.
+        reason: Why there is no fit over it, in words.
+    """
+    return replace(result, horizons=replace(choice.study, why_not_used=reason))
 
 
 def refit_task(search: FitSearch, near: FitResult, workers: FitWorkers | None = None) -> FitResult:

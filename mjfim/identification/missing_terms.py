@@ -13,7 +13,7 @@ are screened by simulations with some of their values (`mjfim/identification/scr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,17 +27,17 @@ from mjfim.identification.candidates import (
     candidates_of,
     load_candidates_of,
 )
+from mjfim.identification.data_parts import part_of_data
 from mjfim.identification.extended_problems import (
     extended_problem,
     extended_system,
     with_residuals_of,
 )
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.next_step import spread_over_data
 from mjfim.identification.screened_terms import screened_terms
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.records.missing_term import MissingTerm, TermParameter
+from mjfim.records.missing_term import MissingTerm, TermParameter, TermTestData
 from mjfim.records.recording import Recording
 
 # Probability, over all candidates, that one is reported although the model is complete.
@@ -46,7 +46,7 @@ SIGNIFICANCE = 1e-3
 # Smallest share of the sum of squared residuals that a reported term explains.
 MIN_EXPLAINED_SHARE = 2e-3
 
-# Largest number of numbers that are tested.
+# Largest number of numbers that one linearisation tests; more of them are tested in groups.
 MAX_TESTED = 100
 
 # Largest number of terms that are reported.
@@ -68,7 +68,7 @@ INVERSE_TOLERANCE = 1e-12
 SMALLEST_NORM = 1e-300
 
 # Largest number of samples that a linearisation by parameters and candidates simulates, over all of
-# its differences. With more data, segments that are spread over them are enough for the tests.
+# its differences. With more data, a part of every recording is enough for the tests.
 MAX_SIMULATED = 400_000
 
 # Samples of the motion from which the speeds of the joints are taken.
@@ -96,47 +96,64 @@ class _Linearisation:
     inverse: Array
 
 
+@dataclass(frozen=True, kw_only=True)
+class TermTests:
+    """Result of the tests of all terms that a model may lack.
+
+    Attributes:
+        terms: The significant terms, most significant first.
+        data: The data on which they were tested; None where no test was possible.
+    """
+
+    terms: tuple[MissingTerm, ...] = ()
+    data: TermTestData | None = None
+
+    @property
+    def remark(self) -> str:
+        """Sentence about the tested data, with a space before it; empty where that is all data."""
+        return "" if self.data is None or self.data.is_complete else f" {self.data}"
+
+
 def find_missing_terms(
     problem: FitProblem, recordings: Sequence[Recording], at: UnknownValues
-) -> tuple[MissingTerm, ...]:
+) -> TermTests:
     """Terms that would explain significant residuals.
 
     Args:
-        problem: The least-squares problem of some segments.
+        problem: The least-squares problem, of which a part is tested where there are much data.
         recordings: All recordings.
         at: Solution of the problem.
 
     Returns:
-        The terms, most significant first; empty where no term is significant.
+        The terms, and the data on which they were tested.
     """
     system = problem.system
     groups = [
-        _affordable(list(candidates_of(system, _typical_speeds(problem, at)))),
+        *in_groups(list(candidates_of(system, _typical_speeds(problem, at)))),
         # Contacts would slow down all simulations of the other candidates.
-        _affordable(list(load_candidates_of(system))),
+        *in_groups(list(load_candidates_of(system))),
     ]
-    problem, at = _affordable_data(problem, at, groups)
+    part = part_of_data(problem, _affordable_samples(problem, groups))
+    tested, at = part.problem, part.unknowns(at)
 
-    squares = 2.0 * problem.cost(at)
-    found = _by_score(problem, recordings, at, squares, groups)
-    found += screened_terms(problem, recordings, at, squares)
+    squares = 2.0 * tested.cost(at)
+    found = _by_score(tested, recordings, at, squares, groups)
+    found += screened_terms(tested, recordings, at, squares)
 
     wanted = [term for term in found if term.share > MIN_EXPLAINED_SHARE]
-    return tuple(_by_significance(wanted)[:MAX_NAMED_TERMS])
+    return TermTests(
+        terms=tuple(_by_significance(wanted)[:MAX_NAMED_TERMS]),
+        data=TermTestData(
+            share=part.share, recordings=part.recording_count, count=len(problem.recordings)
+        ),
+    )
 
 
-def _affordable_data(
-    problem: FitProblem, at: UnknownValues, groups: Sequence[Sequence[Candidate]]
-) -> tuple[FitProblem, UnknownValues]:
-    """The segments on which groups of candidates are tested, and their unknowns."""
+def _affordable_samples(problem: FitProblem, groups: Sequence[Sequence[Candidate]]) -> float:
+    """Number of samples on which groups of candidates are tested, at most."""
     tested = [sum(len(each.tested) for each in candidates) for candidates in groups]
-    columns = problem.layout.column_count + problem.simulation.private_count + max(tested)
-    count = len(problem.segments)
-    wanted = max(int(MAX_SIMULATED * count / (problem.sample_count * columns)), 1)
-    if wanted >= count:
-        return problem, at
-    chosen = spread_over_data(count, wanted)
-    return problem.of_segments(chosen), replace(at, private=at.private[chosen])
+    of_problem = problem.layout.column_count + problem.simulation.private_count
+    return MAX_SIMULATED / (of_problem + max(tested, default=0))
 
 
 def _by_score(
@@ -152,8 +169,6 @@ def _by_score(
     # Of the variants of one term, the most significant one stands for it.
     found: dict[str, MissingTerm] = {}
     for candidates in groups:
-        if not candidates:
-            continue
         linearisation = _linearise(problem, recordings, at, candidates)
         if linearisation is None:
             continue
@@ -165,10 +180,30 @@ def _by_score(
     return list(found.values())
 
 
-def _affordable(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """The first candidates, of which not too many numbers have to be tested."""
-    counts = np.cumsum([len(candidate.tested) for candidate in candidates])
-    return list(candidates[: int(np.searchsorted(counts, MAX_TESTED, side="right"))])
+def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Divide candidates into groups that are linearised one after the other.
+
+    They are about equally large, because the largest one decides how many data all are tested on.
+
+    Args:
+        candidates: The candidates.
+
+    Returns:
+        The groups, in the order of the candidates, with at most `MAX_TESTED` numbers each.
+    """
+    total = sum(len(candidate.tested) for candidate in candidates)
+    count = max(-(-total // MAX_TESTED), 1)
+    most = -(-total // count)
+
+    groups: list[list[Candidate]] = []
+    size = most
+    for candidate in candidates:
+        size += len(candidate.tested)
+        if size > most:
+            groups.append([])
+            size = len(candidate.tested)
+        groups[-1].append(candidate)
+    return groups
 
 
 def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:

@@ -30,7 +30,7 @@ from mjfim.identification.flipped_signs import (
     sufficient_squares,
 )
 from mjfim.identification.laws_in_loop import laws_in_loop
-from mjfim.identification.missing_terms import find_missing_terms
+from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
 from mjfim.identification.recording_comparison import compare_recordings
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
@@ -47,7 +47,6 @@ from mjfim.records.estimate import (
 )
 from mjfim.records.horizons import HorizonStudy
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
-from mjfim.records.missing_term import MissingTerm
 from mjfim.records.progress import begin_stage
 from mjfim.records.recording import Recording
 from mjfim.records.recording_comparison import RecordingComparison
@@ -128,7 +127,7 @@ class _Findings:
         quality: Size and whiteness of the residuals.
         accuracy: Accuracy of theta.
         comparison: Comparison of the recordings, or None.
-        missing: Terms that the model may lack.
+        tests: Tests of terms that the model may lack.
         reasons: Reasons for a misfit, in sentences; empty where there is none.
         at_bound: Names of the parameters at a bound or beyond it.
         outside: True where a parameter is beyond a bound.
@@ -141,7 +140,7 @@ class _Findings:
     quality: FitQuality
     accuracy: Accuracy
     comparison: RecordingComparison | None
-    missing: tuple[MissingTerm, ...]
+    tests: TermTests
     reasons: tuple[str, ...]
     at_bound: tuple[str, ...]
     outside: bool
@@ -170,11 +169,11 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
 
     # Optional parts, each of which takes about as long as a search.
     begin_stage("looking for terms that the model lacks")
-    missing = _missing_terms(result, quality, budget)
+    tests = _term_tests(result, quality, budget)
     predictions = _predictions(result, budget)
 
     reasons = misfit_reasons(
-        quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, missing
+        quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, tests.terms
     )
     begin_stage("computing the intervals")
     accuracy = result.accuracy
@@ -191,7 +190,7 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
         quality=quality,
         accuracy=accuracy,
         comparison=comparison,
-        missing=missing,
+        tests=tests,
         reasons=reasons,
         at_bound=at_bound,
         outside=outside,
@@ -215,24 +214,19 @@ def _unpredictable(result: FitResult, is_poor: bool) -> UnpredictableMotion | No
     return unpredictable_motion(result.problem, solution.unknowns)
 
 
-def _missing_terms(
-    result: FitResult, quality: FitQuality, budget: Budget
-) -> tuple[MissingTerm, ...]:
-    """Terms that the model may lack.
+def _term_tests(result: FitResult, quality: FitQuality, budget: Budget) -> TermTests:
+    """Tests of terms that the model may lack.
 
     There are none where the fit is too poor for the test, and none after a request to stop.
     """
+    tests = TermTests()
     if budget.stop.requested or quality.unexplained:
-        return ()
+        return tests
 
-    # With much data, a subset is enough for the test.
-    unknowns = result.solution.unknowns
-    at = replace(unknowns, private=unknowns.private[result.subset])
-    problem = result.problem.of_segments(result.subset)
-    missing: tuple[MissingTerm, ...] = ()
     with suppress(InterruptedPassError):
-        missing = find_missing_terms(problem, result.task.recordings, at)
-    return () if budget.stop.requested else missing
+        unknowns = result.solution.unknowns
+        tests = find_missing_terms(result.problem, result.task.recordings, unknowns)
+    return TermTests() if budget.stop.requested else tests
 
 
 def _flipped_signs(result: FitResult, quality: FitQuality, budget: Budget) -> tuple[str, ...]:
@@ -336,7 +330,8 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         reasons=findings.reasons,
         whiteness=quality.whiteness,
         sloppy=tuple(name for name, _ in accuracy.poorly_known),
-        missing_terms=findings.missing,
+        missing_terms=findings.tests.terms,
+        tested_data=findings.tests.data,
         per_recording=per_recording,
         worst_residual=quality.worst_residual if findings.reasons else None,
         predictions=predictions,
@@ -432,7 +427,7 @@ def _warnings(findings: _Findings) -> Iterator[str]:
         yield str(findings.quality.worst_residual)
     if findings.reasons:
         yield from _warnings_of_rate(result)
-    for term in findings.missing:
+    for term in findings.tests.terms:
         yield f"the model may lack {term}"
 
     yield from _implausible_estimates(result.task.system.parameters, result.theta)

@@ -14,7 +14,7 @@ from mjfim.records.control_law import ControlLawInLoop
 from mjfim.records.horizons import HorizonStudy
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
-from mjfim.records.missing_term import MissingTerm
+from mjfim.records.missing_term import MissingTerm, TermTestData
 from mjfim.records.parameter_draws import ParameterDraws
 from mjfim.records.payload import PayloadEstimate
 from mjfim.records.prior_directions import PriorDirections
@@ -72,6 +72,8 @@ class Estimate(ShownRecord):
         predictions: Prediction errors on data that were not fitted.
         sloppy: Names of the parameters whose interval is wide compared with their size.
         missing_terms: Terms missing in the model that would explain the residuals.
+        tested_data: The data on which such terms were tested; None where none were, because of a
+            poor fit or a request to stop, and in records of earlier versions.
         per_recording: Values for each recording of the parameters that differ between recordings;
             `theta` holds their values for the first recording.
         robust_uncertainty: Robust uncertainty of the common unknowns, or None.
@@ -161,6 +163,7 @@ class Estimate(ShownRecord):
     recording_comparison: RecordingComparison | None = None
     prior_directions: PriorDirections | None = None
     payload: PayloadEstimate | None = None
+    tested_data: TermTestData | None = None
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -246,6 +249,7 @@ class Estimate(ShownRecord):
             "whiteness": [test.summary() for test in self.whiteness],
             "per_recording": self.per_recording,
             "suspects": [term.summary() for term in self.missing_terms],
+            "suspects_tested": None if self.tested_data is None else self.tested_data.summary(),
             "std_sandwich": self.std_sandwich,
             "interval": self.interval,
             "between_recordings": self.between_recordings,

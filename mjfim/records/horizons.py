@@ -13,14 +13,17 @@ from mjfim.records.combinations import join_names
 # Ratio of the errors over the longest and the shortest horizon above which they grow.
 GROWTH = 1.2
 
+# Smallest error in a denominator.
+SMALLEST_ERROR = 1e-150
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HorizonStudy:
     """Fits over segments of different lengths, and how well each predicts left-out data.
 
-    Each fit predicts parts of the data from the others, over times of each length. The length whose
-    predictions are best over all these times is chosen; of several that are equally good, it is the
-    longest one, whose estimates are the most accurate.
+    Each fit predicts parts of the data from the others, over times of each length. The longest
+    length is chosen whose predictions over all these times are not clearly worse than the best
+    ones, because longer segments give more accurate estimates.
 
     Attributes:
         lengths: (L,) lengths of the segments, which are the prediction horizons as well [s]. The
@@ -36,6 +39,8 @@ class HorizonStudy:
             estimates without each part of the data [theta-unit].
         is_apart: (L, p) whether an estimate differs from that of the chosen length by more than
             chance explains.
+        why_not_used: Why the estimate is over whole recordings although segments were chosen, in
+            words; empty where it is over the chosen length.
     """
 
     lengths: Array
@@ -47,6 +52,7 @@ class HorizonStudy:
     theta: Array
     half_widths: Array
     is_apart: Array
+    why_not_used: str = ""
 
     def __post_init__(self) -> None:
         """Freeze the arrays."""
@@ -63,6 +69,19 @@ class HorizonStudy:
         columns = np.flatnonzero(np.asarray(self.is_apart, dtype=bool).any(axis=0))
         return tuple(self.parameters[j] for j in columns)
 
+    @property
+    def is_used(self) -> bool:
+        """Whether the estimate is over the chosen length."""
+        return not self.why_not_used
+
+    @property
+    def relative_errors(self) -> Array:
+        """(L,) error of each fit over the smallest one in each horizon, as root mean square."""
+        errors = np.asarray(self.errors)
+        least = np.where(np.isfinite(errors), errors, np.inf).min(axis=0)
+        ratios = errors / np.maximum(least, SMALLEST_ERROR)
+        return np.asarray(np.sqrt(np.mean(ratios**2, axis=1)))
+
     def name_of(self, index: int) -> str:
         """A length in words.
 
@@ -76,33 +95,49 @@ class HorizonStudy:
     def widened(self, interval: Array) -> Array:
         """Intervals that also hold the estimates of other lengths that chance does not explain.
 
+        Where the estimate is not over the chosen length, they hold the one over it as well.
+
         Args:
-            interval: (p, 2) intervals of the fit over the chosen length [theta-unit].
+            interval: (p, 2) intervals of the estimate [theta-unit].
 
         Returns:
             (p, 2) intervals.
         """
-        apart = np.asarray(self.is_apart, dtype=bool)
+        apart = np.array(self.is_apart, dtype=bool)
+        if not self.is_used:
+            apart[self.chosen] = apart.any(axis=0)
         low = np.where(apart, self.theta, np.inf).min(axis=0)
         high = np.where(apart, self.theta, -np.inf).max(axis=0)
         return np.column_stack([np.minimum(interval[:, 0], low), np.maximum(interval[:, 1], high)])
 
     def __str__(self) -> str:
-        return " ".join([self.about_choice, self.about_growth, *self.findings])
+        uses = () if self.is_used else (self.about_use,)
+        return " ".join([self.about_choice, *uses, self.about_growth, *self.findings])
 
     @property
     def about_choice(self) -> str:
         """Sentence that says which length was chosen."""
         first, last = self.lengths[0], self.lengths[-1]
-        mean = np.exp(np.log(np.maximum(self.errors, 1e-300)).mean(axis=1))
+        ratios = self.relative_errors
         text = (
-            f"The model does not explain the recordings, so the length of the segments matters: "
-            f"{self.name_of(self.chosen)} were chosen, whose fit predicts left-out data best over "
-            f"times of {first:.2g} to {last:.2g} s (mean error {mean[self.chosen]:.3g} σ"
+            "The model does not explain the recordings, so the length of the segments matters: "
+            f"{self.name_of(self.chosen)} were chosen, the longest ones whose predictions of "
+            f"left-out data over times of {first:.2g} to {last:.2g} s are not clearly worse than "
+            f"the best (error over the smallest one for each time: {ratios[self.chosen]:.3g}"
         )
         others = [i for i in range(len(self.lengths)) if i != self.chosen]
-        listed = [f"{mean[i]:.3g} σ with {self.name_of(i)}" for i in others]
+        listed = [f"{ratios[i]:.3g} with {self.name_of(i)}" for i in others]
         return f"{text}, {join_names(listed)})."
+
+    @property
+    def about_use(self) -> str:
+        """Sentence that says why the estimate is over whole recordings; empty where it is not."""
+        if self.is_used:
+            return ""
+        return (
+            f"The estimate is over whole recordings, not over {self.name_of(self.chosen)}: "
+            f"{self.why_not_used}."
+        )
 
     @property
     def about_growth(self) -> str:
@@ -145,6 +180,7 @@ class HorizonStudy:
             "lengths": self.lengths.tolist(),
             "errors": self.errors.tolist(),
             "chosen": self.chosen,
+            "is_used": self.is_used,
             "is_whole": self.is_whole,
             "theta": self.theta.tolist(),
             "half_widths": self.half_widths.tolist(),

@@ -65,7 +65,9 @@ class MissingTerm:
         value: Estimated value of that parameter [unit].
         unit: Its unit; may be empty.
         sigmas: `value` divided by its standard deviation; for a term with several parameters, the
-            size of the deviation of a normal variable with the same probability.
+            size of the deviation of a normal variable with the same probability. For an elastic
+            joint or backlash, the root of the reduction of the sum of squares by the best of a few
+            values, which is no probability.
         share: Fraction of the sum of squared residuals that the term explains, 0 to 1.
         further: Further parameters that belong to the term.
         added: Table of the library of terms that it needs; None for a number of the model.
@@ -110,6 +112,50 @@ class MissingTerm:
         if self.added is not None:
             found["terms"] = {self.added.name: self.added.table}
         return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class TermTestData:
+    """The data on which terms were tested that a model may lack.
+
+    Attributes:
+        share: Share of the samples of all fitted recordings, 0 to 1.
+        recordings: Number of recordings with tested samples.
+        count: Number of all fitted recordings.
+    """
+
+    share: float
+    recordings: int
+    count: int
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the terms were tested on all data."""
+        return self.share >= 1.0
+
+    @property
+    def amount(self) -> str:
+        """The data in words."""
+        if self.is_complete:
+            return "all data"
+        share = f"{100 * self.share:.2g} % of the data"
+        if self.count == 1:
+            return f"{share}, the first part of the recording"
+        if self.recordings == self.count:
+            return f"{share}, from all {self.count} recordings"
+        return f"{share}, from {self.recordings} of {self.count} recordings"
+
+    def __str__(self) -> str:
+        return f"Terms that the model may lack were tested on {self.amount}."
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of `suspects_tested` in estimate.json."""
+        return {
+            "share": self.share,
+            "recordings": self.recordings,
+            "of_recordings": self.count,
+            "words": str(self),
+        }
 
 
 def toml_table(section: str, added: AddedTerm) -> str:

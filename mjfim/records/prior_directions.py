@@ -36,7 +36,7 @@ class PriorDirections:
         bodies = first_ones(self.bodies, ", ", NAMES_TEXT)
         text = (
             f"The recordings determine {self.determined} of {self.count} combinations of the "
-            f"inertial parameters of {bodies} (the base parameters). The other "
+            f"inertial parameters of {bodies}. The other "
             f"{self.count - self.determined} keep the values of the model within `cad_prior`, "
             "which is an assumption and no measurement"
         )

@@ -24,7 +24,7 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction, held_out_losses
 from mjfim.identification.horizons import with_length
 from mjfim.identification.identify import Callback, fit_task, refit_task
-from mjfim.identification.missing_terms import find_missing_terms
+from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import FitSearch
 from mjfim.identification.task import FitTask
@@ -340,11 +340,12 @@ class _Selector:
         """
         while len(model.terms) < self.max_terms:
             begin_stage(f"looking for term {len(model.terms) + 1} that the model lacks")
-            candidates = self._candidates(model)
+            tests = self._term_tests(model)
+            candidates = tests.terms
             if self._is_stopped():
                 return model, "The selection was interrupted."
             if not candidates:
-                return model, "No further term that was tested is significant."
+                return model, f"No further term that was tested is significant.{tests.remark}"
 
             # The most promising terms are tried first, and the others if these do not help.
             most = candidates[0].share
@@ -356,7 +357,8 @@ class _Selector:
             if self._is_stopped():
                 return model, "The selection was interrupted."
             if better is None:
-                return model, "No further term predicts left-out data clearly better."
+                text = "No further term predicts left-out data clearly better."
+                return model, text + tests.remark
             model = better
         return model, f"{self.max_terms} terms were added, the largest number."
 
@@ -593,16 +595,15 @@ class _Selector:
             return None
         return None if losses is None else replace(model, result=result, losses=losses, cost=cost)
 
-    def _candidates(self, model: FittedModel) -> tuple[MissingTerm, ...]:
+    def _term_tests(self, model: FittedModel) -> TermTests:
         """Significant terms that the model lacks, the most promising one first."""
         result = model.result
-        unknowns = result.solution.unknowns
-        at = replace(unknowns, private=unknowns.private[result.subset])
-        problem = result.problem.of_segments(result.subset)
         try:
-            return find_missing_terms(problem, result.task.recordings, at)
+            return find_missing_terms(
+                result.problem, result.task.recordings, result.solution.unknowns
+            )
         except InterruptedPassError:
-            return ()
+            return TermTests()
 
     def _losses(self, result: FitResult, first: FitResult) -> HeldOutLosses | None:
         """Losses of the predictions of left-out data; None after a request to stop."""

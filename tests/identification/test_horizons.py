@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import mjfim
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.held_out_losses import HeldOutLosses
-from mjfim.identification.horizons import _chosen
+from mjfim.identification.horizons import HorizonChoice, _chosen, choose_horizon
+from mjfim.identification.identify import DIVERGED
+from mjfim.identification.searches import FitSearch
+from mjfim.output.summaries.horizons import describe_horizons
 from mjfim.records.horizons import HorizonStudy
 from mjfim.records.recording import Recording
 from tests.support.paths import ROOT
@@ -126,6 +132,12 @@ def test_a_dependence_on_the_length_is_a_finding_that_the_interval_covers() -> N
     interval = study.widened(np.array([[92.0, 96.0], [9.0, 13.0]]))
     np.testing.assert_array_equal(interval, [[83.0, 96.0], [9.0, 13.0]])
 
+    # The errors are those by which lengths are compared: relative to the smallest of each horizon.
+    expected = [np.sqrt((1.0 + (8.0 / 6.0) ** 2) / 2.0), np.sqrt((1.2**2 + 1.0) / 2.0)]
+    np.testing.assert_allclose(study.relative_errors, expected)
+    assert "not clearly worse than the best" in study.about_choice
+    assert "each time: 1.1, 1.18 with segments of 0.5 s)" in study.about_choice
+
     # Without a dependence, nothing is widened and nothing is found.
     plain = made_study(is_apart=np.zeros((2, 2), dtype=bool))
     assert plain.findings == ()
@@ -135,3 +147,51 @@ def test_a_dependence_on_the_length_is_a_finding_that_the_interval_covers() -> N
 def test_an_error_that_does_not_grow_is_not_said_to_add_up() -> None:
     flat = made_study(errors=np.array([[3.0, 3.2], [3.1, 3.3]]))
     assert "does not add up" in flat.about_growth
+
+
+def test_an_estimate_that_is_not_over_the_chosen_length_covers_it() -> None:
+    study = made_study(chosen=0, is_apart=np.array([[False, False], [True, False]]))
+    assert study.is_used
+    assert study.about_use == ""
+    interval = np.array([[92.0, 96.0], [10.5, 13.0]])
+    np.testing.assert_array_equal(study.widened(interval), [[92.0, 96.0], [10.5, 13.0]])
+
+    # The estimate over whole recordings differs from that of the chosen length.
+    unused = replace(study, why_not_used=DIVERGED)
+    assert not unused.summary()["is_used"]
+    np.testing.assert_array_equal(unused.widened(interval), [[83.0, 96.0], [10.5, 13.0]])
+    assert unused.about_use == (
+        "The estimate is over whole recordings, not over segments of 0.5 s: "
+        "the fit over this length diverged."
+    )
+    assert unused.about_use in str(unused)
+    parts = describe_horizons(unused)
+    assert any(unused.about_use == getattr(part, "text", "") for part in parts)
+
+
+@pytest.mark.slow
+def test_a_failed_fit_over_the_chosen_length_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The estimate is over whole recordings where segments were chosen but cannot be fitted."""
+    solve = FitSearch.solve
+    choose = choose_horizon
+
+    def chosen_segments(*arguments: Any) -> HorizonChoice:
+        choice = choose(*arguments)
+        assert choice is not None
+        study = replace(choice.study, chosen=0)
+        return replace(choice, study=study, length=float(study.lengths[0]), theta=study.theta[0])
+
+    def failing(
+        search: FitSearch, problem: Any, begin: Any, phase: str = "", *others: Any, **settings: Any
+    ) -> Any:
+        if not phase.startswith("segments of"):
+            return solve(search, problem, begin, phase, *others, **settings)
+        raise SimulationDivergedError("it diverges")
+
+    monkeypatch.setattr("mjfim.identification.identify.choose_horizon", chosen_segments)
+    monkeypatch.setattr(FitSearch, "solve", failing)
+    found = mjfim.identify(stated(), recorded(0.6, 2))
+    assert found.horizons is not None
+    assert not found.horizons.is_used
+    assert found.horizons.why_not_used == DIVERGED
+    assert all(len(begins) == 1 for begins in found.segments)

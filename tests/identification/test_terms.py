@@ -14,7 +14,9 @@ import scipy
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.identification import missing_terms
 from mjfim.identification.aligned_recording import align
+from mjfim.identification.candidates import Candidate, CandidateParameter
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.known_activations import KnownActivations
 from mjfim.identification.missing_terms import equivalent_sigmas, find_missing_terms
@@ -154,7 +156,7 @@ def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind
     system = System.resolve(stated)
     problem = FitProblem.of(system, logs)
     at = solution_near(problem, system.parameters.guess)
-    found = find_missing_terms(problem, logs, at)
+    found = find_missing_terms(problem, logs, at).terms
 
     # Score tests are linear, so that a selection of terms compares fits with the first ones.
     compared = [t for t in found if t.sigmas**2 >= SIMILAR_SHARE * found[0].sigmas ** 2]
@@ -187,7 +189,7 @@ def test_a_complete_model_with_terms_lacks_none(tmp_path: Path) -> None:
     logs = [recorded(robot, motor_torque(1.5, RATE, seed, size=0.08), seed) for seed in (0, 1)]
     problem = FitProblem.of(System.resolve(whole), logs)
     at = solution_near(problem, [0.01, 0.0105, 0.02, 0.03])
-    assert find_missing_terms(problem, logs, at) == ()
+    assert find_missing_terms(problem, logs, at).terms == ()
 
 
 def test_a_term_with_several_numbers_has_one_test() -> None:
@@ -198,3 +200,37 @@ def test_a_term_with_several_numbers_has_one_test() -> None:
         assert scipy.special.log_ndtr(-sigmas) + np.log(2.0) == pytest.approx(expected, rel=1e-9)
     assert equivalent_sigmas(25.0, 1) == 5.0
     assert equivalent_sigmas(25.0, 3) < 5.0
+
+
+@pytest.mark.slow
+def test_many_candidates_are_tested_in_groups(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A delay is the last candidate; it was left out where others used all tested numbers."""
+    stated, robot = without_term(tmp_path, "actuator_lag")
+    logs = [recorded(robot, motor_torque(1.5, RATE, 0, size=0.08), 0)]
+    problem = FitProblem.of(System.resolve(stated), logs)
+    at = solution_near(problem, problem.system.parameters.guess)
+    whole = find_missing_terms(problem, logs, at).terms
+    assert "output:delay" in {term.path for term in whole}
+
+    monkeypatch.setattr(missing_terms, "MAX_TESTED", 4)
+    in_groups = find_missing_terms(problem, logs, at).terms
+    assert [term.path for term in in_groups] == [term.path for term in whole]
+    for part, complete in zip(in_groups, whole, strict=True):
+        assert part.sigmas == pytest.approx(complete.sigmas, rel=0.02)
+
+
+@pytest.mark.parametrize("counts", [[], [1], [3] * 40, [1] * 100, [1] * 101, [1, 3, 1] * 41])
+def test_groups_hold_all_candidates_in_their_order(counts: list[int]) -> None:
+    number = CandidateParameter(
+        path="p", unit="", positive=False, value=0.0, linearised_at=0.0, size=1.0
+    )
+    candidates = [
+        Candidate(description=str(i), tested=(number,) * count) for i, count in enumerate(counts)
+    ]
+    groups = missing_terms.in_groups(candidates)
+    sizes = [sum(len(each.tested) for each in group) for group in groups]
+    assert [each for group in groups for each in group] == candidates
+    assert max(sizes, default=0) <= missing_terms.MAX_TESTED
+    assert len(groups) <= sum(counts) // missing_terms.MAX_TESTED + 1

@@ -26,6 +26,7 @@ from mjfim.output.video import Video
 from mjfim.records.campaign import CampaignStatus
 from mjfim.records.check import Check
 from mjfim.records.design import Design, LimitUsage, Status
+from mjfim.records.missing_term import TermTestData
 from mjfim.records.serialization import write_json
 from mjfim.records.shown import ShownRecord
 from tests.support import results
@@ -409,6 +410,14 @@ def test_a_missing_term_is_the_first_next_step() -> None:
     estimate = results.estimate(misfit=True, missing_terms=(results.missing_term(),))
     assert "joint/hinge:frictionloss" in next_steps(estimate)[0]
     assert "<h2>Missing terms</h2>" in rendered(page_of(estimate))
+
+    # Where only a part of the data was tested, the page says so.
+    part = replace(estimate, tested_data=TermTestData(share=0.17, recordings=4, count=4))
+    text = rendered(page_of(part)).replace("\xa0", " ")
+    assert "residuals (17 % of the data, from all 4 recordings)" in text
+    assert "were tested on 17 % of the data, from all 4 recordings." in text
+    assert part.summary()["suspects_tested"]["share"] == 0.17
+    assert estimate.summary()["suspects_tested"] is None
 
 
 def test_the_correlation_of_parameters_that_are_identifiable_alone() -> None:

@@ -73,11 +73,12 @@ def _title(study: HorizonStudy) -> str:
     """Return the outcome in a sentence."""
     name = study.name_of(study.chosen)
     chosen = f"{name[0].upper()}{name[1:]}"
+    outcome = f"{chosen} were chosen" if study.is_used else f"{chosen} were chosen, but not used"
     if not study.dependent:
-        return f"{chosen} predict best"
+        return outcome
     names = ", ".join(study.dependent[:MAX_PARAMETERS])
     verb = "depends" if len(study.dependent) == 1 else "depend"
-    return f"{chosen} predict best; {names} {verb} on the length"
+    return f"{outcome}; {names} {verb} on the length"
 
 
 def _draw_errors(axes: Axes, study: HorizonStudy) -> None:

@@ -617,4 +617,6 @@ def _trace_plots(estimate: Estimate) -> PlotGroup | None:
 def _missing_terms(estimate: Estimate) -> Listing:
     """Return the terms that the model may lack."""
     items = tuple(str(term) for term in estimate.missing_terms)
-    return Listing(title="Terms that would explain a part of the residuals", items=items)
+    tested = estimate.tested_data
+    data = "" if tested is None or tested.is_complete else f" ({tested.amount})"
+    return Listing(title=f"Terms that would explain a part of the residuals{data}", items=items)

@@ -65,6 +65,8 @@ def describe_estimate(estimate: Estimate) -> Summary:
         parts += describe_horizons(estimate.horizons)
     if estimate.inverse_dynamics is not None:
         parts += equation_parts(estimate.inverse_dynamics)
+    if estimate.tested_data is not None and not estimate.tested_data.is_complete:
+        parts.append(Paragraph(text=str(estimate.tested_data)))
     parts += describe_recordings(estimate)
     parts += describe_samples(estimate)
     if estimate.predictions:

@@ -21,8 +21,14 @@ def describe_horizons(study: HorizonStudy) -> list[Part]:
         study: The comparison.
     """
     parts: list[Part] = [Paragraph(text=f"{study.about_choice} {study.about_growth}")]
-    parts += [Paragraph(text=text, emphasis=Emphasis.WARNING) for text in study.findings]
+    cautions = study.findings if study.is_used else (study.about_use, *study.findings)
+    parts += [Paragraph(text=text, emphasis=Emphasis.WARNING) for text in cautions]
     return [*parts, _table(study)]
+
+
+def _mark(study: HorizonStudy) -> str:
+    """Return the mark of the chosen length."""
+    return " (chosen)" if study.is_used else " (chosen, but not used)"
 
 
 def _table(study: HorizonStudy) -> SummaryTable:
@@ -30,7 +36,7 @@ def _table(study: HorizonStudy) -> SummaryTable:
     horizons = [f"over {length:.2g} s" for length in study.lengths]
     rows = []
     for i, errors in enumerate(study.errors):
-        mark = " (chosen)" if i == study.chosen else ""
+        mark = _mark(study) if i == study.chosen else ""
         cells = [Quantity(value=float(error), digits=3) for error in errors]
         rows.append(Row(cells=(study.name_of(i) + mark, *cells)))
     return SummaryTable(

@@ -1,0 +1,163 @@
+"""Tests of much data use a part of it that is spread over all recordings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.experiment.system import System
+from mjfim.identification import data_parts, missing_terms
+from mjfim.identification.data_parts import DataPart, part_of_data
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.missing_terms import TermTests, find_missing_terms
+from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
+from mjfim.records.missing_term import TermTestData
+from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum
+
+RATE = 100.0
+
+
+@pytest.fixture(autouse=True)
+def few_samples_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recordings of these tests are short."""
+    monkeypatch.setattr(data_parts, "ENOUGH_SAMPLES", 10)
+
+
+def problem_of(folder: Path, count: int, segments: float | str = "whole") -> FitProblem:
+    """Recordings of a pendulum of two seconds each."""
+    fit = {"bootstrap": 0, "segments": segments}
+    system = System.resolve(experiment_of(folder, "tilt", fit=fit))
+    logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in range(count)]
+    return FitProblem.of(system, logs, calibrated=False)
+
+
+def test_a_part_has_the_begin_of_each_recording(tmp_path: Path) -> None:
+    problem = problem_of(tmp_path, 4)
+    assert [segment.samples for segment in problem.segments] == [200] * 4
+    part = part_of_data(problem, 136.0)
+    found = part.problem.segments
+    assert [segment.recording for segment in found] == [0, 1, 2, 3]
+    assert [segment.begin for segment in found] == [0] * 4
+    assert {segment.samples for segment in found} == {34}
+    assert part.problem.sample_count == 136
+    assert part.share == pytest.approx(0.17)
+    assert part.recording_count == 4
+
+    # The part has the residuals that these rows have among all.
+    at = problem.begin(problem.system.parameters.guess)
+    predicted, whole = part.problem.predict(part.unknowns(at)), problem.predict(at)
+    assert predicted is not None and whole is not None
+    for y, complete, segment in zip(predicted, whole, found, strict=True):
+        np.testing.assert_allclose(y[segment.rows], complete[segment.rows])
+        assert np.isnan(y[segment.rows.stop :]).all()
+
+
+def test_a_part_has_segments_of_each_recording(tmp_path: Path) -> None:
+    problem = problem_of(tmp_path, 3, 0.25)
+    assert len(problem.segments) == 24
+    for share in (0.05, 0.13, 0.3, 0.6):
+        part = part_of_data(problem, share * problem.sample_count)
+        assert part.recording_count == 3
+        assert 0.8 * share < part.share <= 1.01 * share
+
+        # The unknowns are those of its segments.
+        at = problem.begin(problem.system.parameters.guess)
+        at = replace(at, private=np.arange(at.private.size, dtype=float).reshape(24, -1))
+        for segment, private in zip(part.problem.segments, part.unknowns(at).private, strict=True):
+            index = int(np.flatnonzero((at.private == private).all(axis=1))[0])
+            original = problem.segments[index]
+            assert (segment.recording, segment.begin) == (original.recording, original.begin)
+
+
+def test_one_long_recording_is_cut_and_little_data_is_not(tmp_path: Path) -> None:
+    problem = problem_of(tmp_path, 1)
+    part = part_of_data(problem, 50.0)
+    assert part.problem.sample_count == 50
+    assert part.share == 0.25
+
+    everything = part_of_data(problem, 200.0)
+    assert everything.problem is problem
+    assert everything.share == 1.0
+
+
+def test_too_many_recordings_are_not_cut_into_crumbs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = problem_of(tmp_path, 6)
+    monkeypatch.setattr(data_parts, "ENOUGH_SAMPLES", 50)
+    part = part_of_data(problem, 100.0)
+    assert part.recording_count == 2
+    assert part.problem.sample_count == 100
+    assert part.problem.segments[0].recording < 3 <= part.problem.segments[1].recording
+
+
+def test_the_tested_data_are_said() -> None:
+    complete = TermTestData(share=1.0, recordings=4, count=4)
+    assert TermTests(data=complete).remark == ""
+    assert TermTests().remark == ""
+    for recordings, count, words in (
+        (4, 4, "17 % of the data, from all 4 recordings"),
+        (2, 8, "17 % of the data, from 2 of 8 recordings"),
+        (1, 1, "17 % of the data, the first part of the recording"),
+    ):
+        part = TermTestData(share=0.17, recordings=recordings, count=count)
+        expected = f" Terms that the model may lack were tested on {words}."
+        assert TermTests(data=part).remark == expected
+
+
+@pytest.mark.slow
+def test_a_term_that_the_first_recording_does_not_show_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first recording is at rest; where only it was tested, no term was significant."""
+    robot = System.resolve(experiment_of(tmp_path, "asymmetric_friction"))
+    write_pendulum(tmp_path, joint='frictionloss="0.03"')
+    stated = mjfim.Experiment(
+        model="pendulum.xml",
+        rate=RATE,
+        noise={"angle": 0.001},
+        parameters={"damping": {"target": "joint/pivot:damping"}},
+        directory=tmp_path,
+    )
+    controls = [np.zeros((150, 1)), *(motor_torque(1.5, RATE, i, size=0.08) for i in (0, 1, 2))]
+    logs = [recorded(robot, ctrl, seed) for seed, ctrl in enumerate(controls)]
+    problem = FitProblem.of(System.resolve(stated), logs)
+    begin = problem.begin(problem.system.parameters.guess)
+    solution = minimise(problem, begin, SearchSettings(max_iterations=6))
+    assert solution is not None
+    at = solution.unknowns
+
+    first = DataPart(problem=problem, segments=np.zeros(1, dtype=int), share=0.25)
+    assert not find_missing_terms(
+        problem.of_segments(first.segments), logs, first.unknowns(at)
+    ).terms
+
+    monkeypatch.setattr(missing_terms, "_affordable_samples", lambda *_: 300)
+    found = find_missing_terms(problem, logs, at)
+    assert found.data is not None
+    assert found.data.recordings == 4
+    assert 0.4 < found.data.share <= 0.5
+    assert "term/pivot_asymmetric_friction:offset" in {term.path for term in found.terms}
+
+
+@pytest.mark.slow
+def test_an_estimate_and_a_selection_say_on_how_much_terms_were_tested(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = experiment_of(tmp_path, "tilt", fit={"bootstrap": 0})
+    system = System.resolve(experiment)
+    logs = [recorded(system, motor_torque(2.0, RATE, seed), seed) for seed in (0, 1)]
+    monkeypatch.setattr(missing_terms, "_affordable_samples", lambda *_: 100)
+    found = mjfim.select_terms(experiment, logs)
+    assert not found.misfit
+    words = "Terms that the model may lack were tested on 25 % of the data, from all 2 recordings."
+    assert found.selection is not None
+    assert found.selection.ending == f"No further term that was tested is significant. {words}"
+    assert str(found.tested_data) == words
+
+    found.save(tmp_path / "out")
+    assert mjfim.Estimate.load(tmp_path / "out").tested_data == found.tested_data
