@@ -28,6 +28,13 @@ from mjfim.studies.simplification import simplified_experiment
 # Probability that an interval holds the true value.
 CONFIDENCE = 0.95
 
+# Fewest parts of the data without which estimates scatter, and the warning where there are fewer.
+MIN_PARTS = 2
+NOT_WIDENED = (
+    "no interval contains that the terms were chosen with the same data, because fewer than two "
+    "parts of the recordings could be predicted from the others; give further recordings"
+)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FittedModel:
@@ -204,7 +211,8 @@ def with_selection(
     """The estimate with its selection.
 
     The terms were chosen with the same data. Where the scatter between the estimates without each
-    part of the data is larger than the interval of the fit, the interval is widened to it.
+    part of the data is larger than the interval of the fit, the interval is widened to it. A
+    warning says where there are too few parts for a scatter.
 
     Args:
         estimate: The estimate.
@@ -213,14 +221,17 @@ def with_selection(
         system: The selected model.
     """
     estimate = replace(estimate, selection=selection)
-    jackknife = losses.jackknife
-    parts = len(losses.estimates)
-    if not (selection.terms or selection.pooled) or parts < 2:
+    if not (selection.terms or selection.pooled):
         return estimate
 
-    quantile = float(scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, parts - 1))
-    low = np.minimum(estimate.interval[:, 0], estimate.theta - quantile * jackknife)
-    high = np.maximum(estimate.interval[:, 1], estimate.theta + quantile * jackknife)
+    low, high = estimate.interval.T
+    parts = len(losses.estimates)
+    if parts < MIN_PARTS:
+        estimate = replace(estimate, warnings=(*estimate.warnings, NOT_WIDENED))
+    else:
+        quantile = float(scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, parts - 1))
+        low = np.minimum(low, estimate.theta - quantile * losses.jackknife)
+        high = np.maximum(high, estimate.theta + quantile * losses.jackknife)
 
     # Held-out recordings took no part in the choice, so that what they contradict is not known.
     if selection.refit is not None:
