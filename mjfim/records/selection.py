@@ -218,6 +218,11 @@ class Selection:
     refit: HeldOutRefit | None = None
 
     @property
+    def is_changed(self) -> bool:
+        """Whether the selected model differs from the stated one."""
+        return bool(self.terms or self.pooled or self.held)
+
+    @property
     def parameters(self) -> dict[str, dict[str, object]]:
         """Tables of the parameters of the terms, for `experiment.replace(parameters=...)`."""
         return {name: table for term in self.terms for name, table in term.parameters.items()}
@@ -257,7 +262,7 @@ class Selection:
         begin = self.phases[-1][0]
         over = f" over {begin.description}" if begin.decision is Decision.SHORTENED else ""
         error = f"Held-out error{over} {before:.3g} → {after:.3g} σ."
-        if not (self.terms or self.pooled or self.held):
+        if not self.is_changed:
             error = f"Held-out error{over} {before:.3g} σ."
         return " ".join([added, *self._simplifications, error, self.ending])
 
@@ -268,7 +273,10 @@ class Selection:
             f"Pooled: {pool.name} in place of {', '.join(pool.members)}." for pool in self.pooled
         ]
         if self.held:
-            sentences.append(f"Held at the guess: {', '.join(self.held)}.")
+            sentences.append(
+                f"Held at the guess: {', '.join(self.held)}; an error of a held guess is in no "
+                "interval."
+            )
         return sentences
 
     def summary(self) -> dict[str, Any]:

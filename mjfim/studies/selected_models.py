@@ -221,7 +221,7 @@ def with_selection(
         system: The selected model.
     """
     estimate = replace(estimate, selection=selection)
-    if not (selection.terms or selection.pooled):
+    if not selection.is_changed:
         return estimate
 
     low, high = estimate.interval.T

@@ -55,7 +55,7 @@ def selection_with(**changes: object) -> Selection:
     return Selection(**fields)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("changes", [{"terms": (FRICTION,)}])
+@pytest.mark.parametrize("changes", [{"terms": (FRICTION,)}, {"held": ("c",)}])
 def test_intervals_are_widened_to_the_scatter_between_parts(changes: dict[str, object]) -> None:
     # The first parameter scatters, the others are the same without each part.
     estimates = np.tile(THETA, (5, 1))
@@ -68,6 +68,11 @@ def test_intervals_are_widened_to_the_scatter_between_parts(changes: dict[str, o
     np.testing.assert_allclose(found.interval[0], [2.0 - half, 2.0 + half])
     np.testing.assert_array_equal(found.interval[1:], made_estimate().interval[1:])
     assert NOT_WIDENED not in found.warnings
+
+    # What the others assume is said.
+    assert ("an error of a held guess is in no interval" in str(found.selection)) == (
+        "held" in changes
+    )
 
     # Nothing was chosen with the data where the model stays as it is.
     plain = with_selection(made_estimate(), selection_with(), losses, system)
