@@ -34,8 +34,9 @@ def describe_selection(selection: Selection) -> list[Part]:
         selection: The selection.
     """
     parts: list[Part] = [Paragraph(text=str(selection)), _table(selection)]
+    kept = {term.path for term in selection.terms}
     for step in selection.steps:
-        if step.alternatives:
+        if step.alternatives and step.path in kept:
             text = _describe_alternatives(step)
             parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
     if selection.refit is not None:
