@@ -184,8 +184,8 @@ class HeldOutRefit:
     Attributes:
         theta: (p,) estimate [theta-unit].
         interval: (p, 2) 95 % intervals [theta-unit].
-        differs: Names of the parameters that differ from those of the fitted recordings by more
-            than both intervals explain.
+        differs: Names of the common parameters that differ from those of the fitted recordings by
+            more than both intervals explain; one by chance in 5 % of the cases.
     """
 
     theta: Array

@@ -14,6 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction
 from mjfim.identification.report import FitResult
+from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate
 from mjfim.records.missing_term import MissingTerm, TermParameter
 from mjfim.records.selection import (
@@ -141,17 +142,29 @@ def pooled_values(pooled: Sequence[PooledParameter], values: dict[str, float]) -
     return found
 
 
-def different(estimate: Estimate, theta: Array, interval: Array) -> tuple[str, ...]:
+def different(
+    estimate: Estimate, theta: Array, interval: Array, parameters: ParameterSet
+) -> tuple[str, ...]:
     """Names of the parameters that differ by more than two intervals explain.
+
+    Parameters with a value for each recording differ by nature. The others are compared with wider
+    intervals, so that one of them differs by chance in 5 % of the cases only (Bonferroni), as if
+    the estimates had normal distributions.
 
     Args:
         estimate: The estimate from the fitted recordings.
         theta: (p,) estimate from other recordings [theta-unit].
-        interval: (p, 2) its intervals [theta-unit].
+        interval: (p, 2) its 95 % intervals [theta-unit].
+        parameters: The p parameters.
     """
     halves = np.stack([0.5 * np.ptp(each, axis=1) for each in (estimate.interval, interval)])
     explained = np.sqrt(np.sum(halves**2, axis=0))
-    apart = np.isfinite(explained) & (np.abs(theta - estimate.theta) > explained)
+    is_known = np.isfinite(explained) & (explained > 0.0)
+    compared = is_known & ~parameters.recording_specific
+
+    chance = 0.5 * (1.0 - CONFIDENCE)
+    of_one, of_all = scipy.special.ndtri([chance, chance / max(int(compared.sum()), 1)])
+    apart = compared & (np.abs(theta - estimate.theta) > of_all / of_one * explained)
     return tuple(name for name, flag in zip(estimate.parameters, apart, strict=True) if flag)
 
 

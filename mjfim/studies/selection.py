@@ -250,7 +250,7 @@ class _Selector:
         return HeldOutRefit(
             theta=found.theta,
             interval=interval,
-            differs=different(estimate, found.theta, interval),
+            differs=different(estimate, found.theta, interval, result.task.system.parameters),
         )
 
     def _final(self, model: FittedModel, is_free: bool) -> FitResult:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy
@@ -10,8 +12,9 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses
+from mjfim.model.parameters import ParameterSet
 from mjfim.records.selection import Decision, SelectedTerm, Selection, SelectionStep
-from mjfim.studies.selected_models import NOT_WIDENED, with_selection
+from mjfim.studies.selected_models import NOT_WIDENED, different, with_selection
 from tests.support.paths import ROOT
 from tests.support.results import estimate as make_estimate
 
@@ -86,3 +89,28 @@ def test_a_warning_says_that_no_interval_contains_the_choice_of_terms() -> None:
     assert found.warnings[-1] == NOT_WIDENED
     np.testing.assert_array_equal(found.interval, made_estimate().interval)
     assert with_selection(made_estimate(), selection_with(), losses, system).warnings == ()
+
+
+def test_parameters_of_each_recording_differ_by_nature() -> None:
+    parameters = System.resolve(cart_pendulum()).parameters
+    other = THETA + 0.05
+    interval = other[:, None] + np.array([-0.02, 0.02])
+    assert different(made_estimate(), other, interval, parameters) == ("m", "l", "c")
+
+    own = tuple(replace(each, per_recording=each.name == "l") for each in parameters.parameters)
+    assert different(made_estimate(), other, interval, ParameterSet(own)) == ("m", "c")
+
+
+def test_one_of_several_parameters_differs_by_chance_in_a_twentieth_of_the_cases() -> None:
+    parameters = System.resolve(cart_pendulum()).parameters
+    estimate = made_estimate()
+    std = 0.02 / 1.96
+    rng = np.random.default_rng(0)
+    trials = 1000
+    count = 0
+    for _ in range(trials):
+        # Both estimates have errors.
+        other = THETA + np.sqrt(2.0) * std * rng.normal(size=3)
+        interval = other[:, None] + np.array([-0.02, 0.02])
+        count += bool(different(estimate, other, interval, parameters))
+    assert count / trials == pytest.approx(0.05, abs=0.02)
