@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from itertools import pairwise
-from math import isfinite
+from math import isfinite, isnan
 from typing import Any
 
 from mjfim.arrays import Array, freeze
@@ -149,7 +149,8 @@ class SelectionStep:
         description: The term in words; empty for the stated model.
         path: Target of its parameter; empty for the stated model.
         count: Number of added terms after the step.
-        error: Held-out error of the model with the term, or without a removed one [sigma].
+        error: Held-out error of the model with the term, or without a removed one [sigma]; NaN
+            where no part of the data could be predicted from the others.
         reduction: Reduction of the mean held-out loss by the term [sigma^2].
         standard_error: Standard error of the reduction [sigma^2].
         sigmas: Size of the term in standard deviations by the score test; 0 where none was made.
@@ -256,15 +257,20 @@ class Selection:
         return last[0].error, last[-1].error
 
     def __str__(self) -> str:
-        before, after = self.errors
         words = ", ".join(term.description for term in self.terms)
         added = f"Added: {words}." if self.terms else "No term was added."
+        return " ".join([added, *self._simplifications, *self._about_errors, self.ending])
+
+    @property
+    def _about_errors(self) -> list[str]:
+        """Sentence about the held-out errors; none where no part of the data was predicted."""
+        before, after = self.errors
+        if isnan(before):
+            return []
         begin = self.phases[-1][0]
         over = f" over {begin.description}" if begin.decision is Decision.SHORTENED else ""
-        error = f"Held-out error{over} {before:.3g} → {after:.3g} σ."
-        if not self.is_changed:
-            error = f"Held-out error{over} {before:.3g} σ."
-        return " ".join([added, *self._simplifications, error, self.ending])
+        change = f" → {after:.3g}" if self.is_changed else ""
+        return [f"Held-out error{over} {before:.3g}{change} σ."]
 
     @property
     def _simplifications(self) -> list[str]:

@@ -79,6 +79,8 @@ def _title(estimate: Estimate) -> str:
     selection = estimate.selection
     assert selection is not None
     before, after = selection.errors
+    if np.isnan(before):
+        return "No term was tried"
     if not selection.terms:
         return f"No term was added: held-out error {before:.3g} σ"
     count = len(selection.terms)
