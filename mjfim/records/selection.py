@@ -9,7 +9,7 @@ from math import isfinite, isnan
 from typing import Any
 
 from mjfim.arrays import Array, freeze
-from mjfim.records.missing_term import AddedTerm, TermParameter, toml_table
+from mjfim.records.missing_term import AddedTerm, TermParameter
 
 
 class Decision(Enum):
@@ -65,16 +65,6 @@ class SelectedTerm:
         """The table of the library of terms that it needs, by name; empty without one."""
         return {} if self.added is None else {self.added.name: self.added.table}
 
-    @property
-    def toml(self) -> str:
-        """The tables in an experiment file, each in one line."""
-        lines = [] if self.added is None else [toml_table("terms", self.added)]
-        for name, table in self.parameters.items():
-            lines.append(
-                f'[parameters.{name}] target = "{table["target"]}", scale = {table["scale"]:.2g}'
-            )
-        return "; ".join(lines)
-
 
 @dataclass(frozen=True, kw_only=True)
 class PooledParameter:
@@ -113,15 +103,6 @@ class PooledParameter:
         if isfinite(self.bounds[0]) and isfinite(self.bounds[1]):
             table["bounds"] = list(self.bounds)
         return table
-
-    @property
-    def toml(self) -> str:
-        """The table in an experiment file, in one line."""
-        targets = ", ".join(
-            f'{{ path = "{path}", scale = {scale:.6g} }}'
-            for path, scale in zip(self.paths, self.scales, strict=True)
-        )
-        return f"[parameters.{self.name}] targets = [{targets}], guess = {self.guess:.6g}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,6 +190,9 @@ class Selection:
         pooled: Parameters in place of several that the recordings hardly determine.
         held: Names of parameters that keep their guess, for the same reason.
         refit: The selected model fitted to the held-out recordings; None without any.
+        hold: All names of `fit.hold` of the selected model: those that the user states, and `held`.
+        segments: Length of the segments that was chosen for the selected model [s]; None where the
+            stated experiment decides on it.
     """
 
     terms: tuple[SelectedTerm, ...]
@@ -217,6 +201,8 @@ class Selection:
     pooled: tuple[PooledParameter, ...] = ()
     held: tuple[str, ...] = ()
     refit: HeldOutRefit | None = None
+    hold: tuple[str, ...] = ()
+    segments: float | None = None
 
     @property
     def is_changed(self) -> bool:
@@ -237,6 +223,16 @@ class Selection:
     def tables(self) -> dict[str, dict[str, dict[str, object]]]:
         """All tables of the terms: `experiment.replace(**selection.tables)` has them."""
         return {"parameters": self.parameters, "terms": self.library_terms}
+
+    @property
+    def fit_table(self) -> dict[str, object]:
+        """Keys of the table `[fit]` that the selection changes."""
+        table: dict[str, object] = {}
+        if self.held:
+            table["hold"] = list(self.hold or self.held)
+        if self.segments is not None:
+            table["segments"] = self.segments
+        return table
 
     @property
     def phases(self) -> tuple[tuple[SelectionStep, ...], ...]:
@@ -294,5 +290,7 @@ class Selection:
             "steps": [{**asdict(step), "decision": step.decision.value} for step in self.steps],
             "pooled": [asdict(pool) for pool in self.pooled],
             "held": list(self.held),
+            "hold": list(self.hold),
+            "segments": self.segments,
             "held_out_refit": None if self.refit is None else asdict(self.refit),
         }

@@ -100,12 +100,15 @@ def selected_experiment(experiment: Experiment, selection: Selection) -> Experim
         selection: The selection, `estimate.selection`.
 
     Returns:
-        The experiment with the added terms, and with the pooled and held parameters.
+        The experiment with the added terms, with the pooled and held parameters, and with the
+        length of the segments that was chosen for them, where it states none.
 
     Raises:
         ExperimentError: The selection is one of another experiment.
     """
     extended = experiment.replace(**selection.tables)
+    if selection.segments is not None and experiment.fit.segments is None:
+        extended = extended.replace(fit={"segments": selection.segments})
     return simplified_experiment(extended, selection.pooled, selection.held)
 
 

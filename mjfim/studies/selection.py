@@ -226,7 +226,13 @@ class _Selector:
         )
         estimate = estimate_from(result, self.budget)
         if selection.is_changed:
-            selection = replace(selection, refit=self._refit(result, estimate))
+            settings = result.task.settings
+            selection = replace(
+                selection,
+                refit=self._refit(result, estimate),
+                hold=settings.hold,
+                segments=settings.segment_length if is_free else None,
+            )
         final_system = result.task.system
         return with_selection(estimate, selection, model.losses, final_system), final_system
 

@@ -44,6 +44,8 @@ def selection_figure(estimate: Estimate) -> Figure:
         axes.plot(errors, rows, "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
         first += len(phase)
     right = LARGEST_DRAWN_RATIO * max(step.error for step in kept)
+    if np.isnan(right):
+        axes.set_xticks([])
     row = 0
     for step in selection.steps:
         if step.is_kept:
