@@ -561,6 +561,8 @@ class _Selector:
     ) -> FittedModel | None:
         """Fit the stated model with some terms, beginning at the fit of a similar model.
 
+        None where it cannot be simulated, or after a stop.
+
         Args:
             model: The similar model.
             first: The stated model.
@@ -592,7 +594,7 @@ class _Selector:
         task = FitTask.of(system, first.result.task.recordings, start=start)
         try:
             result = refit_task(self._search(task), model.result, self.workers)
-        except InterruptedPassError:
+        except (InterruptedPassError, SimulationDivergedError):
             return None
         return self._assessed(replace(model, terms=terms), first, result)
 

@@ -9,6 +9,7 @@ import pytest
 
 import mjfim
 from mjfim.budget import StopToken
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
@@ -143,6 +144,21 @@ def test_a_selection_that_cannot_predict_left_out_data_says_so(
     found.estimate.save(tmp_path / "results")
     (step,) = mjfim.Estimate.load(tmp_path / "results").selection.steps
     assert np.isnan(step.error)
+
+
+@pytest.mark.slow
+def test_a_term_with_which_the_simulation_diverges_is_not_added(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverge(*args: object) -> None:
+        """Fail as a fit does whose start cannot be simulated."""
+        raise SimulationDivergedError("the simulation diverges at the start")
+
+    monkeypatch.setattr(selection_study, "refit_task", diverge)
+    found = mjfim.select_terms(stated(), recorded(tmp_path, 'frictionloss="0.5"', count=2))
+    assert found.selection is not None
+    assert not found.selection.terms
+    assert "No further term predicts" in found.selection.ending
 
 
 @pytest.mark.slow
