@@ -92,6 +92,24 @@ def selected_term(candidate: MissingTerm, taken: Iterable[str]) -> SelectedTerm:
     )
 
 
+def as_recorded(term: SelectedTerm) -> SelectedTerm:
+    """A term with rounded sizes, for people to read; a size is no result.
+
+    Args:
+        term: The term.
+    """
+    further = {
+        name: replace(parameter, scale=_rounded(parameter.scale))
+        for name, parameter in term.further.items()
+    }
+    return replace(term, scale=_rounded(term.scale), further=further)
+
+
+def _rounded(size: float) -> float:
+    """A size with two digits."""
+    return float(f"{size:.2g}")
+
+
 def selected_experiment(experiment: Experiment, selection: Selection) -> Experiment:
     """The experiment of a selected model.
 

@@ -44,6 +44,7 @@ from mjfim.records.selection import (
 )
 from mjfim.studies.selected_models import (
     FittedModel,
+    as_recorded,
     different,
     pooled_values,
     poorly_known,
@@ -218,7 +219,7 @@ class _Selector:
                 result = self._final(model.result, is_free=False, is_changed=model.is_changed)
         result = _reported(result, is_free)
         selection = Selection(
-            terms=model.terms,
+            terms=tuple(as_recorded(term) for term in model.terms),
             steps=tuple(steps),
             ending=ending,
             pooled=model.pooled,
