@@ -131,14 +131,19 @@ def selected_experiment(experiment: Experiment, selection: Selection) -> Experim
 
 
 def poorly_known(model: FittedModel) -> tuple[str, ...]:
-    """Names of the stated parameters that a fit determines poorly.
+    """Names of the stated parameters that a fit determines poorly, and that can be held.
+
+    Those with a value for each recording cannot.
 
     Args:
         model: The fitted model.
     """
     added = {name for term in model.terms for name in term.parameters}
     added |= {pool.name for pool in model.pooled}
-    return tuple(name for name, _ in model.result.accuracy.poorly_known if name not in added)
+    parameters = model.result.task.system.parameters
+    own = {parameters.names[j] for j in np.flatnonzero(parameters.recording_specific)}
+    excluded = added | own
+    return tuple(name for name, _ in model.result.accuracy.poorly_known if name not in excluded)
 
 
 def pooled_values(pooled: Sequence[PooledParameter], values: dict[str, float]) -> dict[str, float]:

@@ -481,6 +481,11 @@ class _Selector:
         for attempt in attempts:
             if self._is_stopped() or set(attempt) <= set(model.held):
                 continue
+
+            # One parameter at least is left to the fit.
+            task = model.result.task
+            if {*task.settings.hold, *attempt} >= set(task.system.parameters.names):
+                continue
             changed = replace(model, held=(*model.held, *attempt))
             model = self._simpler(model, changed, first, (Decision.HELD, listed(attempt)), steps)
         return model
