@@ -7,7 +7,7 @@ scatter of the differences between blocks gives the standard error of their mean
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -35,8 +35,10 @@ from mjfim.optimize.levenberg_marquardt import Solution
 # of different blocks nearly independent.
 BLOCKS = 20
 
-# Fewest segments in each left-out part of a single recording.
+# Fewest segments in each left-out part of a single recording, and fewest parts that consist of
+# segments.
 MIN_SEGMENTS_PER_PART = 2
+MIN_STRETCHES = 2
 
 # Share of the mean loss below which a difference between two models does not count, however small
 # its scatter is. Models that no data tell apart differ by where their searches ended.
@@ -162,7 +164,7 @@ def held_out_losses(
         The losses; None after a request to stop, and where there are no parts that can be left out.
     """
     problem, solution = affordable_part(problem, solution)
-    parts = list(_parts(problem))
+    parts = _parts(problem)
     pieces = sum(len(part.recordings) for part in parts)
     blocks = -(-BLOCKS // max(pieces, 1))
     steps = leave_out_steps(problem, solution, parts)
@@ -179,20 +181,27 @@ def held_out_losses(
     )
 
 
-def _parts(problem: FitProblem) -> Iterator[LeftOutPart]:
-    """Parts that are left out: groups of recordings, or of segments of a single recording."""
-    count = len(problem.segments)
-    groups = min(MAX_FOLDS, count // MIN_SEGMENTS_PER_PART)
-    if len(problem.recordings) > 1 or groups < 2:
-        yield from left_out_parts(problem)
-        return
+def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
+    """Parts that are left out: groups of recordings, or stretches of a single recording."""
+    if len(problem.recordings) > 1:
+        return tuple(left_out_parts(problem))
 
+    # Stretches begin with a segment where there are enough of them, because a segment whose initial
+    # state is free is then predicted as a whole. Otherwise they have equal numbers of rows.
     recording = problem.recordings[0]
-    firsts = [group[0] for group in np.array_split(np.arange(count), groups)]
-    times = [float(recording.t[problem.segments[first].rows.start]) for first in firsts]
-    for begin, end in zip(times, [*times[1:], np.inf], strict=True):
-        name = f"{recording.name} from {begin:.3g} s"
-        yield LeftOutPart(name=name, recordings=(0,), begin=begin, end=end)
+    rows = np.array([segment.rows.start for segment in problem.segments])
+    if len(rows) < MIN_SEGMENTS_PER_PART * MIN_STRETCHES:
+        rows = np.flatnonzero(problem.masks[0].any(axis=1))
+        groups = min(MAX_FOLDS, len(rows))
+    else:
+        groups = min(MAX_FOLDS, len(rows) // MIN_SEGMENTS_PER_PART)
+    times = [float(recording.t[group[0]]) for group in np.array_split(rows, groups)]
+    return tuple(
+        LeftOutPart(
+            name=f"{recording.name} from {begin:.3g} s", recordings=(0,), begin=begin, end=end
+        )
+        for begin, end in zip(times, [*times[1:], np.inf], strict=True)
+    )
 
 
 def _losses_of_part(

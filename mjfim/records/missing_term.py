@@ -86,8 +86,8 @@ class MissingTerm:
 
     @property
     def recipe(self) -> str:
-        """What to add to the experiment file, in one line of TOML."""
-        tables = [] if self.added is None else [toml_table("terms", self.added)]
+        """What to add to the experiment file: lines of TOML with a semicolon between them."""
+        tables = [] if self.added is None else [_toml_line("terms", self.added)]
         targets = [self.path, *(parameter.path for parameter in self.further)]
         return "; ".join([*tables, *(f'target = "{path}"' for path in targets)])
 
@@ -158,14 +158,14 @@ class TermTestData:
         }
 
 
-def toml_table(section: str, added: AddedTerm) -> str:
-    """A table in one line of TOML, such as `[terms.friction] kind = "stribeck", joint = "pivot"`.
+def _toml_line(section: str, added: AddedTerm) -> str:
+    """A table in one line of TOML, such as `terms.x = { kind = "stribeck", joint = "pivot" }`.
 
     Args:
         section: Name of the table of tables.
         added: The table.
     """
-    return f"[{section}.{added.name}] {_entries(added.table)}"
+    return f"{section}.{added.name} = {_value(added.table)}"
 
 
 def _entries(table: Mapping[str, object]) -> str:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from itertools import pairwise
-from math import isfinite
+from math import isfinite, isnan
 from typing import Any
 
 from mjfim.arrays import Array, freeze
-from mjfim.records.missing_term import AddedTerm, TermParameter, toml_table
+from mjfim.records.missing_term import AddedTerm, TermParameter
 
 
 class Decision(Enum):
@@ -65,16 +65,6 @@ class SelectedTerm:
         """The table of the library of terms that it needs, by name; empty without one."""
         return {} if self.added is None else {self.added.name: self.added.table}
 
-    @property
-    def toml(self) -> str:
-        """The tables in an experiment file, each in one line."""
-        lines = [] if self.added is None else [toml_table("terms", self.added)]
-        for name, table in self.parameters.items():
-            lines.append(
-                f'[parameters.{name}] target = "{table["target"]}", scale = {table["scale"]:.2g}'
-            )
-        return "; ".join(lines)
-
 
 @dataclass(frozen=True, kw_only=True)
 class PooledParameter:
@@ -114,15 +104,6 @@ class PooledParameter:
             table["bounds"] = list(self.bounds)
         return table
 
-    @property
-    def toml(self) -> str:
-        """The table in an experiment file, in one line."""
-        targets = ", ".join(
-            f'{{ path = "{path}", scale = {scale:.6g} }}'
-            for path, scale in zip(self.paths, self.scales, strict=True)
-        )
-        return f"[parameters.{self.name}] targets = [{targets}], guess = {self.guess:.6g}"
-
 
 @dataclass(frozen=True, kw_only=True)
 class AlternativeTerm:
@@ -149,7 +130,8 @@ class SelectionStep:
         description: The term in words; empty for the stated model.
         path: Target of its parameter; empty for the stated model.
         count: Number of added terms after the step.
-        error: Held-out error of the model with the term, or without a removed one [sigma].
+        error: Held-out error of the model with the term, or without a removed one [sigma]; NaN
+            where no part of the data could be predicted from the others.
         reduction: Reduction of the mean held-out loss by the term [sigma^2].
         standard_error: Standard error of the reduction [sigma^2].
         sigmas: Size of the term in standard deviations by the score test; 0 where none was made.
@@ -184,8 +166,8 @@ class HeldOutRefit:
     Attributes:
         theta: (p,) estimate [theta-unit].
         interval: (p, 2) 95 % intervals [theta-unit].
-        differs: Names of the parameters that differ from those of the fitted recordings by more
-            than both intervals explain.
+        differs: Names of the common parameters that differ from those of the fitted recordings by
+            more than both intervals explain; one by chance in 5 % of the cases.
     """
 
     theta: Array
@@ -208,6 +190,9 @@ class Selection:
         pooled: Parameters in place of several that the recordings hardly determine.
         held: Names of parameters that keep their guess, for the same reason.
         refit: The selected model fitted to the held-out recordings; None without any.
+        hold: All names of `fit.hold` of the selected model: those that the user states, and `held`.
+        segments: Length of the segments that was chosen for the selected model [s]; None where the
+            stated experiment decides on it.
     """
 
     terms: tuple[SelectedTerm, ...]
@@ -216,6 +201,13 @@ class Selection:
     pooled: tuple[PooledParameter, ...] = ()
     held: tuple[str, ...] = ()
     refit: HeldOutRefit | None = None
+    hold: tuple[str, ...] = ()
+    segments: float | None = None
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether the selected model differs from the stated one."""
+        return bool(self.terms or self.pooled or self.held)
 
     @property
     def parameters(self) -> dict[str, dict[str, object]]:
@@ -231,6 +223,16 @@ class Selection:
     def tables(self) -> dict[str, dict[str, dict[str, object]]]:
         """All tables of the terms: `experiment.replace(**selection.tables)` has them."""
         return {"parameters": self.parameters, "terms": self.library_terms}
+
+    @property
+    def fit_table(self) -> dict[str, object]:
+        """Keys of the table `[fit]` that the selection changes."""
+        table: dict[str, object] = {}
+        if self.held:
+            table["hold"] = list(self.hold or self.held)
+        if self.segments is not None:
+            table["segments"] = self.segments
+        return table
 
     @property
     def phases(self) -> tuple[tuple[SelectionStep, ...], ...]:
@@ -251,15 +253,20 @@ class Selection:
         return last[0].error, last[-1].error
 
     def __str__(self) -> str:
-        before, after = self.errors
         words = ", ".join(term.description for term in self.terms)
         added = f"Added: {words}." if self.terms else "No term was added."
+        return " ".join([added, *self._simplifications, *self._about_errors, self.ending])
+
+    @property
+    def _about_errors(self) -> list[str]:
+        """Sentence about the held-out errors; none where no part of the data was predicted."""
+        before, after = self.errors
+        if isnan(before):
+            return []
         begin = self.phases[-1][0]
         over = f" over {begin.description}" if begin.decision is Decision.SHORTENED else ""
-        error = f"Held-out error{over} {before:.3g} → {after:.3g} σ."
-        if not (self.terms or self.pooled or self.held):
-            error = f"Held-out error{over} {before:.3g} σ."
-        return " ".join([added, *self._simplifications, error, self.ending])
+        change = f" → {after:.3g}" if self.is_changed else ""
+        return [f"Held-out error{over} {before:.3g}{change} σ."]
 
     @property
     def _simplifications(self) -> list[str]:
@@ -268,7 +275,10 @@ class Selection:
             f"Pooled: {pool.name} in place of {', '.join(pool.members)}." for pool in self.pooled
         ]
         if self.held:
-            sentences.append(f"Held at the guess: {', '.join(self.held)}.")
+            sentences.append(
+                f"Held at the guess: {', '.join(self.held)}; an error of a held guess is in no "
+                "interval."
+            )
         return sentences
 
     def summary(self) -> dict[str, Any]:
@@ -280,5 +290,7 @@ class Selection:
             "steps": [{**asdict(step), "decision": step.decision.value} for step in self.steps],
             "pooled": [asdict(pool) for pool in self.pooled],
             "held": list(self.held),
+            "hold": list(self.hold),
+            "segments": self.segments,
             "held_out_refit": None if self.refit is None else asdict(self.refit),
         }

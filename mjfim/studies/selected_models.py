@@ -14,6 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction
 from mjfim.identification.report import FitResult
+from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate
 from mjfim.records.missing_term import MissingTerm, TermParameter
 from mjfim.records.selection import (
@@ -27,6 +28,13 @@ from mjfim.studies.simplification import simplified_experiment
 
 # Probability that an interval holds the true value.
 CONFIDENCE = 0.95
+
+# Fewest parts of the data without which estimates scatter, and the warning where there are fewer.
+MIN_PARTS = 2
+NOT_WIDENED = (
+    "no interval contains that the terms were chosen with the same data, because fewer than two "
+    "parts of the recordings could be predicted from the others; give further recordings"
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,6 +92,24 @@ def selected_term(candidate: MissingTerm, taken: Iterable[str]) -> SelectedTerm:
     )
 
 
+def as_recorded(term: SelectedTerm) -> SelectedTerm:
+    """A term with rounded sizes, for people to read; a size is no result.
+
+    Args:
+        term: The term.
+    """
+    further = {
+        name: replace(parameter, scale=_rounded(parameter.scale))
+        for name, parameter in term.further.items()
+    }
+    return replace(term, scale=_rounded(term.scale), further=further)
+
+
+def _rounded(size: float) -> float:
+    """A size with two digits."""
+    return float(f"{size:.2g}")
+
+
 def selected_experiment(experiment: Experiment, selection: Selection) -> Experiment:
     """The experiment of a selected model.
 
@@ -92,24 +118,32 @@ def selected_experiment(experiment: Experiment, selection: Selection) -> Experim
         selection: The selection, `estimate.selection`.
 
     Returns:
-        The experiment with the added terms, and with the pooled and held parameters.
+        The experiment with the added terms, with the pooled and held parameters, and with the
+        length of the segments that was chosen for them, where it states none.
 
     Raises:
         ExperimentError: The selection is one of another experiment.
     """
     extended = experiment.replace(**selection.tables)
+    if selection.segments is not None and experiment.fit.segments is None:
+        extended = extended.replace(fit={"segments": selection.segments})
     return simplified_experiment(extended, selection.pooled, selection.held)
 
 
 def poorly_known(model: FittedModel) -> tuple[str, ...]:
-    """Names of the stated parameters that a fit determines poorly.
+    """Names of the stated parameters that a fit determines poorly, and that can be held.
+
+    Those with a value for each recording cannot.
 
     Args:
         model: The fitted model.
     """
     added = {name for term in model.terms for name in term.parameters}
     added |= {pool.name for pool in model.pooled}
-    return tuple(name for name, _ in model.result.accuracy.poorly_known if name not in added)
+    parameters = model.result.task.system.parameters
+    own = {parameters.names[j] for j in np.flatnonzero(parameters.recording_specific)}
+    excluded = added | own
+    return tuple(name for name, _ in model.result.accuracy.poorly_known if name not in excluded)
 
 
 def pooled_values(pooled: Sequence[PooledParameter], values: dict[str, float]) -> dict[str, float]:
@@ -134,17 +168,29 @@ def pooled_values(pooled: Sequence[PooledParameter], values: dict[str, float]) -
     return found
 
 
-def different(estimate: Estimate, theta: Array, interval: Array) -> tuple[str, ...]:
+def different(
+    estimate: Estimate, theta: Array, interval: Array, parameters: ParameterSet
+) -> tuple[str, ...]:
     """Names of the parameters that differ by more than two intervals explain.
+
+    Parameters with a value for each recording differ by nature. The others are compared with wider
+    intervals, so that one of them differs by chance in 5 % of the cases only (Bonferroni), as if
+    the estimates had normal distributions.
 
     Args:
         estimate: The estimate from the fitted recordings.
         theta: (p,) estimate from other recordings [theta-unit].
-        interval: (p, 2) its intervals [theta-unit].
+        interval: (p, 2) its 95 % intervals [theta-unit].
+        parameters: The p parameters.
     """
     halves = np.stack([0.5 * np.ptp(each, axis=1) for each in (estimate.interval, interval)])
     explained = np.sqrt(np.sum(halves**2, axis=0))
-    apart = np.isfinite(explained) & (np.abs(theta - estimate.theta) > explained)
+    is_known = np.isfinite(explained) & (explained > 0.0)
+    compared = is_known & ~parameters.recording_specific
+
+    chance = 0.5 * (1.0 - CONFIDENCE)
+    of_one, of_all = scipy.special.ndtri([chance, chance / max(int(compared.sum()), 1)])
+    apart = compared & (np.abs(theta - estimate.theta) > of_all / of_one * explained)
     return tuple(name for name, flag in zip(estimate.parameters, apart, strict=True) if flag)
 
 
@@ -204,7 +250,8 @@ def with_selection(
     """The estimate with its selection.
 
     The terms were chosen with the same data. Where the scatter between the estimates without each
-    part of the data is larger than the interval of the fit, the interval is widened to it.
+    part of the data is larger than the interval of the fit, the interval is widened to it. A
+    warning says where there are too few parts for a scatter.
 
     Args:
         estimate: The estimate.
@@ -213,14 +260,17 @@ def with_selection(
         system: The selected model.
     """
     estimate = replace(estimate, selection=selection)
-    jackknife = losses.jackknife
-    parts = len(losses.estimates)
-    if not (selection.terms or selection.pooled) or parts < 2:
+    if not selection.is_changed:
         return estimate
 
-    quantile = float(scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, parts - 1))
-    low = np.minimum(estimate.interval[:, 0], estimate.theta - quantile * jackknife)
-    high = np.maximum(estimate.interval[:, 1], estimate.theta + quantile * jackknife)
+    low, high = estimate.interval.T
+    parts = len(losses.estimates)
+    if parts < MIN_PARTS:
+        estimate = replace(estimate, warnings=(*estimate.warnings, NOT_WIDENED))
+    else:
+        quantile = float(scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, parts - 1))
+        low = np.minimum(low, estimate.theta - quantile * losses.jackknife)
+        high = np.maximum(high, estimate.theta + quantile * losses.jackknife)
 
     # Held-out recordings took no part in the choice, so that what they contradict is not known.
     if selection.refit is not None:

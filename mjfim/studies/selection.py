@@ -44,6 +44,7 @@ from mjfim.records.selection import (
 )
 from mjfim.studies.selected_models import (
     FittedModel,
+    as_recorded,
     different,
     pooled_values,
     poorly_known,
@@ -204,36 +205,57 @@ class _Selector:
         result = fit_task(self._search(whole), self.workers)
         losses = self._losses(result, result)
         if losses is None:
-            ending = "The selection was interrupted, or no part of the data can be left out."
-            return estimate_from(result, self.budget), task.system
+            return self._unselected(result, is_free)
 
         first = FittedModel(result=result, losses=losses, cost=result.solution.cost, terms=())
         steps = [SelectionStep(decision=Decision.BEGUN, error=losses.error)]
         model, ending = self._chosen(first, first, steps)
-        result = self._final(model, is_free)
+        result = self._final(model.result, is_free, is_changed=model.is_changed)
 
         # Over segments, the data may show other terms.
         if result.task.settings.segment_length is not None and is_free:
             model, ending = self._over_length(model, first, result, steps, ending)
             if model.result is not result:
-                result = self._final(model, is_free=False)
-        is_changed = model.is_changed
-
-        # The report compares the estimate with the guess, not with where the last search began.
-        guess = result.task.system.parameters.guess
-        result = replace(result, task=replace(result.task, start=guess))
+                result = self._final(model.result, is_free=False, is_changed=model.is_changed)
+        result = _reported(result, is_free)
         selection = Selection(
-            terms=model.terms,
+            terms=tuple(as_recorded(term) for term in model.terms),
             steps=tuple(steps),
             ending=ending,
             pooled=model.pooled,
             held=model.held,
         )
         estimate = estimate_from(result, self.budget)
-        if is_changed:
-            selection = replace(selection, refit=self._refit(result, estimate))
+        if selection.is_changed:
+            settings = result.task.settings
+            selection = replace(
+                selection,
+                refit=self._refit(result, estimate),
+                hold=settings.hold,
+                segments=settings.segment_length if is_free else None,
+            )
         final_system = result.task.system
         return with_selection(estimate, selection, model.losses, final_system), final_system
+
+    def _unselected(self, result: FitResult, is_free: bool) -> tuple[Estimate, System]:
+        """Estimate of the stated model where no term could be tried, and this model.
+
+        Args:
+            result: The fit of the stated model.
+            is_free: Whether the length of the segments is left to the fit.
+        """
+        ending = "The selection was interrupted before a term was tried."
+        if not self._is_stopped():
+            ending = (
+                "No part of the recordings could be predicted from the others, so that no term "
+                "was tried."
+            )
+            result = self._final(result, is_free, is_changed=False)
+        result = _reported(result, is_free)
+        steps = (SelectionStep(decision=Decision.BEGUN, error=np.nan),)
+        selection = Selection(terms=(), steps=steps, ending=ending)
+        estimate = estimate_from(result, self.budget)
+        return replace(estimate, selection=selection), result.task.system
 
     def _refit(self, result: FitResult, estimate: Estimate) -> HeldOutRefit | None:
         """Fit the selected model to the held-out recordings; None without any, or after a stop."""
@@ -250,19 +272,19 @@ class _Selector:
         return HeldOutRefit(
             theta=found.theta,
             interval=interval,
-            differs=different(estimate, found.theta, interval),
+            differs=different(estimate, found.theta, interval, result.task.system.parameters),
         )
 
-    def _final(self, model: FittedModel, is_free: bool) -> FitResult:
+    def _final(self, result: FitResult, is_free: bool, *, is_changed: bool) -> FitResult:
         """The fit of the chosen model, with all attempts against local minima.
 
         Args:
-            model: The chosen model.
+            result: The fit of the chosen model in the selection.
             is_free: Whether the length of the segments is left to the fit.
+            is_changed: Whether the chosen model differs from the stated one.
         """
-        result = model.result
         fit = WholeFit(problem=result.problem, solution=result.solution, quality=result.quality)
-        is_settled = not model.is_changed and not (is_free and is_doubtful(result.task, fit))
+        is_settled = not is_changed and not (is_free and is_doubtful(result.task, fit))
         if is_settled or self._is_stopped():
             return result
         final = replace(result.task, start=result.theta, held_out=self.held_out)
@@ -461,6 +483,11 @@ class _Selector:
         for attempt in attempts:
             if self._is_stopped() or set(attempt) <= set(model.held):
                 continue
+
+            # One parameter at least is left to the fit.
+            task = model.result.task
+            if {*task.settings.hold, *attempt} >= set(task.system.parameters.names):
+                continue
             changed = replace(model, held=(*model.held, *attempt))
             model = self._simpler(model, changed, first, (Decision.HELD, listed(attempt)), steps)
         return model
@@ -542,6 +569,8 @@ class _Selector:
     ) -> FittedModel | None:
         """Fit the stated model with some terms, beginning at the fit of a similar model.
 
+        None where it cannot be simulated, or after a stop.
+
         Args:
             model: The similar model.
             first: The stated model.
@@ -573,7 +602,7 @@ class _Selector:
         task = FitTask.of(system, first.result.task.recordings, start=start)
         try:
             result = refit_task(self._search(task), model.result, self.workers)
-        except InterruptedPassError:
+        except (InterruptedPassError, SimulationDivergedError):
             return None
         return self._assessed(replace(model, terms=terms), first, result)
 
@@ -620,3 +649,19 @@ class _Selector:
     def _is_stopped(self) -> bool:
         """True after a request to stop."""
         return self.budget.stop.requested
+
+
+def _reported(result: FitResult, is_free: bool) -> FitResult:
+    """A fit as it is reported.
+
+    It is compared with the guess, not with where the last search began. Its experiment has the
+    length of the segments that the user stated, unless another one was chosen.
+
+    Args:
+        result: The fit.
+        is_free: Whether the length of the segments is left to the fit.
+    """
+    task = replace(result.task, start=result.task.system.parameters.guess)
+    if is_free and task.settings.segment_length is None:
+        task = with_length(task, None)
+    return replace(result, task=task)

@@ -27,7 +27,7 @@ def possible_pools(parameters: ParameterSet, names: Collection[str]) -> list[Poo
         names: Names of the parameters that may be pooled.
 
     Returns:
-        A pool for each group of two or more parameters with one target each.
+        A pool for each group of two or more parameters with one target each and common bounds.
     """
     groups: dict[tuple[str, str, int | None, str], list[Parameter]] = {}
     for parameter in parameters.parameters:
@@ -40,8 +40,10 @@ def possible_pools(parameters: ParameterSet, names: Collection[str]) -> list[Poo
     taken = set(parameters.names)
     pools = []
     for (kind, field, _, _), members in groups.items():
+        pool = None
         if len(members) >= MIN_MEMBERS:
             pool = _pool(f"{kind}_{field}", members, taken)
+        if pool is not None:
             taken.add(pool.name)
             pools.append(pool)
     return pools
@@ -56,8 +58,10 @@ def _is_plain(parameter: Parameter) -> bool:
     return is_number and parameter.prior is None and not parameter.per_recording
 
 
-def _pool(stem: str, members: Sequence[Parameter], taken: Collection[str]) -> PooledParameter:
-    """One parameter in place of several.
+def _pool(
+    stem: str, members: Sequence[Parameter], taken: Collection[str]
+) -> PooledParameter | None:
+    """One parameter in place of several; None where no value lies within the bounds of all.
 
     Where all guesses have one sign and differ, it is a factor on the guesses, because elements of
     different size have different values.
@@ -76,6 +80,9 @@ def _pool(stem: str, members: Sequence[Parameter], taken: Collection[str]) -> Po
     # The pool keeps the bounds of all members.
     low = max(min(bound / s for bound in m.bounds) for m, s in zip(members, scales, strict=True))
     high = min(max(bound / s for bound in m.bounds) for m, s in zip(members, scales, strict=True))
+    if not low < high:
+        return None
+    guess = float(np.clip(guess, low, high))
     sizes = [m.scale / abs(s) for m, s in zip(members, scales, strict=True)]
     return PooledParameter(
         name=name,
@@ -85,7 +92,7 @@ def _pool(stem: str, members: Sequence[Parameter], taken: Collection[str]) -> Po
         guess=guess,
         unit="" if is_factor else members[0].unit,
         scale=max(1.0, *sizes) if is_factor else max(sizes),
-        bounds=(float(low), float(high)) if low < high else (-np.inf, np.inf),
+        bounds=(float(low), float(high)),
     )
 
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjfim.identification.held_out_losses import HeldOutLosses
+import mjfim
+from mjfim.budget import Budget
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.held_out_losses import HeldOutLosses, held_out_losses
+from mjfim.identification.identify import least_squares
+from tests.support.paths import ROOT
 
 
 def losses(
@@ -83,3 +90,34 @@ def test_the_jackknife_gives_the_standard_error_of_a_mean() -> None:
         losses=np.ones(1), counts=np.ones(1), parts=np.zeros(1, dtype=int), estimates=left_out
     )
     assert found.jackknife[0] == pytest.approx(data.std(ddof=1) / 5.0)
+
+
+@pytest.mark.parametrize(
+    ("segments", "parts"),
+    [
+        ("whole", 5),
+        pytest.param(0.75, 5, marks=pytest.mark.slow),
+        pytest.param(0.2, 4, marks=pytest.mark.slow),
+    ],
+)
+def test_a_single_recording_is_predicted_in_parts(segments: float | str, parts: int) -> None:
+    """Each part is a stretch of the recording, also of a whole one or of two segments."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    experiment = base.replace(horizon=1.5, fit={"segments": segments})
+    task = DesignTask.resolve(experiment, threads=1)
+    recording = simulate_system(task.system, task.initial, 1)
+    problem = FitProblem.of(task.system, [recording])
+    solution = least_squares(problem, np.array([2.0, 1.0, 1.0]))
+    found = held_out_losses(problem, solution, problem.noise.sigma, Budget())
+    assert found is not None
+
+    # All values are predicted once.
+    assert len(found.estimates) == parts
+    assert set(found.parts.tolist()) == set(range(parts))
+    assert found.counts.sum() == sum(int(mask.sum()) for mask in problem.masks)
+
+    # The estimates without each part scatter about as much as the noise explains.
+    std = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
+    assert (found.jackknife < 4.0 * std).all()
+    assert (found.jackknife > std / 4.0).all()
+    assert found.error == pytest.approx(1.0, abs=0.2)

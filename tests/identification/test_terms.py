@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -169,13 +168,9 @@ def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind
     term = selected_term(first, system.parameters.names)
     extended = System.resolve(stated.replace(parameters=term.parameters, terms=term.terms))
     assert set(term.parameters) < set(extended.parameters.names)
-    tables = tomllib.loads("\n".join(part.replace("] ", "]\n", 1) for part in lines_of(term.toml)))
-    assert tables["terms"][first.added.name]["kind"] == kind
-
-
-def lines_of(toml: str) -> list[str]:
-    """The tables of a term, each key in a line of its own."""
-    return [re.sub(r", (\w+ = )", r"\n\1", part) for part in toml.split("; ")]
+    table, *targets = first.recipe.split("; ")
+    assert tomllib.loads(table)["terms"][first.added.name]["kind"] == kind
+    assert tomllib.loads(targets[0]) == {"target": first.path}
 
 
 @pytest.mark.slow

@@ -9,19 +9,24 @@ import pytest
 
 import mjfim
 from mjfim.budget import StopToken
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
 from mjfim.records.recording import Recording
 from mjfim.records.selection import Decision
+from mjfim.studies import selection as selection_study
+from mjfim.studies.selection import select_terms_system
 from tests.support.paths import ROOT
 
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
 
 
-def stated(**tables: object) -> mjfim.Experiment:
+def stated(segments: str | None = None, **tables: object) -> mjfim.Experiment:
     """The cart-pendulum under a multisine."""
     base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
-    return base.replace(initial={"control": CONTROL}, fit={"bootstrap": 0}, **tables)
+    fit = {"bootstrap": 0} if segments is None else {"bootstrap": 0, "segments": segments}
+    return base.replace(initial={"control": CONTROL}, fit=fit, **tables)
 
 
 def recorded(
@@ -109,6 +114,59 @@ def test_a_selection_that_is_stopped_returns_what_it_has(tmp_path: Path) -> None
     found = mjfim.select_terms(stated(), logs, stop=stop, callback=lambda event: stop.request())
     assert found.interrupted
     assert len(found.theta) == 3
+
+    # The selection says that nothing was tried.
+    assert found.selection is not None
+    assert "interrupted before a term was tried" in str(found.selection)
+    assert "σ" not in str(found.selection)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("segments", [None, "whole"])
+def test_a_selection_that_cannot_predict_left_out_data_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segments: str | None
+) -> None:
+    """The estimate is that of an ordinary identification, with the length that it chooses."""
+    monkeypatch.setattr(selection_study, "held_out_losses", lambda *args: None)
+    logs = recorded(tmp_path, 'frictionloss="0.5"', count=2)
+    experiment = stated() if segments is None else stated(segments=segments)
+    found = select_terms_system(System.resolve(experiment), logs)
+    selection = found.estimate.selection
+    assert selection is not None
+    assert "No part of the recordings could be predicted" in str(selection)
+    assert not found.estimate.interrupted
+
+    plain = mjfim.identify(experiment, logs)
+    np.testing.assert_allclose(found.estimate.theta, plain.theta, rtol=1e-4)
+    assert (found.estimate.horizons is None) == (segments == "whole")
+
+    # The error that is not known is shown, drawn and saved as such.
+    found.estimate.save(tmp_path / "results")
+    (step,) = mjfim.Estimate.load(tmp_path / "results").selection.steps
+    assert np.isnan(step.error)
+
+
+@pytest.mark.slow
+def test_a_term_with_which_the_simulation_diverges_is_not_added(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverge(*args: object) -> None:
+        """Fail as a fit does whose start cannot be simulated."""
+        raise SimulationDivergedError("the simulation diverges at the start")
+
+    monkeypatch.setattr(selection_study, "refit_task", diverge)
+    found = mjfim.select_terms(stated(), recorded(tmp_path, 'frictionloss="0.5"', count=2))
+    assert found.selection is not None
+    assert not found.selection.terms
+    assert "No further term predicts" in found.selection.ending
+
+
+@pytest.mark.slow
+def test_a_settled_selection_keeps_the_length_that_the_user_left_free(tmp_path: Path) -> None:
+    experiment = stated()
+    found = select_terms_system(System.resolve(experiment), recorded(tmp_path, "", count=2))
+    assert found.system.experiment.fit.segments is None
+    assert found.system.experiment == experiment
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
+from mjfim.model.parameters import ParameterSet
 from mjfim.records.recording import Recording
-from mjfim.records.selection import Decision
+from mjfim.records.selection import Decision, PooledParameter
 from mjfim.studies.selected_models import selected_experiment
 from mjfim.studies.simplification import possible_pools, simplified_experiment
 from tests.support.paths import ROOT
@@ -72,6 +74,29 @@ def test_parameters_of_one_field_are_pooled_by_a_factor_on_their_guesses() -> No
     assert same.scales == (1.0, 1.0)
     assert same.guess == pytest.approx(0.1)
     assert possible_pools(system.parameters, {first}) == []
+
+
+def test_parameters_are_pooled_within_the_bounds_of_all_members() -> None:
+    names = names_of_joints()
+    resolved = System.resolve(arm(**{names[0]: 0.1, names[1]: 0.1})).parameters
+
+    def pools(*stated: tuple[float, float, float]) -> list[PooledParameter]:
+        """The pools of both dampings with a guess and bounds each."""
+        changed = [
+            replace(parameter, guess=guess, bounds=(low, high))
+            for parameter, (guess, low, high) in zip(resolved.parameters, stated, strict=True)
+        ]
+        return possible_pools(ParameterSet(tuple(changed)), names)
+
+    # Guesses of one sign give a factor, which has common bounds, and others a common value.
+    (factor,) = pools((0.1, 0.0, 0.2), (0.6, 0.3, 0.9))
+    assert factor.bounds == pytest.approx((0.5, 1.5))
+    (common,) = pools((0.0, -0.2, 0.2), (0.8, 0.1, 0.9))
+    assert common.bounds == (0.1, 0.2)
+    assert common.guess == 0.2
+
+    # No value lies within the bounds of both.
+    assert pools((0.0, -0.2, 0.2), (0.8, 0.3, 0.9)) == []
 
 
 def test_held_parameters_are_added_to_those_that_the_user_holds() -> None:

@@ -44,6 +44,8 @@ def selection_figure(estimate: Estimate) -> Figure:
         axes.plot(errors, rows, "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
         first += len(phase)
     right = LARGEST_DRAWN_RATIO * max(step.error for step in kept)
+    if np.isnan(right):
+        axes.set_xticks([])
     row = 0
     for step in selection.steps:
         if step.is_kept:
@@ -79,6 +81,8 @@ def _title(estimate: Estimate) -> str:
     selection = estimate.selection
     assert selection is not None
     before, after = selection.errors
+    if np.isnan(before):
+        return "No term was tried"
     if not selection.terms:
         return f"No term was added: held-out error {before:.3g} σ"
     count = len(selection.terms)

@@ -21,7 +21,12 @@ def selection_section(selection: Selection) -> Section:
     Args:
         selection: The selection.
     """
-    kept = [step for step in selection.steps if step.is_kept]
+    # Models that diverge have no finite error, and none was tried where no data could be predicted.
+    finite = [step for step in selection.steps if np.isfinite(step.error)]
+    kept = [step for step in finite if step.is_kept]
+    if not kept:
+        return Section(title="Added terms", parts=describe_selection(selection))
+
     line = curve(
         np.array([float(step.count) for step in kept]),
         np.array([step.error for step in kept]),
@@ -32,8 +37,7 @@ def selection_section(selection: Selection) -> Section:
     line["marker"] = {"size": 8, "color": f"role:{IDENTIFIED.word}"}
     line["text"] = [step.description or "the stated model" for step in kept]
 
-    # Models that diverge have no finite error.
-    tried = [step for step in selection.steps if not step.is_kept and np.isfinite(step.error)]
+    tried = [step for step in finite if not step.is_kept]
     crosses = dots(
         np.array([step.count + 1.0 for step in tried]),
         np.array([step.error for step in tried]),

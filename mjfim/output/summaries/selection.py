@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from mjfim.errors import listed
+from mjfim.output.experiment_tables import table_text
 from mjfim.output.summary_parts import (
     Emphasis,
+    Listing,
     Paragraph,
     Part,
     Quantity,
@@ -34,21 +38,32 @@ def describe_selection(selection: Selection) -> list[Part]:
         selection: The selection.
     """
     parts: list[Part] = [Paragraph(text=str(selection)), _table(selection)]
+    kept = {term.path for term in selection.terms}
     for step in selection.steps:
-        if step.alternatives:
+        if step.alternatives and step.path in kept:
             text = _describe_alternatives(step)
             parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
     if selection.refit is not None:
         parts.append(_describe_refit(selection.refit))
-    tables = [term.toml for term in selection.terms]
-    tables += [f"{pool.toml}, in place of {listed(pool.members)}" for pool in selection.pooled]
-    if selection.held:
-        names = ", ".join(f'"{name}"' for name in selection.held)
-        tables.append(f"[fit] hold = [{names}]")
+    tables = tuple(_tables_to_keep(selection))
     if tables:
-        text = f"To keep this model, change the experiment file: {'; '.join(tables)}"
-        parts.append(Paragraph(text=text, emphasis=Emphasis.WEAK))
+        title = "To keep this model, put these tables into the experiment file"
+        parts.append(Listing(title=title, items=tables, emphasis=Emphasis.WEAK))
     return parts
+
+
+def _tables_to_keep(selection: Selection) -> Iterator[str]:
+    """Yield the tables of the experiment file that state the selected model, as TOML."""
+    for name, table in selection.library_terms.items():
+        yield table_text(("terms", name), table)
+    for name, table in selection.parameters.items():
+        yield table_text(("parameters", name), table)
+
+    for pool in selection.pooled:
+        members = listed([f"[parameters.{member}]" for member in pool.members])
+        yield table_text(("parameters", pool.name), pool.table, f"in place of {members}")
+    if selection.fit_table:
+        yield table_text(("fit",), selection.fit_table, "beside the other keys of this table")
 
 
 def _describe_refit(refit: HeldOutRefit) -> Paragraph:

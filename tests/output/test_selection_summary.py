@@ -1,0 +1,122 @@
+"""The summary of a selection: the table, what is not told apart, and the tables to keep."""
+
+from __future__ import annotations
+
+import tomllib
+
+import mjfim
+from mjfim.experiment.system import System
+from mjfim.output.summaries.selection import describe_selection
+from mjfim.output.summary_parts import Listing, Paragraph
+from mjfim.records.missing_term import AddedTerm, TermParameter
+from mjfim.records.selection import (
+    AlternativeTerm,
+    Decision,
+    SelectedTerm,
+    Selection,
+    SelectionStep,
+)
+from mjfim.studies.selected_models import selected_experiment
+from mjfim.studies.simplification import possible_pools
+from tests.support.paths import ROOT
+
+FRICTION = SelectedTerm(
+    name="slide_frictionloss",
+    description="dry friction of slide",
+    path="joint/slide:frictionloss",
+    unit="N",
+    scale=0.5,
+)
+BEGUN = SelectionStep(decision=Decision.BEGUN, error=2.0)
+
+
+def texts_of(selection: Selection) -> str:
+    """All paragraphs of the summary."""
+    parts = describe_selection(selection)
+    return "\n".join(part.text for part in parts if isinstance(part, Paragraph))
+
+
+def test_alternatives_of_a_removed_term_are_not_named() -> None:
+    other = AlternativeTerm(description="a spring", path="joint/slide:stiffness", values={"m": 2.0})
+    added = SelectionStep(
+        decision=Decision.ADDED,
+        description=FRICTION.description,
+        path=FRICTION.path,
+        count=1,
+        error=1.0,
+        alternatives=(other,),
+    )
+    steps = (BEGUN, added)
+    kept = Selection(terms=(FRICTION,), steps=steps, ending="No further term.")
+    assert "do not tell dry friction of slide apart from a spring" in texts_of(kept)
+    removed = Selection(terms=(), steps=steps, ending="No further term.")
+    assert "do not tell" not in texts_of(removed)
+
+
+def test_the_tables_to_keep_state_the_selected_experiment() -> None:
+    base = mjfim.Experiment.from_file(ROOT / "models" / "double_pendulum.toml")
+    experiment = base.replace(
+        parameters={
+            "d1": {"guess": 0.2, "bounds": [0.0, 5.0]},
+            "d2": {"guess": 0.05, "bounds": [0.0, 5.0]},
+        },
+        fit={"hold": ["m2"], "bootstrap": 0},
+    )
+
+    # A number of the model, a term of the library with two parameters, a pool and held parameters.
+    further = {
+        "stribeck_speed": TermParameter(
+            path="term/elbow_stribeck:velocity", value=0.1, unit="rad/s", scale=1 / 3
+        )
+    }
+    stribeck = SelectedTerm(
+        name="stribeck_friction",
+        description="Stribeck friction of elbow",
+        path="term/elbow_stribeck:friction",
+        unit="N",
+        scale=0.1 + 0.2,
+        further=further,
+        added=AddedTerm(
+            name="elbow_stribeck",
+            kind="stribeck",
+            element="joint",
+            element_name="elbow",
+            values={"velocity": 1e-5},
+        ),
+    )
+    (pool,) = possible_pools(System.resolve(experiment).parameters, ("d1", "d2"))
+    selection = Selection(
+        terms=(FRICTION, stribeck),
+        steps=(BEGUN,),
+        ending="No further term.",
+        pooled=(pool,),
+        held=("I1",),
+        hold=("m2", "I1"),
+        segments=0.123456789,
+    )
+    (listing,) = (part for part in describe_selection(selection) if isinstance(part, Listing))
+    added = tomllib.loads("\n\n".join(listing.items))
+
+    # Pasted, with the tables of the pooled parameters removed, they give the selected experiment.
+    values = experiment.model_dump(exclude_unset=True)
+    kept = {n: t for n, t in stated_tables(experiment).items() if n not in pool.members}
+    pasted = experiment.restated(
+        {
+            **values,
+            "terms": added["terms"],
+            "parameters": {**kept, **added["parameters"]},
+            "fit": {**values["fit"], **added["fit"]},
+        }
+    )
+    assert pasted == selected_experiment(experiment, selection)
+    assert pasted.fit.hold == ("m2", "I1")
+    assert pasted.fit.segments == 0.123456789
+    assert "# in place of [parameters.d1], [parameters.d2]" in listing.items[-2]
+
+    # The lines fit into a terminal, so that none is folded.
+    assert max(len(line) for item in listing.items for line in item.split("\n")) < 76
+
+
+def stated_tables(experiment: mjfim.Experiment) -> dict[str, object]:
+    """The tables of the parameters of an experiment."""
+    return dict(experiment.model_dump(exclude_unset=True)["parameters"])
