@@ -29,6 +29,7 @@ from mjfim.identification.flipped_signs import (
     sentence_about_signs,
     sufficient_squares,
 )
+from mjfim.identification.honest_covariance import with_honest_covariance
 from mjfim.identification.laws_in_loop import laws_in_loop
 from mjfim.identification.missing_terms import find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
@@ -308,7 +309,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         values = solution.unknowns.per_recording[:, column]
         per_recording[parameters.names[j]] = tuple(values.tolist())
 
-    return Estimate(
+    estimate = Estimate(
         parameters=parameters.names,
         units=system.units,
         prior=parameters.prior_information + CadPrior.of(parameters).information(result.theta),
@@ -356,6 +357,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         recording_comparison=findings.comparison,
         prior_directions=accuracy.prior_directions,
     )
+    return with_honest_covariance(estimate, parameters, accuracy.robust_covariance)
 
 
 def _clipped_shares(result: FitResult) -> dict[str, float]:

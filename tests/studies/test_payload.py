@@ -12,7 +12,7 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
-from mjfim.identification.parameter_draws import honest_covariance
+from mjfim.identification.honest_covariance import honest_covariance
 from mjfim.studies.payload import PayloadTask
 from mjfim.studies.payload_experiment import RobotExperiment
 
@@ -116,7 +116,7 @@ def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Pa
     parameters = task.system().parameters
     index = [parameters.names.index(name) for name in ROBOT]
     information = parameters.prior_information[np.ix_(index, index)]
-    expected = np.linalg.inv(honest_covariance(system, estimate))
+    expected = np.linalg.inv(honest_covariance(system.parameters, estimate))
     np.testing.assert_allclose(information, expected, rtol=1e-8)
     np.testing.assert_array_equal(parameters.guess[index], theta)
 
