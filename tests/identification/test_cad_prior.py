@@ -16,6 +16,7 @@ from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import _unseen_directions
 from mjfim.identification.prior_share import prior_directions
+from mjfim.identification.report import _implausible_estimates
 from mjfim.identification.task import FitTask
 from mjfim.model.inertia_distance import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step
@@ -172,6 +173,20 @@ def test_directions_without_data_have_the_prior_alone(tmp_path: Path) -> None:
     # Nothing is to be said where the recordings know everything.
     std = np.sqrt(np.diag(np.linalg.inv(1e4 * known)))
     assert prior_directions(parameters, theta, 1e4 * known, std) is None
+
+
+def test_an_inertia_that_contradicts_the_model_is_named(tmp_path: Path) -> None:
+    """A body that is f times as heavy and large in all moments is 2 ln f from the model."""
+    parameters = System.resolve(arm(tmp_path, cad_prior=0.5)).parameters
+    theta = np.array(parameters.guess)
+    assert not list(_implausible_estimates(parameters, theta))
+
+    # The first log-Cholesky coordinate is half of the logarithm of the mass.
+    theta[0] += 0.5 * np.log(4.0)
+    assert not list(_implausible_estimates(parameters, theta))
+    theta[0] += 0.5 * np.log(2.0)
+    (text,) = _implausible_estimates(parameters, theta)
+    assert text.startswith("the inertia of link1 is 8 prior standard deviations (cad_prior)")
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from mjfim.errors import first_ones
@@ -45,7 +47,28 @@ def describe_samples(estimate: Estimate) -> list[Part]:
             "determine."
         )
         parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
+    parts += [Paragraph(text=text, emphasis=Emphasis.WARNING) for text in _about_equal(estimate)]
     return parts
+
+
+def _about_equal(estimate: Estimate) -> Iterator[str]:
+    """Sentences about what is equal in all drawn robots although it is not known."""
+    draws, directions = estimate.draws, estimate.prior_directions
+    assert draws is not None
+    if draws.held_combinations and directions is not None:
+        yield (
+            f"The drawn robots differ in {directions.determined} of {directions.count} "
+            f"combinations of the inertial parameters of {first_ones(directions.bodies)}. The "
+            f"recordings do not determine the other {draws.held_combinations}, which are those of "
+            "the estimate in all robots; what is wrong in them is not covered."
+        )
+
+    held = [name for name in estimate.held if name in draws.parameters]
+    if held:
+        yield (
+            f"The drawn robots do not differ in {first_ones(held)}, which the fit held at the "
+            "guess; its error is not covered."
+        )
 
 
 def _table(estimate: Estimate) -> SummaryTable:
@@ -76,7 +99,7 @@ def _table(estimate: Estimate) -> SummaryTable:
         rows=rows,
         note=(
             "σ is that of the 95 % intervals, before the bounds cut the distribution off; a bound "
-            "shifts the median."
+            "shifts the median. It is smaller where combinations of inertias stay at the estimate."
         ),
         detail=True,
     )
