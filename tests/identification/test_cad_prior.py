@@ -135,6 +135,24 @@ def test_inertias_move_along_straight_lines_of_barycentric_coordinates(
     assert problem.prior_rows.along_step(begin, 100.0 * common) is None
 
 
+def test_a_step_to_a_rod_ends_before_it(tmp_path: Path) -> None:
+    """Rounding makes a rod of a body that is one to nine digits."""
+    parameters = System.resolve(arm(tmp_path)).parameters
+    body = CadPrior.of(parameters).bodies[0]
+    thin = np.array(parameters.guess[body.columns])
+    thin[1] = thin[3] - 10.3
+    linear = body.linear(thin)
+    assert body.is_physical(linear)
+
+    # Towards the rod, nothing is left, and away from it everything.
+    step = np.zeros(10)
+    step[1] = -1.0
+    assert body.physical_share(thin, step) == 0.0
+    assert not body.is_physical_after(thin, 0.49 * step)
+    assert body.physical_share(thin, -step) == 1.0
+    assert body.is_physical(body.linear(body.moved(thin, -step)))
+
+
 def test_rows_along_a_step_have_the_derivatives_of_differences(
     tmp_path: Path, log: Recording
 ) -> None:

@@ -80,11 +80,12 @@ def log(stated: mjfim.Experiment, seed: int) -> mjfim.Recording:
     return mjfim.simulate(stated, trajectory, seed=seed)
 
 
-def with_whole_hand(stated: mjfim.Experiment) -> mjfim.Experiment:
-    """The arm with an unknown inertia of the hand in place of its mass."""
+def with_whole_links(stated: mjfim.Experiment) -> mjfim.Experiment:
+    """The arm with unknown inertias of both links in place of the mass of the hand."""
     values = stated.model_dump(exclude_unset=True)
     parameters = {k: v for k, v in values["parameters"].items() if k != "hand_mass"}
-    return stated.restated({**values, "parameters": {**parameters, "hand": {"inertial": "hand"}}})
+    links = {name: {"inertial": name} for name in ("upper", "hand")}
+    return stated.restated({**values, "parameters": {**parameters, **links}})
 
 
 def inside(found: mjfim.Estimate) -> dict[str, bool]:
@@ -187,11 +188,11 @@ def test_a_whole_inertia_of_the_robot_becomes_ten_known_parameters(tmp_path: Pat
 
 def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
     """The covariance of the earlier estimate contains it, with all correlations."""
-    whole = with_whole_hand(experiment(tmp_path))
+    whole = with_whole_links(experiment(tmp_path))
     system = System.resolve(whole)
     parameters = system.parameters
     cad = CadPrior.of(parameters)
-    assert len(cad.bodies) == 1
+    assert len(cad.bodies) == 2
     guess = parameters.guess
     row = np.random.default_rng(1).standard_normal(len(parameters)) / parameters.magnitude
     others = np.setdiff1d(np.arange(len(parameters)), cad.columns)
@@ -212,9 +213,9 @@ def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_load_on_a_hand_whose_inertia_the_model_alone_tells(tmp_path: Path) -> None:
-    robot = with_whole_hand(experiment(tmp_path))
-    loaded = with_whole_hand(experiment(tmp_path, **LOAD, inertia=INERTIA))
+def test_a_load_on_links_whose_inertia_the_model_tells_in_part(tmp_path: Path) -> None:
+    robot = with_whole_links(experiment(tmp_path))
+    loaded = with_whole_links(experiment(tmp_path, **LOAD, inertia=INERTIA))
     earlier = mjfim.identify(robot, [log(robot, 1)])
     assert earlier.prior_directions is not None
     estimate = mjfim.identify_payload(robot, [log(loaded, 2)], body="hand", robot=earlier)
@@ -223,7 +224,7 @@ def test_a_load_on_a_hand_whose_inertia_the_model_alone_tells(tmp_path: Path) ->
     assert estimate.success and payload.is_seen
     assert sum(inside(estimate).values()) >= 3
 
-    # Single inertias of the hand are hardly known, but the load is.
+    # Single inertias of the links are hardly known, but the load is.
     width = float(np.ptp(payload.mass_interval))
     assert width < 0.5 * LOAD["mass"]
 
