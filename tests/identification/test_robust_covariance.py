@@ -387,3 +387,25 @@ def test_inflated_residuals_widen_what_the_data_say_but_not_the_prior() -> None:
         np.testing.assert_array_equal(plain.interval, wide.interval)
         ratio = np.diag(wide.covariance) / np.diag(plain.covariance)
         np.testing.assert_allclose(ratio, factor, rtol=0.35)
+
+
+def test_combinations_known_far_better_than_others_keep_their_digits() -> None:
+    """Two regressors that differ by 1e-5, whose sum is known far better than each factor."""
+    rng = np.random.default_rng(3)
+    first, second = rng.standard_normal((2, 1, 1600))
+    X = np.stack([first, first + 1e-5 * second], axis=2)
+    y = 5.0 * rng.standard_normal((1, 1600))
+    _, condensed = Linear(X).fitted(y)
+    found = robust_uncertainty(
+        condensed,
+        np.zeros(2),
+        condensed.segment_of_block,
+        np.full(len(condensed.segment_of_block), float(FINE)),
+        min_rows=16,
+        draws=0,
+        rng=rng,
+        inflation=25.0,
+    )
+    weights = np.array([1.0, 1.0])
+    known = 5.0 / np.linalg.norm(first + 0.5e-5 * second)
+    assert np.sqrt(weights @ found.covariance @ weights) == pytest.approx(known, rel=0.15)
