@@ -14,7 +14,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.honest_covariance import between_covariance
 from mjfim.identification.independent_blocks import block_length
 from mjfim.identification.prior_share import prior_directions
-from mjfim.identification.robust_covariance import robust_uncertainty
+from mjfim.identification.robust_covariance import inverse_root, robust_uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.optimize.condensed_least_squares import Condensed
@@ -143,7 +143,8 @@ def _formal_covariance(problem: FitProblem, solution: Solution) -> tuple[Array, 
     is_singular = not np.isfinite(common_std).all()
     common: Array = np.full_like(H, np.inf)
     if not is_singular:
-        common = np.asarray(np.linalg.inv(H), dtype=np.float64)
+        root = inverse_root(H)
+        common = root @ root.T
 
     # Common unknowns of the first recording.
     p = len(problem.system.parameters)
