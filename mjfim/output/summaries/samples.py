@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from mjfim.errors import first_ones
+from mjfim.identification.accuracy import POORLY_KNOWN_SHARE
 from mjfim.output.summary_parts import (
     Emphasis,
     Name,
@@ -17,7 +18,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.estimate import Estimate
+from mjfim.records.estimate import NORMAL_95, Estimate
 
 # Heading of the standard deviation of the distribution.
 STD = "σ"
@@ -40,7 +41,7 @@ def describe_samples(estimate: Estimate) -> list[Part]:
             "recordings; find the missing term first (--select), or randomise more widely."
         )
         parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
-    wide = [name for name in estimate.sloppy if name in draws.parameters]
+    wide = [name for name in estimate.sloppy if _is_wide(name, estimate)]
     if wide:
         text = (
             f"The drawn robots differ widely in {first_ones(wide)}, which the recordings hardly "
@@ -49,6 +50,17 @@ def describe_samples(estimate: Estimate) -> list[Part]:
         parts.append(Paragraph(text=text, emphasis=Emphasis.WARNING))
     parts += [Paragraph(text=text, emphasis=Emphasis.WARNING) for text in _about_equal(estimate)]
     return parts
+
+
+def _is_wide(name: str, estimate: Estimate) -> bool:
+    """Whether robots differ widely in a parameter, also where combinations of others are held."""
+    draws = estimate.draws
+    assert draws is not None
+    if name not in draws.parameters:
+        return False
+    half_width = NORMAL_95 * float(draws.std[draws.parameters.index(name)])
+    size = float(estimate.sizes[estimate.parameters.index(name)])
+    return half_width > POORLY_KNOWN_SHARE * size
 
 
 def _about_equal(estimate: Estimate) -> Iterator[str]:
