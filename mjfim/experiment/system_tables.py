@@ -273,7 +273,8 @@ class ParameterSpec(Section):
             "standard deviation of the logarithm of the pseudo-inertia relative to it. With 1, "
             "mass and second moments are right within a factor of e or so; this holds only what "
             "the recordings hardly determine. false: no prior knowledge. Default: 1 without "
-            "`prior`, false with it."
+            "`prior`, false with it. Only fits use it; `design` and `check` count what motions "
+            "show, without it."
         ),
     )
     unit: str = Field(

@@ -11,9 +11,10 @@ from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.honest_covariance import between_covariance
 from mjfim.identification.independent_blocks import block_length
 from mjfim.identification.prior_share import prior_directions
-from mjfim.identification.robust_covariance import robust_uncertainty
+from mjfim.identification.robust_covariance import inverse_root, robust_uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.optimize.condensed_least_squares import Condensed
@@ -47,6 +48,8 @@ class Accuracy:
     Attributes:
         std: (p,) formal standard deviations [theta-unit].
         covariance: (p, p) formal covariance.
+        robust_covariance: (p, p) covariance that allows for autocorrelated residuals and for
+            recordings that disagree; infinite on the diagonal where a parameter is not determined.
         sandwich: (p,) standard deviations that allow for autocorrelated residuals [theta-unit].
         interval: (p, 2) 95 % intervals [theta-unit].
         between: (p,) standard deviations from recording to recording [theta-unit].
@@ -62,6 +65,7 @@ class Accuracy:
 
     std: Array
     covariance: Array
+    robust_covariance: Array
     sandwich: Array
     interval: Array
     between: Array
@@ -114,6 +118,7 @@ def accuracy_of(
     return Accuracy(
         std=std,
         covariance=covariance,
+        robust_covariance=_robust_covariance(problem, solution, covariance, std, robust),
         sandwich=sandwich,
         interval=interval,
         between=between,
@@ -138,7 +143,8 @@ def _formal_covariance(problem: FitProblem, solution: Solution) -> tuple[Array, 
     is_singular = not np.isfinite(common_std).all()
     common: Array = np.full_like(H, np.inf)
     if not is_singular:
-        common = np.asarray(np.linalg.inv(H), dtype=np.float64)
+        root = inverse_root(H)
+        common = root @ root.T
 
     # Common unknowns of the first recording.
     p = len(problem.system.parameters)
@@ -211,6 +217,41 @@ def _robust(
         own=problem.layout.own_columns,
         inflation=inflation,
     )
+
+
+def _robust_covariance(
+    problem: FitProblem, solution: Solution, formal: Array, std: Array, robust: Uncertainty | None
+) -> Array:
+    """(p, p) robust covariance of the parameters, with the scatter between recordings.
+
+    Args:
+        problem: The least-squares problem.
+        solution: Its solution.
+        formal: (p, p) formal covariance, which counts where there is no robust one.
+        std: (p,) formal standard deviations, infinite where a parameter is not determined.
+        robust: Robust uncertainty of the common unknowns, or None.
+    """
+    layout = problem.layout
+    covariance = np.array(formal)
+    if robust is not None:
+        common = robust.covariance + between_covariance(robust)
+        columns = layout.first_columns
+        index = layout.parameter_of_column[columns]
+        covariance[np.ix_(index, index)] = common[np.ix_(columns, columns)]
+
+        # Deviations of the first initial state follow the common unknowns.
+        private = layout.private
+        if len(private) and not layout.free_starts:
+            of_private, cross = _private_covariance(solution.condensed, common, columns)
+            covariance[np.ix_(private, private)] = of_private
+            covariance[np.ix_(private, index)] = cross
+            covariance[np.ix_(index, private)] = cross.T
+
+    is_unknown = ~np.isfinite(std) | ~np.isfinite(np.diag(covariance))
+    covariance[is_unknown] = 0.0
+    covariance[:, is_unknown] = 0.0
+    covariance[is_unknown, is_unknown] = np.inf
+    return covariance
 
 
 def independent_rows(problem: FitProblem, correlation_rows: Sequence[float]) -> float:

@@ -94,7 +94,10 @@ class UnknownBody:
         change = np.tensordot(step, logcholesky_derivatives(values), axes=1)
         inverse = np.linalg.inv(logcholesky_factor(values))
         smallest = float(np.linalg.eigvalsh(inverse @ change @ inverse.T)[0])
-        return min(1.0, -TO_BOUNDARY / smallest) if smallest < 0.0 else 1.0
+        share = min(1.0, -TO_BOUNDARY / smallest) if smallest < 0.0 else 1.0
+
+        # Near a rod or a plate, rounding may leave no way.
+        return share if self.is_physical_after(values, share * step) else 0.0
 
     def is_physical_after(self, values: Array, step: Array) -> bool:
         """Whether `moved` leads to a body with a volume, from parameters (10,) by a step (10,)."""
@@ -116,7 +119,9 @@ class UnknownBody:
 
     def is_physical(self, linear: Array) -> bool:
         """Whether the barycentric coordinates: (10,) are those of a body with a volume."""
-        return is_positive_definite(pseudo_inertia_of(linear))
+        if not is_positive_definite(pseudo_inertia_of(linear)):
+            return False
+        return _logcholesky(INERTIA_PARAMETRISATIONS["barycentric"].inertia(linear)) is not None
 
     @property
     def prior_sigma(self) -> float:

@@ -1,36 +1,38 @@
 """Draws of the parameters from the uncertainty of an estimate, for domain randomisation.
 
-The distribution is normal about the estimate and truncated at the bounds. Its standard deviations
-are those of the 95 % intervals, which also cover autocorrelated residuals and recordings that
-disagree; its correlations are those of the formal covariance. Draws with an unphysical inertia are
-replaced.
+The distribution is normal about the estimate, with its honest covariance
+(`mjfim/identification/honest_covariance.py`), and truncated at the bounds. Inertias of whole bodies
+move along straight lines of their barycentric coordinates, along which forces are linear, so that
+combinations that the recordings know well stay known in the drawn robots. Combinations that only
+the CAD prior determines stay at the estimate. Draws with an unphysical inertia are replaced.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-import scipy
 
 from mjfim.amounts import MAX_SAMPLES
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, first_ones, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.honest_covariance import (
+    covariance_root,
+    honest_covariance,
+)
+from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
+from mjfim.identification.prior_share import InertiaCombinations
 from mjfim.identification.truncated_normal import draw_truncated_normal
+from mjfim.model.parameters import ParameterSet
 from mjfim.model.targets import ModelField
 from mjfim.records.estimate import Estimate
 from mjfim.records.parameter_draws import ParameterDraws
 
-# Half width of the 95 % interval of a normal distribution [standard deviations].
-HALF_WIDTH = float(scipy.special.ndtri(0.975))
-
-# Distance of the end of an interval from a bound, relative to the width of the interval, at which
-# the bound has cut the interval off.
-CUT_OFF = 1e-9
-
 # Number of times that draws with an unphysical inertia are replaced before the search for physical
 # ones is given up.
-MAX_ROUNDS = 50
+MAX_ROUNDS = 200
 
 
 def draw_parameters(
@@ -39,8 +41,8 @@ def draw_parameters(
     """Draw robots that are compatible with an estimate, for domain randomisation.
 
     Args:
-        experiment: The experiment that was identified; with added terms,
-            `experiment.replace(parameters=estimate.selection.parameters)`.
+        experiment: The experiment that was identified; after a selection of terms,
+            `mjfim.selected_experiment(experiment, estimate.selection)`.
         estimate: The estimate.
         count: Number of robots, from 1 to 10 000.
         rng: Source of random numbers.
@@ -82,12 +84,12 @@ def draw_parameters_system(
         raise ExperimentError(
             f"the estimate is one of other parameters ({first_ones(estimate.parameters)}) than the "
             f"experiment ({first_ones(names)}); after a selection of terms, use "
-            "experiment.replace(parameters=estimate.selection.parameters)"
+            "mjfim.selected_experiment(experiment, estimate.selection)"
         )
 
     # Deviations of the initial state belong to a recording, not to the robot.
     drawn = np.flatnonzero(~system.parameters.initial_deviations)
-    covariance = honest_covariance(system, estimate)[np.ix_(drawn, drawn)]
+    covariance = honest_covariance(system.parameters, estimate)[np.ix_(drawn, drawn)]
     undetermined = [names[j] for j in drawn[~np.isfinite(np.diag(covariance))]]
     if undetermined:
         raise ExperimentError(
@@ -105,6 +107,8 @@ def draw_parameters_system(
             "are drawn; identify with the method least_squares, which keeps bounds"
         )
 
+    combinations = _undetermined(system.parameters, estimate, drawn)
+    covariance = _with_held(covariance, combinations)
     values, replaced = _physical_draws(
         system, estimate, drawn, centre, covariance, count=count, rng=rng
     )
@@ -115,6 +119,7 @@ def draw_parameters_system(
         centre=centre,
         std=np.sqrt(np.diag(covariance)),
         replaced=replaced,
+        held_combinations=len(combinations),
     )
 
 
@@ -135,56 +140,45 @@ def complete_theta(system: System, estimate: Estimate, draws: ParameterDraws, ro
     return theta
 
 
-def honest_covariance(system: System, estimate: Estimate) -> Array:
-    """(p, p) covariance with the standard deviations that the 95 % intervals stand for.
-
-    An end of an interval that a bound cuts off says nothing about the width, so that the other side
-    counts there. Parameters that differ between recordings also scatter as they do between them.
-    The correlations are those of the formal covariance.
+def _undetermined(parameters: ParameterSet, estimate: Estimate, drawn: np.ndarray) -> Array:
+    """(m, q) weights in the combinations of inertias that only the CAD prior determines.
 
     Args:
-        system: The system that was identified.
+        parameters: The parameters.
         estimate: The estimate.
-
-    Returns:
-        The covariance [products of theta-units]; infinite on the diagonal where a parameter is not
-        determined.
+        drawn: (q,) indices in theta of the drawn parameters, ascending.
     """
-    std = _honest_std(system, estimate)
-    for name, values in estimate.per_recording.items():
-        if len(values) > 1:
-            j = estimate.parameters.index(name)
-            std[j] = np.hypot(std[j], np.std(values, ddof=1))
+    found = None
+    if len(estimate.data) == len(parameters):
+        found = InertiaCombinations.of(parameters, estimate.theta, estimate.data)
+    if found is None:
+        return np.zeros((0, len(drawn)))
 
-    # A parameter that the fit holds has no correlation with the others.
-    formal = np.sqrt(np.diag(estimate.covariance))
-    is_known = np.isfinite(formal) & (formal > 0.0)
-    scale = np.where(is_known, 1.0 / np.where(is_known, formal, 1.0), 0.0)
-    shared = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
-    correlation = scale[:, None] * shared * scale
-    np.fill_diagonal(correlation, 1.0)
-
-    is_finite = np.isfinite(std)
-    finite = np.where(is_finite, std, 0.0)
-    covariance = finite[:, None] * correlation * finite
-    covariance[~is_finite, ~is_finite] = np.inf
-    return np.asarray(covariance)
+    of_inertias = found.undetermined
+    weights = np.zeros((len(of_inertias), len(drawn)))
+    weights[:, np.searchsorted(drawn, found.columns)] = of_inertias
+    return weights
 
 
-def _honest_std(system: System, estimate: Estimate) -> Array:
-    """(p,) standard deviations of normal distributions with the 95 % intervals [theta-unit]."""
-    low, high = estimate.interval.T
-    below, above = estimate.theta - low, high - estimate.theta
-    width = high - low
-    tolerance = CUT_OFF * np.where(np.isfinite(width), width, 0.0)
-    is_cut_below = low <= system.parameters.lower + tolerance
-    is_cut_above = high >= system.parameters.upper - tolerance
+def _with_held(covariance: Array, combinations: Array) -> Array:
+    """(q, q) covariance of a normal distribution given that some combinations stay as they are.
 
-    # Half of the width, and the longer side where a bound has cut the other one off. Where bounds
-    # have cut both, the interval says nothing, and the deviations that led to it remain.
-    half_width = np.where(is_cut_below | is_cut_above, np.maximum(below, above), 0.5 * width)
-    robust = np.hypot(estimate.std_sandwich, estimate.between_recordings)
-    return np.asarray(np.maximum(half_width / HALF_WIDTH, np.maximum(estimate.std, robust)))
+    What is known of sums, such as a moment of inertia and the armature of its joint, is known of
+    the parameters that are still drawn.
+
+    Args:
+        covariance: (q, q) covariance.
+        combinations: (m, q) weights of the combinations.
+    """
+    if not len(combinations):
+        return covariance
+    root = covariance_root(covariance)
+    weights = combinations @ root
+
+    # Roots orthogonal to the combinations, which lose no digits of what is known well.
+    _, _, axes = np.linalg.svd(weights)
+    kept = root @ axes[len(combinations) :].T
+    return np.asarray(kept @ kept.T)
 
 
 def _centre(estimate: Estimate) -> Array:
@@ -220,14 +214,21 @@ def _physical_draws(
         ExperimentError: Hardly any draw is physical.
     """
     lower, upper = system.parameters.lower[drawn], system.parameters.upper[drawn]
+    places = [
+        (body, np.searchsorted(drawn, body.columns)) for body in unknown_bodies(system.parameters)
+    ]
     values = np.zeros((count, len(drawn)))
     missing = np.arange(count)
     replaced = 0
 
     for _ in range(MAX_ROUNDS):
-        values[missing] = draw_truncated_normal(centre, covariance, lower, upper, len(missing), rng)
-        is_physical = [_is_physical(system, estimate, drawn, values[i]) for i in missing]
-        missing = missing[~np.array(is_physical)]
+        tried = draw_truncated_normal(centre, covariance, lower, upper, len(missing), rng)
+        is_physical = np.zeros(len(missing), dtype=bool)
+        for i, row in zip(missing, range(len(missing)), strict=True):
+            robot = _moved(places, centre, tried[row])
+            if robot is not None and _is_physical(system, estimate, drawn, robot):
+                values[i], is_physical[row] = robot, True
+        missing = missing[~is_physical]
         if not len(missing):
             return values, replaced
         replaced += len(missing)
@@ -235,9 +236,27 @@ def _physical_draws(
     raise ExperimentError(
         f"{len(missing)} of {count} drawn robots still had an unphysical inertia after they had "
         f"been replaced {MAX_ROUNDS} times; the recordings determine the inertias too poorly. "
-        'State them in the coordinates "logcholesky", which are physical for all values, or with '
-        "a `prior`"
+        "State them as a whole (`inertial`) with a `cad_prior`, or with a narrower `prior`"
     )
+
+
+def _moved(
+    places: Sequence[tuple[UnknownBody, np.ndarray]], centre: Array, values: Array
+) -> Array | None:
+    """(q,) parameters whose inertias have moved along straight lines; None where no body is there.
+
+    Args:
+        places: Bodies whose whole inertia is drawn, and the (10,) places of their coordinates.
+        centre: (q,) parameters at which the lines begin.
+        values: (q,) parameters without curvature, drawn from the normal distribution.
+    """
+    robot = np.array(values)
+    for body, place in places:
+        begin, step = centre[place], values[place] - centre[place]
+        if not body.is_physical_after(begin, step):
+            return None
+        robot[place] = body.moved(begin, step)
+    return robot
 
 
 def _is_physical(system: System, estimate: Estimate, drawn: np.ndarray, values: Array) -> bool:

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget
@@ -29,6 +30,7 @@ from mjfim.identification.flipped_signs import (
     sentence_about_signs,
     sufficient_squares,
 )
+from mjfim.identification.honest_covariance import with_honest_covariance
 from mjfim.identification.laws_in_loop import laws_in_loop
 from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
@@ -302,7 +304,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         values = solution.unknowns.per_recording[:, column]
         per_recording[parameters.names[j]] = tuple(values.tolist())
 
-    return Estimate(
+    estimate = Estimate(
         parameters=parameters.names,
         units=system.units,
         prior=parameters.prior_information + CadPrior.of(parameters).information(result.theta),
@@ -351,6 +353,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         recording_comparison=findings.comparison,
         prior_directions=accuracy.prior_directions,
     )
+    return with_honest_covariance(estimate, parameters, accuracy.robust_covariance)
 
 
 def _clipped_shares(result: FitResult) -> dict[str, float]:
@@ -568,7 +571,7 @@ def _warnings_of_bounds(findings: _Findings) -> Iterator[str]:
 
 
 def _implausible_estimates(parameters: ParameterSet, theta: Array) -> Iterator[str]:
-    """Warnings about estimates that contradict their stated priors."""
+    """Warnings about estimates that contradict their stated priors, or the CAD prior."""
     for parameter, value in zip(parameters.parameters, theta, strict=True):
         if parameter.prior is None:
             continue
@@ -578,4 +581,18 @@ def _implausible_estimates(parameters: ParameterSet, theta: Array) -> Iterator[s
             yield (
                 f"{parameter.name} is {distance:.0f} prior standard deviations from its guess: "
                 "the prior or the estimate is wrong"
+            )
+
+    # The prior of an inertia is normal in ten directions, so that its distance is compared with the
+    # quantile of as rare an event.
+    rare = 2.0 * scipy.special.ndtr(-IMPLAUSIBLE_PRIOR_DISTANCE)
+    for body in CadPrior.of(parameters).bodies:
+        residual = body.difference(theta[body.columns]).residual / body.prior_sigma
+        distance = float(np.linalg.norm(residual))
+        if distance > np.sqrt(scipy.special.chdtri(len(residual), rare)):
+            group = parameters.parameters[int(body.columns[0])].group
+            yield (
+                f"the inertia of {group} is {distance:.0f} prior standard deviations (cad_prior) "
+                "from that of the model: the model's inertia, its cad_prior or the estimate is "
+                "wrong"
             )

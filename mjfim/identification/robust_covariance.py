@@ -107,16 +107,18 @@ def robust_uncertainty(
 
     # Sandwich and formal covariance.
     H = blocks.information.sum(axis=0) + blocks.prior_information
-    inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
+    root = inverse_root(H)
+    inverse = root @ root.T
     centred = blocks.scores - blocks.scores.mean(axis=0)
-    S = centred.T @ centred * (count / max(count - 1, 1)) + blocks.prior_information
-    of_scatter = inverse @ S @ inverse
+    along = centred @ root
+    scatter = along.T @ along * (count / max(count - 1, 1))
+    of_scatter = _in_unknowns(scatter + root.T @ blocks.prior_information @ root, root)
     sandwich = np.sqrt(np.maximum(np.diag(of_scatter), 0.0))
     formal = np.sqrt(np.maximum(np.diag(inverse), 0.0))
 
     # Larger and correlated residuals widen what the data say, but not the priors.
     data = inflation * blocks.information.sum(axis=0) + blocks.prior_information
-    of_noise = inverse @ data @ inverse
+    of_noise = _in_unknowns(root.T @ data @ root, root)
 
     replicates = _bootstrap(blocks, draws, rng)
 
@@ -144,6 +146,35 @@ def robust_uncertainty(
         draws=theta + replicates,
         covariance=covering_covariance(of_noise, _student_factor(count) ** 2 * of_scatter),
     )
+
+
+def inverse_root(information: Array) -> Array:
+    """(c, k) factor A of the pseudo-inverse `A A'` of an information: (c, c).
+
+    Products with the factor keep the digits of combinations that are known far better than others,
+    which products with the inverse lose.
+
+    Args:
+        information: (c, c) information of the unknowns.
+
+    Returns:
+        (c, k) factor; eigenvalues of the scaled information that count as zero are left out.
+    """
+    scaled, scale = scaled_to_unit_diagonal(information)
+    values, vectors = np.linalg.eigh(scaled)
+    is_known = values > INVERSE_TOLERANCE * values.max(initial=0.0)
+    return np.asarray(vectors[:, is_known] / np.sqrt(values[is_known]) / scale[:, None])
+
+
+def _in_unknowns(covariance: Array, root: Array) -> Array:
+    """(c, c) covariance of the unknowns from that of the coordinates of a root.
+
+    Args:
+        covariance: (k, k) covariance of the coordinates, symmetric but for rounding, which would
+            not be small in combinations that are known well.
+        root: (c, k) the root.
+    """
+    return np.asarray(root @ (0.5 * (covariance + covariance.T)) @ root.T)
 
 
 def covering_covariance(first: Array, second: Array) -> Array:

@@ -110,6 +110,13 @@ class Estimate(ShownRecord):
         prior_directions: Combinations of inertias that the recordings do not determine, but the
             inertias of the model (`cad_prior`); None without any.
         payload: The payload that was looked for; None where none was.
+        honest_covariance: (p, p) covariance that agrees with the intervals, for combinations of
+            parameters: with weights w, the standard deviation is `sqrt(w @ honest_covariance @ w)`.
+            It contains the noise of the stated or estimated size, its autocorrelation, priors,
+            disagreement between recordings, lengths of segments and the selection of terms. It
+            contains neither the bias of a wrong model nor the errors of held parameters, and no
+            scatter of parameters that are stated to differ between recordings. Infinite on the
+            diagonal where a parameter is not determined; empty in records of earlier versions.
     """
 
     parameters: tuple[str, ...]
@@ -164,6 +171,7 @@ class Estimate(ShownRecord):
     prior_directions: PriorDirections | None = None
     payload: PayloadEstimate | None = None
     tested_data: TermTestData | None = None
+    honest_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
@@ -198,6 +206,7 @@ class Estimate(ShownRecord):
 
         freeze(self, "theta", "std", "covariance", "initial_theta", "data", "prior")
         freeze(self, "std_sandwich", "interval", "between_recordings", "trace", "sizes")
+        freeze(self, "honest_covariance")
 
     @property
     def guess_sizes(self) -> Array:
@@ -233,6 +242,7 @@ class Estimate(ShownRecord):
             "theta": self.theta,
             "std": self.std,
             "covariance": self.covariance,
+            "honest_covariance": self.honest_covariance,
             "initial_theta": self.initial_theta,
             "sizes": self.sizes,
             "chi2": self.chi2,
@@ -479,7 +489,8 @@ class Uncertainty:
         blocks: Number of blocks of the bootstrap.
         draws: (n, c) bootstrap replicates of the estimate.
         covariance: (c, c) covariance that is in every direction at least the formal one and the
-            sandwich one, for combinations of the unknowns; empty in records of earlier versions.
+            sandwich one, without the scatter between recordings; empty in records of earlier
+            versions. `Estimate.honest_covariance` is the one for combinations of parameters.
     """
 
     sandwich: Array

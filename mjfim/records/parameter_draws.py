@@ -23,6 +23,8 @@ class ParameterDraws:
             parameters that differ between them [theta-unit].
         std: (q,) standard deviations of the distribution before truncation [theta-unit].
         replaced: Number of draws that were replaced because a body had an unphysical inertia.
+        held_combinations: Number of combinations of inertias that stay at the estimate, because the
+            recordings do not determine them.
         seed: Seed of the draws; None where the caller has made the generator.
     """
 
@@ -32,6 +34,7 @@ class ParameterDraws:
     centre: Array
     std: Array
     replaced: int = 0
+    held_combinations: int = 0
     seed: int | None = None
 
     def __post_init__(self) -> None:
@@ -44,6 +47,13 @@ class ParameterDraws:
         count = len(self)
         drawn = "1 robot was" if count == 1 else f"{count} robots were"
         text = f"{drawn} drawn from the uncertainty of the estimate, inside the bounds"
+        if self.held_combinations:
+            stay = (
+                "1 combination"
+                if self.held_combinations == 1
+                else (f"{self.held_combinations} combinations")
+            )
+            text += f"; {stay} of inertias that the recordings do not determine stayed there"
         if not self.replaced:
             return text
         times = "once" if self.replaced == 1 else f"{self.replaced} times"
@@ -59,4 +69,5 @@ class ParameterDraws:
             "centre": self.centre,
             "std": self.std,
             "replaced": self.replaced,
+            "held_combinations": self.held_combinations,
         }

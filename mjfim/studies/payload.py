@@ -20,9 +20,9 @@ from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, explain_renamed_arguments, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
+from mjfim.identification.honest_covariance import honest_covariance
 from mjfim.identification.horizons import with_length
 from mjfim.identification.identify import Callback, fit_task, identify_system
-from mjfim.identification.parameter_draws import honest_covariance
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import FitSearch
 from mjfim.identification.task import FitTask
@@ -260,7 +260,8 @@ class PayloadTask:
         """
         if self.earlier is not None:
             system = System.resolve(self.robot.experiment, threads=self.threads)
-            return self._known_from(self.earlier, honest_covariance(system, self.earlier))
+            covariance = honest_covariance(system.parameters, self.earlier)
+            return self._known_from(self.earlier, covariance)
 
         held = list(self.robot.values["fit"].get("hold", ()))
         for name in self._robot_tables():
@@ -318,7 +319,7 @@ class PayloadTask:
         system = self._system(known, {})
         estimate = identify_system(system, without, callback=callback, stop=token)
         now = replace(self, source="the recordings without the payload")
-        return now._known_from(estimate, honest_covariance(system, estimate))
+        return now._known_from(estimate, honest_covariance(system.parameters, estimate))
 
     def _robot_tables(self) -> tuple[str, ...]:
         """Names of the robot's tables of parameters that have one value in all recordings."""

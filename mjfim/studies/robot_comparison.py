@@ -16,7 +16,12 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, first_ones
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
+from mjfim.identification.honest_covariance import (
+    agreeing_covariance,
+    stretched_formal_covariance,
+)
 from mjfim.identification.random_effects import between_variance, f_tail, satterthwaite
+from mjfim.records.combinations import join_names
 from mjfim.records.estimate import NORMAL_95, Estimate
 from mjfim.records.recording import Recording
 from mjfim.records.robot_comparison import RobotComparison
@@ -104,7 +109,7 @@ class _Robot:
         values: (q,) estimates [theta-unit].
         std: (q,) standard deviations, with the scatter between recordings [theta-unit].
         between: (q,) part of the variances that is due to this scatter [squares of theta-units].
-        correlation: (q, q) correlation of the estimates.
+        covariance: (q, q) covariance of the estimates, with these standard deviations.
     """
 
     units: tuple[str, ...]
@@ -112,7 +117,7 @@ class _Robot:
     values: Array
     std: Array
     between: Array
-    correlation: Array
+    covariance: Array
 
     @staticmethod
     def of(estimate: Estimate, parameters: Sequence[str], scatter: _Scatter) -> _Robot:
@@ -124,22 +129,15 @@ class _Robot:
             scatter: Scatter between recordings of both robots.
         """
         index = [estimate.parameters.index(name) for name in parameters]
-        noise = honest_std(estimate)[index]
         between = scatter.tau2 / _effective_numbers(estimate, parameters)
-        variance = noise**2 + between
-        formal = estimate.covariance[np.ix_(index, index)]
-        size = np.sqrt(np.diag(formal))
-        is_known = size > 0.0
-        scale = np.where(is_known, 1.0 / np.where(is_known, size, 1.0), 0.0)
-        correlation = scale[:, None] * formal * scale
-        np.fill_diagonal(correlation, 1.0)
+        std = np.sqrt(honest_std(estimate)[index] ** 2 + between)
         return _Robot(
             units=tuple(estimate.units[j] for j in index),
             is_single=(estimate.sizes == np.abs(estimate.theta))[index],
             values=estimate.theta[index],
-            std=np.sqrt(variance),
+            std=std,
             between=between,
-            correlation=correlation,
+            covariance=_covariance(estimate, index, std),
         )
 
 
@@ -161,6 +159,26 @@ def honest_std(estimate: Estimate) -> Array:
     is_apart = (estimate.between_recordings > 0.0) & (estimate.recording_comparison is not None)
     widened = np.where(is_apart, 0.0, half_width / NORMAL_95)
     return np.asarray(np.maximum(without_scatter, widened))
+
+
+def _covariance(estimate: Estimate, index: Sequence[int], std: Array) -> Array:
+    """(q, q) covariance of some parameters, which agrees with their standard deviations.
+
+    Combinations that are known better than the single parameters stay so.
+
+    Args:
+        estimate: The estimate.
+        index: Indices of the q parameters, which it determines.
+        std: (q,) their standard deviations [theta-unit].
+    """
+    place = np.ix_(index, index)
+    if len(estimate.honest_covariance) == len(estimate.parameters):
+        return agreeing_covariance(np.array(estimate.honest_covariance[place]), std)
+
+    # Estimates of earlier versions have formal correlations only.
+    complete = np.array(estimate.std)
+    complete[list(index)] = std
+    return stretched_formal_covariance(estimate, complete)[place]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -265,11 +283,9 @@ class _Tests:
 
         t = scipy.special.stdtrit(freedom, 0.975)
         found = scipy.special.stdtrit(freedom, 1.0 - 0.5 * LEVEL / (count + 1))
-        covariance = sum(
-            robot.correlation * np.outer(robot.std, robot.std) for robot in (first, second)
-        )
+        covariance = first.covariance + second.covariance
         middle = float(np.median(freedom)) if count else MANY
-        squares, rank = _wald(difference, np.asarray(covariance))
+        squares, rank = _wald(difference, covariance)
         corrected = holm(np.append(p, f_tail(squares, rank, middle)))
         return _Tests(
             interval=np.column_stack([difference - t * std, difference + t * std]),
@@ -389,6 +405,18 @@ def _remarks_on_parameters(
         yield (
             f"{first_ones(with_prior)}: the priors of both estimates draw them to one value, so "
             "that a difference looks smaller than it is"
+        )
+
+    with_model = [
+        robot
+        for robot, estimate in zip(names, (first, second), strict=True)
+        if estimate.prior_directions is not None
+    ]
+    if with_model:
+        yield (
+            f"{join_names(with_model)}: combinations of inertias that the recordings do not show "
+            "are those of the model (cad_prior), which makes robots alike; identify both with "
+            "cad_prior = false"
         )
 
 

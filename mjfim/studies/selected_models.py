@@ -13,6 +13,7 @@ from mjfim.arrays import Array
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction
+from mjfim.identification.honest_covariance import with_honest_covariance
 from mjfim.identification.report import FitResult
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate
@@ -280,4 +281,5 @@ def with_selection(
         high = np.where(differs, np.maximum(high, other[:, 1]), high)
     interval = np.column_stack([low, high])
     lower, upper = system.parameters.lower, system.parameters.upper
-    return replace(estimate, interval=np.clip(interval, lower[:, None], upper[:, None]))
+    widened = replace(estimate, interval=np.clip(interval, lower[:, None], upper[:, None]))
+    return with_honest_covariance(widened, system.parameters, without_parts=losses.estimates)

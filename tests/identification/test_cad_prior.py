@@ -14,8 +14,11 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.honest_covariance import interval_std
 from mjfim.identification.identify import _unseen_directions
+from mjfim.identification.parameter_draws import draw_parameters_system
 from mjfim.identification.prior_share import prior_directions
+from mjfim.identification.report import _implausible_estimates
 from mjfim.identification.task import FitTask
 from mjfim.model.inertia_distance import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step
@@ -134,6 +137,24 @@ def test_inertias_move_along_straight_lines_of_barycentric_coordinates(
     assert problem.prior_rows.along_step(begin, 100.0 * common) is None
 
 
+def test_a_step_to_a_rod_ends_before_it(tmp_path: Path) -> None:
+    """Rounding makes a rod of a body that is one to nine digits."""
+    parameters = System.resolve(arm(tmp_path)).parameters
+    body = CadPrior.of(parameters).bodies[0]
+    thin = np.array(parameters.guess[body.columns])
+    thin[1] = thin[3] - 10.3
+    linear = body.linear(thin)
+    assert body.is_physical(linear)
+
+    # Towards the rod, nothing is left, and away from it everything.
+    step = np.zeros(10)
+    step[1] = -1.0
+    assert body.physical_share(thin, step) == 0.0
+    assert not body.is_physical_after(thin, 0.49 * step)
+    assert body.physical_share(thin, -step) == 1.0
+    assert body.is_physical(body.linear(body.moved(thin, -step)))
+
+
 def test_rows_along_a_step_have_the_derivatives_of_differences(
     tmp_path: Path, log: Recording
 ) -> None:
@@ -174,6 +195,20 @@ def test_directions_without_data_have_the_prior_alone(tmp_path: Path) -> None:
     assert prior_directions(parameters, theta, 1e4 * known, std) is None
 
 
+def test_an_inertia_that_contradicts_the_model_is_named(tmp_path: Path) -> None:
+    """A body that is f times as heavy and large in all moments is 2 ln f from the model."""
+    parameters = System.resolve(arm(tmp_path, cad_prior=0.5)).parameters
+    theta = np.array(parameters.guess)
+    assert not list(_implausible_estimates(parameters, theta))
+
+    # The first log-Cholesky coordinate is half of the logarithm of the mass.
+    theta[0] += 0.5 * np.log(4.0)
+    assert not list(_implausible_estimates(parameters, theta))
+    theta[0] += 0.5 * np.log(2.0)
+    (text,) = _implausible_estimates(parameters, theta)
+    assert text.startswith("the inertia of link1 is 8 prior standard deviations (cad_prior)")
+
+
 @pytest.mark.slow
 def test_what_no_recording_shows_stays_as_in_the_model(tmp_path: Path, log: Recording) -> None:
     experiment = arm(tmp_path)
@@ -188,12 +223,34 @@ def test_what_no_recording_shows_stays_as_in_the_model(tmp_path: Path, log: Reco
     assert not estimate.sloppy and not estimate.combinations
     assert not [text for text in estimate.warnings if "identifiable" in text or "sloppy" in text]
 
-    theta = System.resolve(experiment).parameters.guess
-    residual = CadPrior.of(System.resolve(experiment).parameters).rows(estimate.theta)[:, -1]
+    system = System.resolve(experiment)
+    theta = system.parameters.guess
+    residual = CadPrior.of(system.parameters).rows(estimate.theta)[:, -1]
     assert np.abs(residual).max() < 1.0
     low, high = estimate.interval.T
     assert ((low <= theta) & (theta <= high)).mean() > 0.9
     assert len(estimate.prior) == 20 and np.linalg.eigvalsh(estimate.prior)[0] > 0.0
+
+    # The covariance agrees with the intervals, and no combination is better known than formally.
+    honest, std = estimate.honest_covariance, interval_std(system.parameters, estimate)
+    ratio = np.sqrt(np.diag(honest)) / std
+    assert ratio.min() > 1.0 - 1e-9 and ratio.max() < 1.15
+    root = np.linalg.inv(np.linalg.cholesky(estimate.covariance / np.outer(std, std)))
+    assert np.linalg.eigvalsh(root @ (honest / np.outer(std, std)) @ root.T).min() > 0.5
+
+    # Drawn robots keep every combination that the recordings know well.
+    draws = draw_parameters_system(system, estimate, 300, np.random.default_rng(1))
+    assert draws.held_combinations == found.count - found.determined
+    moved = np.array(draws.values - estimate.theta)
+    for body in CadPrior.of(system.parameters).bodies:
+        begin = body.linear(estimate.theta[body.columns])
+        linear = np.array([body.linear(robot[body.columns]) for robot in draws.values])
+        moved[:, body.columns] = (linear - begin) @ body.derivative(begin).T
+    values, axes = np.linalg.eigh(honest / np.outer(std, std))
+    known = axes[:, values < 1e-4] / std[:, None]
+    sizes = np.sqrt(values[values < 1e-4])
+    assert len(sizes) >= 3
+    np.testing.assert_allclose(np.std(moved @ known, axis=0) / sizes, 1.0, atol=0.15)
 
     # Without the prior, such combinations are held and said one by one.
     without = mjfim.identify(arm(tmp_path, cad_prior=False), [log], progress=False)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -13,14 +14,21 @@ from scipy.stats import chi2, kstest, truncnorm
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
+from mjfim.identification.cad_prior import CadPrior
+from mjfim.identification.honest_covariance import honest_covariance
+from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
 from mjfim.identification.parameter_draws import (
     complete_theta,
     draw_parameters,
     draw_parameters_system,
-    honest_covariance,
 )
+from mjfim.model.inertia_distance import barycentric_of, logcholesky_derivatives
+from tests.support.hinged_arm import arm_experiment
 from tests.support.numerics import Array
 from tests.support.paths import MODELS
+
+# Relative standard deviation of what recordings know well.
+KNOWN = 1e-3
 
 # Standard deviations of mass, length and damping, and a correlation of the first two.
 STD = np.array([0.02, 0.03, 0.1])
@@ -79,13 +87,13 @@ def test_the_moments_are_those_of_the_formal_covariance(system: System) -> None:
     assert kstest(wrong, chi2(3).cdf).pvalue < 1e-6
 
 
-def test_wide_intervals_stretch_the_formal_covariance(system: System) -> None:
+def test_wide_intervals_stretch_the_covariance_of_earlier_versions(system: System) -> None:
     """The intervals are twice and three times as wide as the formal ones."""
     factor = np.array([2.0, 3.0, 1.0])
     theta = system.parameters.guess
     half = 1.959964 * factor * STD
     estimate = estimated(system, COVARIANCE, interval=np.column_stack([theta - half, theta + half]))
-    found = honest_covariance(system, estimate)
+    found = honest_covariance(system.parameters, estimate)
     np.testing.assert_allclose(found, COVARIANCE * np.outer(factor, factor), rtol=1e-5)
 
 
@@ -98,7 +106,7 @@ def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
         theta=np.array([2.0, 1.0, 0.0]),
         interval=np.array([[1.9, 2.1], [0.9, 1.1], [0.0, 0.4]]),
     )
-    found = honest_covariance(system, bounded)
+    found = honest_covariance(system.parameters, bounded)
     np.testing.assert_allclose(np.sqrt(found[2, 2]), 0.4 / 1.959964, rtol=1e-5)
     draws = draw_parameters_system(system, bounded, 1000, np.random.default_rng(2))
     half_normal = truncnorm(0.0, np.inf, scale=0.4 / 1.959964)
@@ -108,7 +116,7 @@ def test_the_side_that_a_bound_cuts_off_does_not_count(system: System) -> None:
     narrow = System.resolve(stated(parameters={"c": {"bounds": [0.9, 1.5]}}))
     cut = replace(bounded, theta=np.array([2.0, 1.0, 1.0]), std=np.array([0.1, 0.1, 2.0]))
     cut = replace(cut, interval=np.array([[1.9, 2.1], [0.9, 1.1], [0.9, 1.5]]))
-    assert np.sqrt(honest_covariance(narrow, cut)[2, 2]) == 2.0
+    assert np.sqrt(honest_covariance(narrow.parameters, cut)[2, 2]) == 2.0
     damping = draw_parameters_system(narrow, cut, 500, np.random.default_rng(2)).values[:, 2]
     assert 0.9 <= damping.min() < 0.92 and 1.48 < damping.max() <= 1.5
 
@@ -117,7 +125,7 @@ def test_deviations_between_recordings_count(system: System) -> None:
     estimate = estimated(
         system, COVARIANCE, std_sandwich=2.0 * STD, between_recordings=np.array([0.0, 0.0, 0.3])
     )
-    found = np.sqrt(np.diag(honest_covariance(system, estimate)))
+    found = np.sqrt(np.diag(honest_covariance(system.parameters, estimate)))
     np.testing.assert_allclose(found, [0.04, 0.06, np.hypot(0.2, 0.3)], rtol=1e-3)
 
     # A parameter with a value for each recording is centred at their mean, and scatters as they do.
@@ -186,16 +194,92 @@ def test_unphysical_inertias_are_replaced() -> None:
     assert (moments[:, 2] <= (moments[:, 0] + moments[:, 1])).all()
 
     hopeless = estimated(system, np.diag([0.006**2, 0.006**2, 1e12]))
-    with pytest.raises(ExperimentError, match=r"of 5 drawn robots still .*logcholesky"):
-        draw_parameters_system(system, hopeless, 5, np.random.default_rng(3))
+    with pytest.raises(ExperimentError, match=r"1 of 1 drawn robots still .*cad_prior"):
+        draw_parameters_system(system, hopeless, 1, np.random.default_rng(3))
 
     whole = {"cart": {"inertial": "cart"}}
     system = System.resolve(mjfim.Experiment(**{**values, "parameters": whole}))
+    covariance: Array = np.diag((0.1 * system.parameters.magnitude) ** 2)
     draws = draw_parameters_system(
-        system, estimated(system, np.diag(np.full(10, 0.5**2))), 50, np.random.default_rng(3)
+        system, estimated(system, covariance), 50, np.random.default_rng(3)
     )
-    assert draws.replaced == 0
+    assert draws.replaced < 10
     for values_of_robot in draws.values:
         model = system.model_at(values_of_robot)
         mujoco.mj_forward(model, mujoco.MjData(model))
         assert model.body("cart").mass[0] > 0.0
+
+
+# ---- inertias with a CAD prior
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownMoment:
+    """A link of which recordings tell the first moment m x and the moment of inertia of its joint.
+
+    Attributes:
+        system: The link, with the armature of its joint.
+        estimate: Its estimate.
+        body: The link.
+        moment: (11,) derivatives of m x, to whose value its standard deviation is 0.1 %.
+        inertia: (11,) derivatives of the moment of inertia of link and rotor, likewise.
+    """
+
+    system: System
+    estimate: mjfim.Estimate
+    body: UnknownBody
+    moment: Array
+    inertia: Array
+
+    @staticmethod
+    def of(folder: Path) -> KnownMoment:
+        """The estimate with the model as prior knowledge."""
+        tables = {"link1": {"inertial": "link1"}, "armature": {"target": "joint/joint1:armature"}}
+        system = System.resolve(arm_experiment(folder, 1, parameters=tables))
+        parameters = system.parameters
+        (body,) = unknown_bodies(parameters)
+        guess = parameters.guess
+        by_linear = barycentric_of(logcholesky_derivatives(guess[body.columns]))
+        linear = body.linear(guess[body.columns])
+
+        # Barycentric coordinates begin with the mass and the first moments.
+        moment, inertia = np.zeros((2, 11))
+        moment[body.columns] = by_linear[:, 1] / linear[1]
+        inertia[body.columns] = by_linear[:, 9] / (linear[9] + guess[10])
+        inertia[10] = 1.0 / (linear[9] + guess[10])
+        data = sum(np.outer(row, row) / KNOWN**2 for row in (moment, inertia))
+        inverse = np.linalg.inv(data + CadPrior.of(parameters).information(guess))
+        covariance = np.asarray(inverse, dtype=np.float64)
+        estimate = estimated(system, covariance, data=data, honest_covariance=covariance)
+        return KnownMoment(
+            system=system, estimate=estimate, body=body, moment=moment, inertia=inertia
+        )
+
+
+def test_combinations_that_recordings_know_stay_known(tmp_path: Path) -> None:
+    known = KnownMoment.of(tmp_path)
+    system, estimate, body = known.system, known.estimate, known.body
+    for row in (known.moment, known.inertia):
+        np.testing.assert_allclose(
+            np.sqrt(row @ estimate.honest_covariance @ row), KNOWN, rtol=1e-3
+        )
+    draws = draw_parameters_system(system, estimate, 400, np.random.default_rng(7))
+    assert draws.held_combinations == 9
+    assert "9 combinations of inertias that the recordings do not determine" in str(draws)
+
+    # Standard deviations of 400 draws scatter by 3.5 %.
+    linear = np.array([body.linear(robot[body.columns]) for robot in draws.values])
+    begin = body.linear(estimate.theta[body.columns])
+    moment = linear[:, 1] / begin[1]
+    inertia = (linear[:, 9] + draws.values[:, 10]) / (begin[9] + estimate.theta[10])
+    for values in (moment, inertia):
+        assert np.std(values) == pytest.approx(KNOWN, rel=0.12)
+        assert np.mean(values) == pytest.approx(1.0, abs=4 * KNOWN / 20)
+    assert all(body.is_physical(each) for each in linear)
+
+    # Along straight lines of log-Cholesky coordinates, they are lost.
+    curved = np.random.default_rng(7).multivariate_normal(
+        estimate.theta, estimate.honest_covariance, 400, method="eigh"
+    )
+    lost = [body.linear(robot[body.columns])[1] / begin[1] for robot in curved]
+    assert np.std(lost) > 50 * KNOWN

@@ -387,3 +387,50 @@ def test_inflated_residuals_widen_what_the_data_say_but_not_the_prior() -> None:
         np.testing.assert_array_equal(plain.interval, wide.interval)
         ratio = np.diag(wide.covariance) / np.diag(plain.covariance)
         np.testing.assert_allclose(ratio, factor, rtol=0.35)
+
+
+def test_combinations_known_far_better_than_others_keep_their_digits() -> None:
+    """Two regressors that differ by 1e-5, whose sum is known far better than each factor."""
+    rng = np.random.default_rng(3)
+    first, second = rng.standard_normal((2, 1, 1600))
+    X = np.stack([first, first + 1e-5 * second], axis=2)
+    y = 5.0 * rng.standard_normal((1, 1600))
+    _, condensed = Linear(X).fitted(y)
+    found = robust_uncertainty(
+        condensed,
+        np.zeros(2),
+        condensed.segment_of_block,
+        np.full(len(condensed.segment_of_block), float(FINE)),
+        min_rows=16,
+        draws=0,
+        rng=rng,
+        inflation=25.0,
+    )
+    weights = np.array([1.0, 1.0])
+    known = 5.0 / np.linalg.norm(first + 0.5e-5 * second)
+    assert np.sqrt(weights @ found.covariance @ weights) == pytest.approx(known, rel=0.15)
+
+
+def test_no_combination_is_better_known_than_by_the_formal_covariance() -> None:
+    """Twelve unknowns, whose combinations are known to 1e-5 to 1 of them."""
+    rng = np.random.default_rng(4)
+    axes = np.linalg.qr(rng.standard_normal((12, 12)))[0]
+    sizes = np.geomspace(1.0, 1e-5, 12)
+    plain = rng.standard_normal((1600, 12))
+    X = (plain * sizes @ axes)[None]
+    _, condensed = Linear(X).fitted(rng.standard_normal((1, 1600)))
+    rows = np.full(len(condensed.segment_of_block), float(FINE))
+    found = robust_uncertainty(
+        condensed,
+        np.zeros(12),
+        condensed.segment_of_block,
+        rows,
+        min_rows=16,
+        draws=0,
+        rng=rng,
+    )
+
+    # In coordinates in which the formal covariance is nearly that of all combinations alike.
+    scaled = sizes[:, None] * (axes @ found.covariance @ axes.T) * sizes
+    root = np.linalg.cholesky(plain.T @ plain)
+    assert np.linalg.eigvalsh(root.T @ scaled @ root).min() > 0.99

@@ -18,7 +18,10 @@ from mjfim.output import robot_samples
 from mjfim.output.manifest import MANIFEST, OutputGuard, claimed
 from mjfim.output.mjcf.write import same_dynamics, write_identified
 from mjfim.output.robot_samples import clear_samples, sample_files, write_samples
+from mjfim.output.summaries.samples import describe_samples
+from mjfim.output.summary_parts import Paragraph
 from mjfim.records.estimate import Estimate
+from mjfim.records.prior_directions import PriorDirections
 from tests.identification.test_parameter_draws import COVARIANCE, estimated
 from tests.support.paths import MODELS
 
@@ -131,3 +134,24 @@ def test_files_of_the_user_remain(system: System, tmp_path: Path) -> None:
     names = {path.name for path in (tmp_path / "samples").iterdir()}
     assert names == {"robot_0002.xml", "notes.txt", MANIFEST}
     assert not (tmp_path / "samples.csv").exists()
+
+
+def test_what_is_equal_in_all_robots_is_said(system: System) -> None:
+    estimate = drawn(system, COVARIANCE, 3)
+    assert estimate.draws is not None
+    assert "do not differ" not in texts(estimate)
+
+    # A parameter that the fit held, and inertias that the model alone tells.
+    held = texts(replace(estimate, held=("c", "another")))
+    assert "The drawn robots do not differ in c, which the fit held at the guess" in held
+    directions = PriorDirections(bodies=("link1",), count=10, determined=7, parameters=())
+    draws = replace(estimate.draws, held_combinations=3)
+    said = texts(replace(estimate, draws=draws, prior_directions=directions))
+    assert "differ in 7 of 10 combinations of the inertial parameters of link1" in said
+    assert "3 combinations of inertias that the recordings do not determine stayed there" in said
+
+
+def texts(estimate: Estimate) -> str:
+    """All sentences about the drawn robots."""
+    parts = describe_samples(estimate)
+    return " ".join(part.text for part in parts if isinstance(part, Paragraph))

@@ -12,9 +12,11 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
-from mjfim.identification.parameter_draws import honest_covariance
+from mjfim.identification.cad_prior import CadPrior
+from mjfim.identification.honest_covariance import honest_covariance
 from mjfim.studies.payload import PayloadTask
 from mjfim.studies.payload_experiment import RobotExperiment
+from tests.identification.test_parameter_draws import estimated
 
 # Two hinges about different axes, so that gravity and inertia show every coordinate of a load.
 ARM = """
@@ -78,6 +80,14 @@ def log(stated: mjfim.Experiment, seed: int) -> mjfim.Recording:
     return mjfim.simulate(stated, trajectory, seed=seed)
 
 
+def with_whole_links(stated: mjfim.Experiment) -> mjfim.Experiment:
+    """The arm with unknown inertias of both links in place of the mass of the hand."""
+    values = stated.model_dump(exclude_unset=True)
+    parameters = {k: v for k, v in values["parameters"].items() if k != "hand_mass"}
+    links = {name: {"inertial": name} for name in ("upper", "hand")}
+    return stated.restated({**values, "parameters": {**parameters, **links}})
+
+
 def inside(found: mjfim.Estimate) -> dict[str, bool]:
     """Whether the true values of the load are inside the intervals, by field."""
     payload = found.payload
@@ -116,7 +126,7 @@ def test_an_earlier_estimate_is_prior_knowledge_with_its_covariance(tmp_path: Pa
     parameters = task.system().parameters
     index = [parameters.names.index(name) for name in ROBOT]
     information = parameters.prior_information[np.ix_(index, index)]
-    expected = np.linalg.inv(honest_covariance(system, estimate))
+    expected = np.linalg.inv(honest_covariance(system.parameters, estimate))
     np.testing.assert_allclose(information, expected, rtol=1e-8)
     np.testing.assert_array_equal(parameters.guess[index], theta)
 
@@ -174,6 +184,49 @@ def test_a_whole_inertia_of_the_robot_becomes_ten_known_parameters(tmp_path: Pat
         expected, found = system.model_at(vector), again.model_at(vector)
         np.testing.assert_allclose(found.body_mass, expected.body_mass, rtol=1e-12)
         np.testing.assert_allclose(found.body_inertia, expected.body_inertia, rtol=1e-9)
+
+
+def test_a_prior_from_the_model_counts_once(tmp_path: Path) -> None:
+    """The covariance of the earlier estimate contains it, with all correlations."""
+    whole = with_whole_links(experiment(tmp_path))
+    system = System.resolve(whole)
+    parameters = system.parameters
+    cad = CadPrior.of(parameters)
+    assert len(cad.bodies) == 2
+    guess = parameters.guess
+    row = np.random.default_rng(1).standard_normal(len(parameters)) / parameters.magnitude
+    others = np.setdiff1d(np.arange(len(parameters)), cad.columns)
+    data = np.outer(row, row)
+    data[others, others] += 1e4 / parameters.magnitude[others] ** 2
+    covariance = np.asarray(np.linalg.inv(data + cad.information(guess)), dtype=np.float64)
+    estimate = estimated(system, covariance, data=data, honest_covariance=covariance)
+
+    task = PayloadTask.of(whole, body="hand", robot=estimate)
+    found = task.system().parameters
+    index = [found.names.index(name) for name in parameters.names]
+    prior = found.prior_information + CadPrior.of(found).information(found.guess)
+    inverse = np.linalg.inv(covariance)
+    scale = np.sqrt(np.diag(inverse))
+    size = np.outer(scale, scale)
+    np.testing.assert_allclose(prior[np.ix_(index, index)] / size, inverse / size, atol=1e-5)
+    assert not CadPrior.of(found).bodies
+
+
+@pytest.mark.slow
+def test_a_load_on_links_whose_inertia_the_model_tells_in_part(tmp_path: Path) -> None:
+    robot = with_whole_links(experiment(tmp_path))
+    loaded = with_whole_links(experiment(tmp_path, **LOAD, inertia=INERTIA))
+    earlier = mjfim.identify(robot, [log(robot, 1)])
+    assert earlier.prior_directions is not None
+    estimate = mjfim.identify_payload(robot, [log(loaded, 2)], body="hand", robot=earlier)
+    payload = estimate.payload
+    assert payload is not None
+    assert estimate.success and payload.is_seen
+    assert sum(inside(estimate).values()) >= 3
+
+    # Single inertias of the links are hardly known, but the load is.
+    width = float(np.ptp(payload.mass_interval))
+    assert width < 0.5 * LOAD["mass"]
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from mjfim.identification.independent_blocks import (
 from mjfim.identification.recording_comparison import compare_evidence
 from mjfim.identification.robust_covariance import robust_uncertainty
 from mjfim.output.summaries.verdicts import Level, verdict_of
+from mjfim.records.prior_directions import PriorDirections
 from mjfim.records.recording import Recording
 from mjfim.records.robot_comparison import RobotComparison
 from mjfim.studies.robot_comparison import compare_estimates, holm, honest_std
@@ -167,6 +168,41 @@ def test_priors_draw_both_to_one_value() -> None:
     prior = np.diag([1.0, 0.0, 0.0])
     found = compare_estimates(estimate(prior=prior), estimate(1, prior=prior))
     assert any(remark.startswith("mass: the priors") for remark in found.remarks)
+
+
+def test_inertias_of_the_model_make_robots_alike() -> None:
+    directions = PriorDirections(bodies=("link",), count=10, determined=7, parameters=())
+    found = compare_estimates(estimate(), estimate(1, prior_directions=directions))
+    assert any(remark.startswith("B: combinations of inertias") for remark in found.remarks)
+    assert any("cad_prior = false" in remark for remark in found.remarks)
+    assert not any(
+        "cad_prior" in text for text in compare_estimates(estimate(), estimate(1)).remarks
+    )
+
+
+def test_known_combinations_are_compared_by_the_honest_covariance() -> None:
+    """Noise five times as large as stated, of which single parameters hardly show anything."""
+    sums, differences = np.array([1.0, 1.0, 0.0]), np.array([1.0, -1.0, 0.0])
+    wide = 0.005 * np.outer(differences, differences) + np.diag([0.0, 0.0, 1e-4])
+    formal, honest = (wide + (0.5 * k) ** 2 * 1e-6 * np.outer(sums, sums) for k in (1.0, 5.0))
+    std = np.sqrt(np.diag(formal))
+    apart = 0.003 * sums
+
+    def joint_p(**fields: Any) -> float:
+        """Probability of the difference of the sums by chance."""
+        fields = {"std": std, "covariance": formal, **fields}
+        theta = np.ones(3)
+        first, second = (estimate(k, theta=theta + k * apart, **fields) for k in (0, 1))
+        return compare_estimates(first, second).joint_p
+
+    assert joint_p() < 0.05
+    assert joint_p(honest_covariance=honest) > 0.5
+    assert joint_p(honest_covariance=formal) < 0.05
+
+    # An interval that is 5 % wider does not hide the difference.
+    half = 1.96 * std * [1.05, 1.0, 1.0]
+    interval = np.column_stack([1.0 - half, 1.0 + half])
+    assert joint_p(interval=interval, honest_covariance=formal) < 0.05
 
 
 def test_misuse() -> None:

@@ -1,0 +1,228 @@
+"""The honest covariance: agreement with intervals, and combinations that are known well."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.excitation import DesignTask
+from mjfim.experiment.system import System
+from mjfim.identification.honest_covariance import (
+    AGREEMENT,
+    HALF_WIDTH,
+    agreeing_covariance,
+    between_covariance,
+    honest_covariance,
+    interval_std,
+    stretched_formal_covariance,
+    with_honest_covariance,
+)
+from mjfim.records.estimate import Uncertainty
+from mjfim.records.horizons import HorizonStudy
+from tests.identification.test_parameter_draws import COVARIANCE, STD, estimated, stated
+from tests.support.numerics import Array
+
+# Mass and lever, known to 10 % each, and their product to 0.1 %.
+PRODUCT = np.array([1.0, 1.0]) / np.sqrt(2.0)
+KNOWN = 1e-3
+NARROW = 0.02 * np.eye(2) + (KNOWN**2 - 0.02) * np.outer(PRODUCT, PRODUCT)
+
+
+def size(covariance: Array, weights: Array) -> float:
+    """Standard deviation of a combination."""
+    return float(np.sqrt(weights @ covariance @ weights))
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    return System.resolve(stated())
+
+
+# ---- agreement with intervals
+
+
+def test_one_wider_interval_leaves_a_known_product_known(system: System) -> None:
+    std = np.sqrt(np.diag(NARROW)) * [1.0, 1.05]
+    found = agreeing_covariance(NARROW, std)
+    assert size(found, PRODUCT) == pytest.approx(KNOWN, rel=1e-2)
+    ratio = np.sqrt(np.diag(found)) / std
+    assert ratio[1] == pytest.approx(1.0)
+    assert 1.0 <= ratio[0] <= 1.05
+
+    # Formal correlations with the standard deviations of the intervals lose it.
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = NARROW
+    covariance[2, 2] = 1.0
+    lost = stretched_formal_covariance(estimated(system, covariance), np.append(std, 1.0))
+    assert size(lost, np.append(PRODUCT, 0.0)) > 3.0 * KNOWN
+
+
+def test_a_common_factor_changes_no_correlation() -> None:
+    std = np.sqrt(np.diag(NARROW))
+    np.testing.assert_allclose(agreeing_covariance(9.0 * NARROW, std), NARROW, rtol=1e-9)
+    np.testing.assert_allclose(agreeing_covariance(NARROW, std), NARROW, rtol=1e-9)
+
+
+def test_standard_deviations_agree_with_all_intervals() -> None:
+    rng = np.random.default_rng(1)
+    factor = rng.standard_normal((6, 6)) * np.geomspace(1e-6, 1e3, 6)[:, None]
+    covariance = factor @ factor.T
+    wanted = np.sqrt(np.diag(covariance)) * [1.0, 0.3, 3.0, 1.0, 1.0, 1.0]
+    wanted[3:5] = 0.0, np.nan
+    found = agreeing_covariance(covariance, wanted)
+    ratio = np.sqrt(np.diag(found))[[0, 1, 2, 5]] / wanted[[0, 1, 2, 5]]
+    assert (ratio > 1.0 - 1e-9).all()
+    assert ratio[2] < 1.0 + AGREEMENT + 1e-9
+    assert not found[3].any()
+    scale = np.sqrt(np.diag(covariance))
+    assert np.linalg.eigvalsh(found / np.outer(scale, scale)).min() > -1e-9
+
+    # Parameters about which the covariance says nothing are uncorrelated.
+    alone = agreeing_covariance(np.zeros((2, 2)), np.array([2.0, 0.0]))
+    np.testing.assert_array_equal(alone, [[4.0, 0.0], [0.0, 0.0]])
+
+
+# ---- its parts
+
+
+def uncertainty(each: Array, between: Array, apart: tuple[int, ...]) -> Uncertainty:
+    """Robust uncertainty of unknowns on which recordings disagree."""
+    c = each.shape[1]
+    return Uncertainty(
+        sandwich=np.zeros(c),
+        interval=np.zeros((c, 2)),
+        between=between,
+        apart=apart,
+        each=each,
+        blocks=10,
+        draws=np.zeros((0, c)),
+    )
+
+
+def test_recordings_disagree_along_what_differs_between_them() -> None:
+    """Mass and lever of 20 recordings, with one product, and a third unknown that agrees."""
+    deviation = 0.1 * np.random.default_rng(2).standard_normal(20)
+    each = np.column_stack([1.0 + deviation, 1.0 - deviation, np.ones(20)])
+    between = np.array([0.1, 0.1, 0.0])
+    found = between_covariance(uncertainty(each, between, (0, 1)))
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), between)
+    assert size(found[:2, :2], PRODUCT) == pytest.approx(0.1 / np.sqrt(20), rel=1e-6)
+    assert not found[2].any()
+
+    # Two recordings show one direction only.
+    few = between_covariance(uncertainty(each[:2], between, (0, 1)))
+    assert size(few[:2, :2], PRODUCT) == pytest.approx(0.1 / np.sqrt(2), rel=1e-6)
+
+    # Recordings of which none determines all unknowns.
+    unknown = between_covariance(uncertainty(np.full((3, 3), np.nan), between, (0, 1)))
+    np.testing.assert_array_equal(unknown, np.diag(between**2))
+
+
+def test_lengths_and_selections_widen_along_their_differences(system: System) -> None:
+    """Mass and lever are 0.5 apart over whole recordings, with one product.
+
+    Chance explains the difference of the lever alone, which follows that of the mass.
+    """
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = NARROW
+    covariance[2, 2] = 0.01
+    theta = system.parameters.guess
+    step = np.array([0.5, -0.5, 0.0])
+    study = HorizonStudy(
+        lengths=np.array([1.0, 10.0]),
+        errors=np.ones((2, 2)),
+        chosen=0,
+        is_whole=True,
+        parameters=system.parameters.names,
+        units=("", "", ""),
+        theta=np.array([theta, theta + step]),
+        half_widths=np.zeros((2, 3)),
+        is_apart=np.array([[False] * 3, [True, False, False]]),
+    )
+    narrow = estimated(system, covariance)
+    wide = replace(narrow, horizons=study, interval=study.widened(narrow.interval))
+    found = with_honest_covariance(wide, system.parameters, covariance).honest_covariance
+    std = interval_std(system.parameters, wide)
+    assert std[0] > 1.5 * np.sqrt(NARROW[0, 0])
+    ratio = np.sqrt(np.diag(found)) / std
+    assert (ratio >= 1.0 - 1e-9).all()
+    assert ratio[0] <= 1.0 + AGREEMENT + 1e-9
+    assert size(found, np.append(PRODUCT, 0.0)) == pytest.approx(KNOWN, rel=0.2)
+
+    # Estimates without each of five parts of the data.
+    first = with_honest_covariance(narrow, system.parameters, covariance)
+    shifts = np.array([-0.2, -0.1, 0.0, 0.1, 0.2])
+    without = theta + shifts[:, None] * np.array([1.0, -1.0, 0.0])
+    jackknife = np.sqrt(4 / 5 * np.sum(shifts**2))
+    half = 2.776 * jackknife * np.array([1.0, 1.0, 0.0])
+    spread = np.column_stack([theta - half, theta + half])
+    low = np.minimum(first.interval[:, 0], spread[:, 0])
+    high = np.maximum(first.interval[:, 1], spread[:, 1])
+    widened = replace(first, interval=np.column_stack([low, high]))
+    found = with_honest_covariance(
+        widened, system.parameters, without_parts=without
+    ).honest_covariance
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found))[:2], 2.776 * jackknife / HALF_WIDTH, rtol=AGREEMENT + 0.01
+    )
+    assert size(found, np.append(PRODUCT, 0.0)) == pytest.approx(KNOWN, rel=0.2)
+
+
+# ---- estimates
+
+
+def test_it_is_saved_and_earlier_estimates_have_none(system: System, tmp_path: Path) -> None:
+    earlier = estimated(system, COVARIANCE)
+    parameters = system.parameters
+    saved = with_honest_covariance(earlier, parameters, 4.0 * COVARIANCE)
+    saved.save(tmp_path)
+    loaded = mjfim.Estimate.load(tmp_path)
+    np.testing.assert_array_equal(loaded.honest_covariance, saved.honest_covariance)
+    assert loaded.summary()["honest_covariance"] is not None
+    np.testing.assert_array_equal(honest_covariance(parameters, loaded), saved.honest_covariance)
+
+    # Without it, formal correlations count.
+    np.testing.assert_allclose(honest_covariance(parameters, earlier), COVARIANCE, rtol=1e-4)
+    assert with_honest_covariance(earlier, parameters) is earlier
+
+    # Parameters that no recording determines, and values that differ between recordings.
+    unknown = np.array(COVARIANCE)
+    unknown[2], unknown[:, 2] = 0.0, 0.0
+    unknown[2, 2] = np.inf
+    found = with_honest_covariance(earlier, parameters, unknown).honest_covariance
+    assert np.isinf(found[2, 2])
+    np.testing.assert_allclose(np.sqrt(np.diag(found))[:2], STD[:2], rtol=AGREEMENT)
+    differing = replace(saved, per_recording={"c": (1.0, 3.0)})
+    added = honest_covariance(parameters, differing) - saved.honest_covariance
+    np.testing.assert_allclose(added, np.diag([0.0, 0.0, 2.0]), atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0, 1.8])
+def test_noise_that_is_larger_than_stated_counts_in_all_combinations(factor: float) -> None:
+    experiment = stated(fit={"bootstrap": 100, "segments": "whole"})
+    motion = DesignTask.resolve(experiment).initial
+    logs = []
+    for seed in (1, 2):
+        clean = mjfim.simulate(experiment, motion)
+        noisy = mjfim.simulate(experiment, motion, seed=seed)
+        logs.append(replace(noisy, y=clean.y + factor * (noisy.y - clean.y)))
+    found = mjfim.identify(experiment, logs, progress=False)
+    assert found.misfit == (factor > 1.0)
+
+    honest = found.honest_covariance
+    std = interval_std(System.resolve(experiment).parameters, found)
+    ratio = np.sqrt(np.diag(honest)) / std
+    assert (ratio > 1.0 - 1e-9).all()
+    assert (ratio < 1.02 + AGREEMENT).all()
+
+    # In the axes of the formal covariance.
+    values, axes = np.linalg.eigh(found.covariance / np.outer(found.std, found.std))
+    weights = axes / found.std[:, None]
+    sizes = np.sqrt(np.einsum("ij,ik,kj->j", weights, honest, weights) / values)
+    assert (sizes > 0.85 * factor).all()
+    assert (sizes < 1.6 * factor).all()
