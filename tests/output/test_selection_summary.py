@@ -7,7 +7,8 @@ import tomllib
 import mjfim
 from mjfim.experiment.system import System
 from mjfim.output.summaries.selection import describe_selection
-from mjfim.output.summary_parts import Listing, Paragraph
+from mjfim.output.summaries.verdicts import verdict_of
+from mjfim.output.summary_parts import Emphasis, Listing, Paragraph, SummaryTable
 from mjfim.records.missing_term import AddedTerm, TermParameter
 from mjfim.records.selection import (
     AlternativeTerm,
@@ -18,6 +19,7 @@ from mjfim.records.selection import (
 )
 from mjfim.studies.selected_models import selected_experiment
 from mjfim.studies.simplification import possible_pools
+from tests.support import results
 from tests.support.paths import ROOT
 
 FRICTION = SelectedTerm(
@@ -120,3 +122,22 @@ def test_the_tables_to_keep_state_the_selected_experiment() -> None:
 def stated_tables(experiment: mjfim.Experiment) -> dict[str, object]:
     """The tables of the parameters of an experiment."""
     return dict(experiment.model_dump(exclude_unset=True)["parameters"])
+
+
+def test_the_rows_that_changed_the_model_stand_out() -> None:
+    """They stay where a terminal has room for one row alone."""
+    steps = (
+        BEGUN,
+        SelectionStep(decision=Decision.REJECTED, description="a spring", error=1.9),
+        SelectionStep(decision=Decision.ADDED, description=FRICTION.description, error=1.0),
+    )
+    selection = Selection(terms=(FRICTION,), steps=steps, ending="No further term.")
+    (table,) = [part for part in describe_selection(selection) if isinstance(part, SummaryTable)]
+    emphases = [row.emphasis for row in table.rows]
+    assert emphases == [Emphasis.NORMAL, Emphasis.NORMAL, Emphasis.STRONG]
+
+
+def test_the_verdict_names_the_added_terms() -> None:
+    selection = Selection(terms=(FRICTION,), steps=(BEGUN,), ending="No further term.")
+    verdict = verdict_of(results.estimate(selection=selection))
+    assert verdict.text.startswith("With dry friction of slide added, the model explains")

@@ -118,6 +118,7 @@ def _row(step: SelectionStep) -> Row:
     is_begin = step.decision in (Decision.BEGUN, Decision.SHORTENED)
     reduction = "" if is_begin else Quantity(value=step.reduction, digits=2)
     error = "" if is_begin else Quantity(value=step.standard_error, digits=2)
+    is_change = step.is_kept and not is_begin
     is_other = step.decision is Decision.REJECTED and step.reduction > step.standard_error
     return Row(
         cells=(
@@ -127,5 +128,6 @@ def _row(step: SelectionStep) -> Row:
             Quantity(value=step.error, digits=4),
             reduction,
             error,
-        )
+        ),
+        emphasis=Emphasis.STRONG if is_change else Emphasis.NORMAL,
     )

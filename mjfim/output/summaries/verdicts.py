@@ -212,8 +212,8 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
 
     if estimate.misfit:
         text = (
-            f"The model does not explain the recordings: the residuals are {ratio:.2f} times the "
-            "noise or are no white noise, so the true errors may exceed the intervals."
+            f"{_model(estimate)} does not explain the recordings: the residuals are {ratio:.2f} "
+            "times the noise or are no white noise, so the true errors may exceed the intervals."
         )
         return Verdict(text=text, level=Level.DOUBTFUL)
 
@@ -221,8 +221,17 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
         text = "Interrupted: the estimates are the best ones that were found until then."
         return Verdict(text=text, level=Level.DOUBTFUL)
 
-    text = f"The model explains the recordings: the residuals are {ratio:.2f} times the noise"
+    model = _model(estimate)
+    text = f"{model} explains the recordings: the residuals are {ratio:.2f} times the noise"
     return Verdict(text=f"{text}{_worst_estimate(estimate)}.", level=Level.GOOD)
+
+
+def _model(estimate: Estimate) -> str:
+    """The model as the subject of a sentence, with the terms that a selection added."""
+    if estimate.selection is None or not estimate.selection.terms:
+        return "The model"
+    terms = first_ones([term.description for term in estimate.selection.terms])
+    return f"With {terms} added, the model"
 
 
 def _why_not_reliable(estimate: Estimate) -> str:
