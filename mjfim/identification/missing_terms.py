@@ -12,8 +12,8 @@ are screened by simulations with some of their values (`mjfim/identification/scr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -107,6 +107,10 @@ class TermTests:
 
     terms: tuple[MissingTerm, ...] = ()
     data: TermTestData | None = None
+
+    def without(self, paths: Collection[str]) -> TermTests:
+        """The tests without the terms that have some paths."""
+        return replace(self, terms=tuple(term for term in self.terms if term.path not in paths))
 
     @property
     def remark(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -151,7 +151,7 @@ class _Findings:
     flipped: tuple[str, ...]
 
 
-def estimate_from(result: FitResult, budget: Budget) -> Estimate:
+def estimate_from(result: FitResult, budget: Budget, refuted: Collection[str] = ()) -> Estimate:
     """Assess a fit and make the estimate.
 
     After a request to stop, missing terms and predictions are left out; the rest of the estimate is
@@ -160,6 +160,8 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
     Args:
         result: The fit.
         budget: Budget with the stop token.
+        refuted: Paths of terms with which left-out data are predicted no better. They are not
+            named as missing terms, and are no reason for a misfit.
 
     Returns:
         The estimate, without its time and engine steps.
@@ -171,7 +173,7 @@ def estimate_from(result: FitResult, budget: Budget) -> Estimate:
 
     # Optional parts, each of which takes about as long as a search.
     begin_stage("looking for terms that the model lacks")
-    tests = _term_tests(result, quality, budget)
+    tests = _term_tests(result, quality, budget).without(refuted)
     predictions = _predictions(result, budget)
 
     reasons = misfit_reasons(

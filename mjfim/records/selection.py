@@ -156,6 +156,11 @@ class SelectionStep:
         """Whether the selection continued with the model of this step."""
         return self.decision not in (Decision.REJECTED, Decision.KEPT)
 
+    @property
+    def is_refuted(self) -> bool:
+        """Whether the term was tried and predicts left-out data no better."""
+        return self.decision is Decision.REJECTED and self.reduction <= 0.0
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HeldOutRefit:
@@ -208,6 +213,15 @@ class Selection:
     def is_changed(self) -> bool:
         """Whether the selected model differs from the stated one."""
         return bool(self.terms or self.pooled or self.held)
+
+    @property
+    def refuted(self) -> frozenset[str]:
+        """Paths of terms with which left-out data are predicted no better, by the last attempt.
+
+        They explain residuals of the data to which they are fitted, but not those of other data.
+        """
+        last = {step.path: step for step in self.steps if step.path}
+        return frozenset(path for path, step in last.items() if step.is_refuted)
 
     @property
     def parameters(self) -> dict[str, dict[str, object]]:

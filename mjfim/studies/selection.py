@@ -225,7 +225,7 @@ class _Selector:
             pooled=model.pooled,
             held=model.held,
         )
-        estimate = estimate_from(result, self.budget)
+        estimate = estimate_from(result, self.budget, selection.refuted)
         if selection.is_changed:
             settings = result.task.settings
             selection = replace(
@@ -309,7 +309,12 @@ class _Selector:
         """
         model, ending = self._grown(model, first, steps)
         model = self._pruned(model, first, steps)
-        return self._simplified(model, first, steps), ending
+        simpler = self._simplified(model, first, steps)
+
+        # Terms may have stood in for parameters that are held or pooled now.
+        if simpler is not model:
+            simpler = self._pruned(simpler, first, steps, tests_last=True)
+        return simpler, ending
 
     def _over_length(
         self,
@@ -432,15 +437,28 @@ class _Selector:
         return chosen
 
     def _pruned(
-        self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
+        self,
+        model: FittedModel,
+        first: FittedModel,
+        steps: list[SelectionStep],
+        *,
+        tests_last: bool = False,
     ) -> FittedModel:
-        """Remove terms without which left-out data are predicted as well."""
-        while len(model.terms) > 1 and not self._is_stopped():
+        """Remove terms without which left-out data are predicted as well.
+
+        Args:
+            model: Where to begin.
+            first: The stated model.
+            steps: Receives the steps.
+            tests_last: False where the last term has just been tested against the model without it.
+        """
+        while not self._is_stopped():
+            tested = model.terms if tests_last else model.terms[:-1]
+            if not tested:
+                break
             begin_stage("testing whether all added terms are needed")
             needless: list[tuple[Reduction, SelectedTerm, FittedModel]] = []
-
-            # The last term has just been tested against the model without it.
-            for term in model.terms[:-1]:
+            for term in tested:
                 fewer = self._without(model, first, term)
                 if fewer is None:
                     continue
@@ -553,7 +571,14 @@ class _Selector:
     def _without(
         self, model: FittedModel, first: FittedModel, term: SelectedTerm
     ) -> FittedModel | None:
-        """The model without a term; None where it cannot be simulated, or after a stop."""
+        """The model without a term; None where it cannot be simulated, or after a stop.
+
+        There is none either where a pool replaces parameters of the term.
+        """
+        if any(not term.parameters.keys().isdisjoint(pool.members) for pool in model.pooled):
+            return None
+        held = tuple(name for name in model.held if name not in term.parameters)
+        model = replace(model, held=held)
         names = model.result.task.system.parameters.names
         values = dict(zip(names, model.result.theta, strict=True))
         terms = tuple(each for each in model.terms if each is not term)

@@ -141,3 +141,24 @@ def test_the_verdict_names_the_added_terms() -> None:
     selection = Selection(terms=(FRICTION,), steps=(BEGUN,), ending="No further term.")
     verdict = verdict_of(results.estimate(selection=selection))
     assert verdict.text.startswith("With dry friction of slide added, the model explains")
+
+
+def tried(path: str, decision: Decision, reduction: float) -> SelectionStep:
+    """A step that tried a term."""
+    return SelectionStep(
+        decision=decision, description=path, path=path, error=1.0, reduction=reduction
+    )
+
+
+def test_terms_that_left_out_data_refute_are_those_of_the_last_attempt() -> None:
+    steps = (
+        BEGUN,
+        tried("worse", Decision.REJECTED, -0.1),
+        tried("unclear", Decision.REJECTED, 0.1),
+        tried("better later", Decision.REJECTED, -0.1),
+        tried("worse later", Decision.REJECTED, 0.1),
+        tried("better later", Decision.ADDED, 0.2),
+        tried("worse later", Decision.REJECTED, -0.2),
+    )
+    selection = Selection(terms=(), steps=steps, ending="No further term.")
+    assert selection.refuted == {"worse", "worse later"}
