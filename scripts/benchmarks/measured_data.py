@@ -79,6 +79,12 @@ SETS = (
         held_out=("A0_02.csv.gz",),
     ),
     MeasuredSet(
+        name="dfki_double_pendulum",
+        folder="dfki_double_pendulum",
+        fitted=("A0_01.csv.gz",),
+        held_out=("A0_00.csv.gz", "A0_02.csv.gz"),
+    ),
+    MeasuredSet(
         name="bam_xl330",
         folder="bam_xl330/raw",
         fitted=_servo_files("28m10", "28m17", "28m57", "29m04"),
@@ -150,8 +156,9 @@ def row_of(measured: MeasuredSet, result: Result, is_selecting: bool) -> list[st
     ratios = [prediction.ratio for prediction in found.predictions if prediction.held_out]
     halves = 0.5 * np.ptp(found.interval, axis=1) / np.maximum(np.abs(found.theta), 1e-300)
     reasons = "; ".join(found.reasons) if found.misfit else "none"
+    logs = f"{measured.name}, {len(measured.fitted)} fitted, {len(measured.held_out)} predicted"
     return [
-        measured.name if not is_selecting else "",
+        logs if not is_selecting else "",
         "--select" if is_selecting else "as stated",
         ", ".join(term.description for term in terms) or "–",
         ", ".join(f"{ratio:.3g}" for ratio in ratios),
@@ -168,7 +175,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
-    parser.add_argument("--only", choices=[each.name for each in SETS], help="one set")
+    parser.add_argument("--only", choices={each.name for each in SETS}, help="one robot")
     args = parser.parse_args()
 
     table = Table(title="Measured data of other groups", title_justify="left", show_lines=True)
