@@ -175,7 +175,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data")
-    parser.add_argument("--only", choices={each.name for each in SETS}, help="one robot")
+    parser.add_argument("--only", choices=sorted({each.name for each in SETS}), help="one robot")
     args = parser.parse_args()
 
     table = Table(title="Measured data of other groups", title_justify="left", show_lines=True)
