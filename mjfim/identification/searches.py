@@ -70,8 +70,12 @@ INITIAL_STATE_ROUGH_SHARE = 0.01
 
 # Decrease of the cost, as a share of it, that a last step over the first data may still bring, and
 # that share where the stated noise is estimated afterwards.
-FIRST_ROUGH_SHARE = 1e-2
+FIRST_ROUGH_SHARE = 1e-3
 ROUGH_SHARE = 0.1
+
+# Decrease of the cost, as a share of it, that a last step may bring where another start is improved
+# on a part of the data.
+IMPROVED_ROUGH_SHARE = 1e-2
 
 # Decrease of the cost, as a share of it, that a last step may bring in a fit to much data that is
 # judged before it goes on: another start may lead to a lower minimum.
@@ -214,7 +218,11 @@ class FitSearch:
         part = problem.of_segments(subset)
         placed = self.with_initial_states(part, of_subset(begin, subset))
         cost_to_beat = part.cost(of_subset(beaten, subset))
-        settings = replace(self._settings_of_part(problem, part), cost_to_beat=cost_to_beat)
+        settings = replace(
+            self._settings_of_part(problem, part),
+            rough_share=IMPROVED_ROUGH_SHARE,
+            cost_to_beat=cost_to_beat,
+        )
         found = self.minimise(part, placed, settings, "again part of the data")
         if found is None or found.cost >= cost_to_beat:
             return None
