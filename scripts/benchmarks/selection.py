@@ -257,7 +257,7 @@ def _inside(found: Estimate, true: np.ndarray) -> tuple[bool, ...]:
 
 
 def study(jobs: Sequence[Job], title: str) -> list[Outcome]:
-    """Run many robots on all cores.
+    """Run many robots on all cores, and print each outcome, so that a study may be stopped.
 
     Args:
         jobs: The runs.
@@ -268,7 +268,13 @@ def study(jobs: Sequence[Job], title: str) -> list[Outcome]:
     """
     context = get_context("spawn")
     with ProcessPoolExecutor(cores(), mp_context=context) as pool:
-        return list(track(pool.map(run, jobs), title, total=len(jobs)))
+        found = []
+        for outcome in track(pool.map(run, jobs), title, total=len(jobs)):
+            chosen = ", ".join(outcome.chosen) or "nothing"
+            after = "misfit" if outcome.misfit else "no misfit"
+            print(f"{outcome.kind or 'complete'}: {chosen}; {after}", flush=True)
+            found.append(outcome)
+        return found
 
 
 def kinds_table(found: Sequence[Outcome]) -> Table:
