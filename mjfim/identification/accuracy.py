@@ -146,25 +146,35 @@ def _formal_covariance(problem: FitProblem, solution: Solution) -> tuple[Array, 
         root = inverse_root(H)
         common = root @ root.T
 
-    # Common unknowns of the first recording.
+    covariance = _of_parameters(problem, solution, common)
+    std = np.zeros(len(covariance))
+    columns = layout.first_columns
+    std[layout.parameter_of_column[columns]] = common_std[columns]
+    if not layout.free_starts:
+        std[layout.private] = np.sqrt(np.diag(covariance)[layout.private])
+    return covariance, std
+
+
+def _of_parameters(problem: FitProblem, solution: Solution, common: Array) -> Array:
+    """(p, p) covariance of the parameters from that of the common unknowns: (c, c).
+
+    Unknowns of each recording have the values of the first recording. Deviations of the first
+    initial state, which are private unknowns, follow the common ones.
+    """
+    layout = problem.layout
     p = len(problem.system.parameters)
     columns = layout.first_columns
     index = layout.parameter_of_column[columns]
     covariance = np.zeros((p, p))
     covariance[np.ix_(index, index)] = common[np.ix_(columns, columns)]
-    std = np.zeros(p)
-    std[index] = common_std[columns]
 
-    # Deviations of the first initial state, which are private unknowns.
     private = layout.private
     if len(private) and not layout.free_starts:
         of_private, cross = _private_covariance(solution.condensed, common, columns)
         covariance[np.ix_(private, private)] = of_private
         covariance[np.ix_(private, index)] = cross
         covariance[np.ix_(index, private)] = cross.T
-        std[private] = np.sqrt(np.diag(of_private))
-
-    return covariance, std
+    return covariance
 
 
 def _private_covariance(
@@ -231,21 +241,10 @@ def _robust_covariance(
         std: (p,) formal standard deviations, infinite where a parameter is not determined.
         robust: Robust uncertainty of the common unknowns, or None.
     """
-    layout = problem.layout
     covariance = np.array(formal)
     if robust is not None:
         common = robust.covariance + between_covariance(robust)
-        columns = layout.first_columns
-        index = layout.parameter_of_column[columns]
-        covariance[np.ix_(index, index)] = common[np.ix_(columns, columns)]
-
-        # Deviations of the first initial state follow the common unknowns.
-        private = layout.private
-        if len(private) and not layout.free_starts:
-            of_private, cross = _private_covariance(solution.condensed, common, columns)
-            covariance[np.ix_(private, private)] = of_private
-            covariance[np.ix_(private, index)] = cross
-            covariance[np.ix_(index, private)] = cross.T
+        covariance = _of_parameters(problem, solution, common)
 
     is_unknown = ~np.isfinite(std) | ~np.isfinite(np.diag(covariance))
     covariance[is_unknown] = 0.0

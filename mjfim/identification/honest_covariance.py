@@ -237,7 +237,8 @@ def covariance_root(covariance: Array) -> Array:
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(std > 0.0, std, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+    sizes = np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(scale[:, None] * vectors * sizes)
 
 
 def _covering(covariance: Array, deviations: Array) -> Array:
