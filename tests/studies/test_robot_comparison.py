@@ -323,10 +323,10 @@ def test_equal_robots_rarely_differ() -> None:
     ids=str,
 )
 def test_rate_of_false_alarms(setting: Setting) -> None:
-    """The stated level is 5 %; 200 comparisons give more than 9 % with a probability below 1 %."""
+    """The stated level is 5 %; 300 comparisons give 8.5 % with a probability of 1 %."""
     rng = np.random.default_rng(1)
-    alarms = sum(setting.compared(rng).differs for _ in range(200))
-    assert alarms / 200 <= 0.09
+    alarms = sum(setting.compared(rng).differs for _ in range(300))
+    assert alarms / 300 <= 0.085
 
 
 @pytest.mark.slow
@@ -335,8 +335,8 @@ def test_rate_of_true_alarms(setting: Setting) -> None:
     """A shift as large as the difference that would be found with a probability of 80 %."""
     rng = np.random.default_rng(2)
     hits = 0
-    for _ in range(120):
+    for _ in range(200):
         shift = float(setting.compared(rng).detectable[0])
         found = setting.compared(rng, shift)
         hits += 0 in found.changed
-    assert 0.68 <= hits / 120 <= 0.92
+    assert 0.68 <= hits / 200 <= 0.92

@@ -181,7 +181,7 @@ def test_a_selection_is_saved_and_loaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(3))
 def test_two_missing_terms_are_both_found(tmp_path: Path, seed: int) -> None:
     logs = recorded(
         tmp_path, 'frictionloss="0.3" stiffness="2"', count=4, horizon=4.0, begin=10 * seed
