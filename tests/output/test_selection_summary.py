@@ -21,14 +21,8 @@ from mjfim.studies.selected_models import selected_experiment
 from mjfim.studies.simplification import possible_pools
 from tests.support import results
 from tests.support.paths import ROOT
+from tests.support.results import SLIDE_FRICTION
 
-FRICTION = SelectedTerm(
-    name="slide_frictionloss",
-    description="dry friction of slide",
-    path="joint/slide:frictionloss",
-    unit="N",
-    scale=0.5,
-)
 BEGUN = SelectionStep(decision=Decision.BEGUN, error=2.0)
 
 
@@ -42,14 +36,14 @@ def test_alternatives_of_a_removed_term_are_not_named() -> None:
     other = AlternativeTerm(description="a spring", path="joint/slide:stiffness", values={"m": 2.0})
     added = SelectionStep(
         decision=Decision.ADDED,
-        description=FRICTION.description,
-        path=FRICTION.path,
+        description=SLIDE_FRICTION.description,
+        path=SLIDE_FRICTION.path,
         count=1,
         error=1.0,
         alternatives=(other,),
     )
     steps = (BEGUN, added)
-    kept = Selection(terms=(FRICTION,), steps=steps, ending="No further term.")
+    kept = Selection(terms=(SLIDE_FRICTION,), steps=steps, ending="No further term.")
     assert "do not tell dry friction of slide apart from a spring" in texts_of(kept)
     removed = Selection(terms=(), steps=steps, ending="No further term.")
     assert "do not tell" not in texts_of(removed)
@@ -88,7 +82,7 @@ def test_the_tables_to_keep_state_the_selected_experiment() -> None:
     )
     (pool,) = possible_pools(System.resolve(experiment).parameters, ("d1", "d2"))
     selection = Selection(
-        terms=(FRICTION, stribeck),
+        terms=(SLIDE_FRICTION, stribeck),
         steps=(BEGUN,),
         ending="No further term.",
         pooled=(pool,),
@@ -129,16 +123,16 @@ def test_the_rows_that_changed_the_model_stand_out() -> None:
     steps = (
         BEGUN,
         SelectionStep(decision=Decision.REJECTED, description="a spring", error=1.9),
-        SelectionStep(decision=Decision.ADDED, description=FRICTION.description, error=1.0),
+        SelectionStep(decision=Decision.ADDED, description=SLIDE_FRICTION.description, error=1.0),
     )
-    selection = Selection(terms=(FRICTION,), steps=steps, ending="No further term.")
+    selection = Selection(terms=(SLIDE_FRICTION,), steps=steps, ending="No further term.")
     (table,) = [part for part in describe_selection(selection) if isinstance(part, SummaryTable)]
     emphases = [row.emphasis for row in table.rows]
     assert emphases == [Emphasis.NORMAL, Emphasis.NORMAL, Emphasis.STRONG]
 
 
 def test_the_verdict_names_the_added_terms() -> None:
-    selection = Selection(terms=(FRICTION,), steps=(BEGUN,), ending="No further term.")
+    selection = Selection(terms=(SLIDE_FRICTION,), steps=(BEGUN,), ending="No further term.")
     verdict = verdict_of(results.estimate(selection=selection))
     assert verdict.text.startswith("With dry friction of slide added, the model explains")
 

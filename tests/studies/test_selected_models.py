@@ -13,19 +13,13 @@ from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses
 from mjfim.model.parameters import ParameterSet
-from mjfim.records.selection import Decision, SelectedTerm, Selection, SelectionStep
+from mjfim.records.selection import Decision, Selection, SelectionStep
 from mjfim.studies.selected_models import NOT_WIDENED, different, with_selection
 from tests.support.paths import ROOT
+from tests.support.results import SLIDE_FRICTION
 from tests.support.results import estimate as make_estimate
 
 THETA = np.array([2.0, 1.0, 1.0])
-FRICTION = SelectedTerm(
-    name="slide_frictionloss",
-    description="dry friction of slide",
-    path="joint/slide:frictionloss",
-    unit="N",
-    scale=0.5,
-)
 
 
 def cart_pendulum() -> mjfim.Experiment:
@@ -58,7 +52,7 @@ def selection_with(**changes: object) -> Selection:
     return Selection(**fields)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("changes", [{"terms": (FRICTION,)}, {"held": ("c",)}])
+@pytest.mark.parametrize("changes", [{"terms": (SLIDE_FRICTION,)}, {"held": ("c",)}])
 def test_intervals_are_widened_to_the_scatter_between_parts(changes: dict[str, object]) -> None:
     # The first parameter scatters, the others are the same without each part.
     estimates = np.tile(THETA, (5, 1))
@@ -85,7 +79,7 @@ def test_intervals_are_widened_to_the_scatter_between_parts(changes: dict[str, o
 def test_a_warning_says_that_no_interval_contains_the_choice_of_terms() -> None:
     losses = losses_without(THETA[None])
     system = System.resolve(cart_pendulum())
-    found = with_selection(made_estimate(), selection_with(terms=(FRICTION,)), losses, system)
+    found = with_selection(made_estimate(), selection_with(terms=(SLIDE_FRICTION,)), losses, system)
     assert found.warnings[-1] == NOT_WIDENED
     np.testing.assert_array_equal(found.interval, made_estimate().interval)
     assert with_selection(made_estimate(), selection_with(), losses, system).warnings == ()

@@ -29,6 +29,7 @@ from mjfim.records.parameter_draws import ParameterDraws
 from mjfim.records.recording import Recording
 from mjfim.records.robot_comparison import RobotComparison
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
+from mjfim.records.selection import SelectedTerm
 from mjfim.records.trajectory import Trajectory
 from tests.support.made_records import make_recording_comparison, ten_iterates
 
@@ -42,6 +43,15 @@ BOUND = 1.125
 
 # Correlation of the estimates of the first two parameters.
 CORRELATION = 0.8
+
+# A term that a selection has added to the cart-pendulum.
+SLIDE_FRICTION = SelectedTerm(
+    name="slide_frictionloss",
+    description="dry friction of slide",
+    path="joint/slide:frictionloss",
+    unit="N",
+    scale=0.5,
+)
 
 
 def labels(name: str = "hinge") -> Labels:
