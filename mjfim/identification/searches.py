@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget
+from mjfim.budget import Budget, StopReason
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.estimated_noise import EstimatedNoiseProblem
 from mjfim.identification.fit_problem import FitProblem
@@ -120,6 +120,17 @@ def _without_neighbourhood(solution: Solution) -> Solution:
     return replace(solution, success=False, status=status)
 
 
+def _interrupted(solution: Solution) -> Solution:
+    """A solution near the minimum, after a request to stop before the search has converged."""
+    status = f"{StopReason.REQUESTED.value}; the best estimate so far"
+    return replace(solution, success=False, interrupted=True, status=status)
+
+
+def _after(first: Solution, found: Solution) -> Solution:
+    """A solution with the iterates of the search at whose end its own search began before them."""
+    return replace(found, iterates=(*first.iterates, *found.iterates[1:]))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitSearch:
     """Searches of one identification, which share a budget and report their iterations.
@@ -168,7 +179,7 @@ class FitSearch:
         if is_whole and starts == 1:
             return placed
 
-        settings = self._settings_of_part(problem, part)
+        settings = self._settings_of_part(problem)
         found = [self._minimise(part, placed, settings, "part of the data")]
         found += self._from_random_starts(part, starts)
         best = min(found, key=lambda solution: solution.cost).unknowns
@@ -219,7 +230,7 @@ class FitSearch:
         placed = self.with_initial_states(part, of_subset(begin, subset))
         cost_to_beat = part.cost(of_subset(beaten, subset))
         settings = replace(
-            self._settings_of_part(problem, part),
+            self._settings_of_part(problem),
             rough_share=IMPROVED_ROUGH_SHARE,
             cost_to_beat=cost_to_beat,
         )
@@ -230,7 +241,7 @@ class FitSearch:
             begin, theta=found.unknowns.theta, per_recording=found.unknowns.per_recording
         )
 
-    def _settings_of_part(self, problem: FitProblem, part: FitProblem) -> SearchSettings:
+    def _settings_of_part(self, problem: FitProblem) -> SearchSettings:
         """Settings of a search over a part of the data, before the search over all of them."""
         # Costs of several starts can be compared only if all searches come close to their minimum.
         rough_share = 0.0
@@ -317,7 +328,7 @@ class FitSearch:
         # may be that of the unknowns before the last step.
         weighted = likelihood.linearised
         cost = completed(partial(likelihood.cost_of_squares, weighted.noise, found.unknowns))
-        return weighted, replace(found, cost=cost, iterates=(*first.iterates, *found.iterates[1:]))
+        return weighted, replace(_after(first, found), cost=cost)
 
     def converged(self, problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
         """Continue a search that ended near the minimum because it was judged first.
@@ -329,20 +340,20 @@ class FitSearch:
         Returns:
             The problem and its solution, unchanged after a search that ended otherwise.
         """
-        if not solution.rough or self.interrupted():
+        if not solution.rough:
             return problem, solution
+        if self.interrupted():
+            return problem, _interrupted(solution)
 
         settings = replace(self._final_settings(problem), begins_near=True)
         try:
             found = self._minimise(problem, solution.unknowns, settings, "all data")
         except InterruptedPassError:
-            return problem, replace(solution, interrupted=True)
+            return problem, _interrupted(solution)
         except SimulationDivergedError:
             return problem, _without_neighbourhood(solution)
-        iterates = (*solution.iterates, *found.iterates[1:])
-        return problem, replace(
-            found, iterates=iterates, iterations=solution.iterations + found.iterations
-        )
+        iterations = solution.iterations + found.iterations
+        return problem, replace(_after(solution, found), iterations=iterations)
 
     def _solve_in_turn_with_noise(
         self, problem: FitProblem, begin: UnknownValues, max_iterations: int | None, phase: str
@@ -369,7 +380,7 @@ class FitSearch:
             except SimulationDivergedError:
                 return problem, _without_neighbourhood(solution)
             problem = reweighted
-            solution = replace(refined, iterates=(*solution.iterates, *refined.iterates[1:]))
+            solution = _after(solution, refined)
             if change < NOISE_TOLERANCE:
                 break
         return problem, solution
@@ -402,7 +413,7 @@ class FitSearch:
                 break
             if found is None:
                 break
-            found = replace(found, iterates=(*solution.iterates, *found.iterates[1:]))
+            found = _after(solution, found)
             if found.success:
                 return longer, found
 

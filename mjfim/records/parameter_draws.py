@@ -48,12 +48,11 @@ class ParameterDraws:
         drawn = "1 robot was" if count == 1 else f"{count} robots were"
         text = f"{drawn} drawn from the uncertainty of the estimate, inside the bounds"
         if self.held_combinations:
-            stay = (
-                "1 combination"
-                if self.held_combinations == 1
-                else (f"{self.held_combinations} combinations")
+            count = self.held_combinations
+            noun = "combination" if count == 1 else "combinations"
+            text += (
+                f"; {count} {noun} of inertias that the recordings do not determine stayed there"
             )
-            text += f"; {stay} of inertias that the recordings do not determine stayed there"
         if not self.replaced:
             return text
         times = "once" if self.replaced == 1 else f"{self.replaced} times"

@@ -300,3 +300,21 @@ def test_a_search_that_ends_next_to_divergence_is_kept_where_the_noise_is_estima
     assert kept is problem
     assert not found.success and "diverges next to the estimate" in found.status
     assert found.unknowns.theta[0] == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_judged_fit_that_is_stopped_before_it_converges_is_no_success(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without a request to stop, it converges."""
+    problem: Any = parts(3.0, 3.0)
+    searched = search(starts=1, noise_is_stated=True)
+    found = minimise(problem, begin_of(1.1), SearchSettings())
+    assert found is not None
+    rough = replace(found, rough=True, status="near the minimum")
+    _, converged = searched.converged(problem, rough)
+    assert converged.success and not converged.rough and not converged.interrupted
+
+    monkeypatch.setattr(FitSearch, "interrupted", lambda _: True)
+    _, stopped = searched.converged(problem, rough)
+    assert stopped.interrupted and not stopped.success
+    assert "the best estimate so far" in stopped.status
