@@ -163,8 +163,8 @@ def _title(draws: ParameterDraws) -> str:
 def _note(estimate: Estimate, draws: ParameterDraws, count: int) -> str:
     """Say from which distribution the robots were drawn."""
     note = (
-        "Drawn from the normal distribution with the standard deviations of the 95 % intervals and "
-        "the correlations of the formal covariance, inside the bounds."
+        "Drawn from the normal distribution with the honest covariance of the estimate, which "
+        "agrees with the 95 % intervals, inside the bounds."
     )
     if estimate.misfit:
         note += " It does not cover the error of a model that does not explain the recordings."
