@@ -320,7 +320,7 @@ class FitSearch:
                 likelihood, first.unknowns, settings, f"{phase}, noise estimated"
             )
         except InterruptedPassError:
-            return problem, replace(first, interrupted=True)
+            return problem, _interrupted(first)
         except SimulationDivergedError:
             return problem, _without_neighbourhood(first)
 
@@ -376,7 +376,7 @@ class FitSearch:
                     reweighted, solution.unknowns, settings, f"{phase}, noise estimated"
                 )
             except InterruptedPassError:
-                return problem, replace(solution, interrupted=True)
+                return problem, _interrupted(solution)
             except SimulationDivergedError:
                 return problem, _without_neighbourhood(solution)
             problem = reweighted

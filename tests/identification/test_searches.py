@@ -21,6 +21,7 @@ from mjfim.identification.subsets import first_subset
 from mjfim.identification.task import FitTask
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (
+    InterruptedPassError,
     SearchSettings,
     Solution,
     UnknownValues,
@@ -316,5 +317,53 @@ def test_a_judged_fit_that_is_stopped_before_it_converges_is_no_success(
 
     monkeypatch.setattr(FitSearch, "interrupted", lambda _: True)
     _, stopped = searched.converged(problem, rough)
+    assert stopped.interrupted and not stopped.success
+    assert "the best estimate so far" in stopped.status
+
+
+class Stopped:
+    """Stands for the problem with estimated noise, whose first pass a request to stop ends."""
+
+    def __init__(self, problem: Any, smallest: Array) -> None:
+        self.linearised = problem
+
+    def cost(self, at: UnknownValues) -> float:
+        """The pass is not completed."""
+        raise InterruptedPassError
+
+
+def test_a_search_that_is_stopped_before_the_noise_is_estimated_is_no_success(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The search with the stated noise has converged, but its minimum is not the wanted one."""
+    monkeypatch.setattr(searches, "EstimatedNoiseProblem", Stopped)
+    problem: Any = parts(3.0, 3.0)
+    _, found = search(starts=1, noise_is_stated=False).solve(problem, begin_of(1.1))
+    assert found.interrupted and not found.success
+    assert "the best estimate so far" in found.status
+    assert found.unknowns.theta[0] == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_robust_search_that_is_stopped_while_the_noise_is_estimated_is_no_success(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searched = search(starts=1, noise_is_stated=False)
+    searched.task.settings.loss = "huber"
+    found = minimise(parts(3.0, 3.0), begin_of(1.1), SearchSettings())
+    assert found is not None and found.success
+    solutions = iter([found])
+
+    def interrupted(*_: Any) -> Solution:
+        """The first search converges, and a request to stop ends the first pass of the second."""
+        for solution in solutions:
+            return solution
+        raise InterruptedPassError
+
+    reweighted = SimpleNamespace(noise=SimpleNamespace(sigma=np.ones(1), strides=np.ones(1, int)))
+    reweighted.with_noise = lambda noise: reweighted
+    monkeypatch.setattr(FitSearch, "_minimise", interrupted)
+    monkeypatch.setattr(FitSearch, "_final_settings", lambda *_: SearchSettings())
+    monkeypatch.setattr(FitSearch, "_robust_sigma", lambda *_: np.array([2.0]))
+    _, stopped = searched.solve(reweighted, begin_of(1.1))
     assert stopped.interrupted and not stopped.success
     assert "the best estimate so far" in stopped.status
