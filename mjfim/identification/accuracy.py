@@ -20,7 +20,8 @@ from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.combinations import ParameterGroup
-from mjfim.records.estimate import NORMAL_95, Uncertainty
+from mjfim.records.estimate import Uncertainty
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.prior_directions import PriorDirections
 
 # Half width of an interval over the size of the value (an entry of a vector or tensor has the size

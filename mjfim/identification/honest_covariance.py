@@ -29,9 +29,7 @@ from mjfim.identification.robust_covariance import LEVEL, covering_covariance
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate, Uncertainty
 from mjfim.records.horizons import HorizonStudy
-
-# Half width of the 95 % interval of a normal distribution [standard deviations].
-HALF_WIDTH = float(scipy.special.ndtri(0.5 + 0.5 * LEVEL))
+from mjfim.records.intervals import NORMAL_95
 
 # Distance of the end of an interval from a bound, relative to the width of the interval, at which
 # the bound has cut the interval off.
@@ -125,7 +123,7 @@ def interval_std(parameters: ParameterSet, estimate: Estimate) -> Array:
     # have cut both, the interval says nothing, and the deviations that led to it remain.
     half_width = np.where(is_cut_below | is_cut_above, np.maximum(below, above), 0.5 * width)
     robust = np.hypot(estimate.std_sandwich, estimate.between_recordings)
-    return np.asarray(np.maximum(half_width / HALF_WIDTH, np.maximum(estimate.std, robust)))
+    return np.asarray(np.maximum(half_width / NORMAL_95, np.maximum(estimate.std, robust)))
 
 
 def stretched_formal_covariance(estimate: Estimate, std: Array) -> Array:
@@ -261,7 +259,7 @@ def _differences(covariance: Array, study: HorizonStudy, known: np.ndarray) -> A
     """
     root = covariance_root(covariance)
     apart = np.asarray(study.is_apart, dtype=bool)[:, known]
-    differences = (study.theta - study.theta[study.chosen])[:, known] / HALF_WIDTH
+    differences = (study.theta - study.theta[study.chosen])[:, known] / NORMAL_95
     found = [np.zeros((0, len(known)))]
     for is_apart, difference in zip(apart, differences, strict=True):
         if is_apart.any():
@@ -279,6 +277,6 @@ def _jackknife(without_parts: Array) -> Array:
     K = len(without_parts)
     if K < 2:
         return np.zeros_like(without_parts)
-    factor = float(scipy.special.stdtrit(K - 1, 0.5 + 0.5 * LEVEL)) / HALF_WIDTH
+    factor = float(scipy.special.stdtrit(K - 1, 0.5 + 0.5 * LEVEL)) / NORMAL_95
     scatter = without_parts - without_parts.mean(axis=0)
     return np.asarray(factor * np.sqrt((K - 1) / K) * scatter)

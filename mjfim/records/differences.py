@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-# Half width of a 95 % interval of a normal distribution [standard deviations].
-HALF_WIDTH = 1.96
+from mjfim.records.intervals import NORMAL_95
 
 # Difference over the value it is compared with, up to which it is written in percent.
 LARGEST_SHARE = 10.0
@@ -29,7 +28,7 @@ def difference_text(
     change, size = abs(value - reference), abs(reference)
 
     # A percentage of a value that may be zero means nothing.
-    is_positive = value * reference > 0.0 and size > HALF_WIDTH * reference_std
+    is_positive = value * reference > 0.0 and size > NORMAL_95 * reference_std
     if is_single and is_positive and change <= LARGEST_SHARE * size:
         return f"{100.0 * change / size:.2g} % {above}"
     amount = f"{change:.2g} {unit}".rstrip()
@@ -43,7 +42,7 @@ def value_text(value: float, std: float) -> str:
         value: The value.
         std: Its standard deviation.
     """
-    return f"{value:.3g} ± {HALF_WIDTH * std:.2g}"
+    return f"{value:.3g} ± {NORMAL_95 * std:.2g}"
 
 
 def p_text(p: float) -> str:

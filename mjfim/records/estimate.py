@@ -12,6 +12,7 @@ from mjfim.arrays import Array, freeze
 from mjfim.records.combinations import join_names
 from mjfim.records.control_law import ControlLawInLoop
 from mjfim.records.horizons import HorizonStudy
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
 from mjfim.records.missing_term import MissingTerm, TermTestData
@@ -28,9 +29,6 @@ from mjfim.records.trajectory import Trajectory
 # Number of rows of all recordings above which an estimate does not hold the outputs of the model at
 # the initial guess.
 MAX_NOMINAL_ROWS = 1_000_000
-
-# Half width of a 95 % interval of a normal distribution [standard deviations].
-NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

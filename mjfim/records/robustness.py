@@ -10,13 +10,11 @@ import numpy as np
 from mjfim.amounts import MAX_NOISE, MAX_WRONG
 from mjfim.arrays import Array, freeze
 from mjfim.errors import ExperimentError
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.shown import ShownRecord
 
 # Probability with which the intervals and joint regions should hold the true values.
 CONFIDENCE = 0.95
-
-# Half width of an interval of this probability [standard deviations].
-INTERVAL_HALF_WIDTH = 1.959964
 
 # Required fraction of robots whose interval contains the true value, for every parameter.
 REQUIRED_COVERAGE = 0.90
@@ -195,7 +193,7 @@ class Robustness(ShownRecord):
     @property
     def inside(self) -> np.ndarray:
         """(p,) number of robots whose interval contains the true value."""
-        return np.asarray((np.abs(self.z) <= INTERVAL_HALF_WIDTH).sum(axis=0))
+        return np.asarray((np.abs(self.z) <= NORMAL_95).sum(axis=0))
 
     @property
     def observed(self) -> Array:

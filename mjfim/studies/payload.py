@@ -28,7 +28,8 @@ from mjfim.identification.searches import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.model.terms.base import AXES
 from mjfim.parallel import one_blas_thread
-from mjfim.records.estimate import NORMAL_95, Estimate
+from mjfim.records.estimate import Estimate
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.payload import PayloadEstimate
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording

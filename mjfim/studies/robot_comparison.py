@@ -22,7 +22,8 @@ from mjfim.identification.honest_covariance import (
 )
 from mjfim.identification.random_effects import between_variance, f_tail, satterthwaite
 from mjfim.records.combinations import join_names
-from mjfim.records.estimate import NORMAL_95, Estimate
+from mjfim.records.estimate import Estimate
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.recording import Recording
 from mjfim.records.robot_comparison import RobotComparison
 

@@ -56,6 +56,7 @@ from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.inertia_distance import barycentric_of, logcholesky_factor
 from mjfim.parallel import cores, one_blas_thread
 from mjfim.records.estimate import Whiteness
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.recording import Recording
 from scripts.benchmarks.arm_models import TIMESTEP, Arm, panda, ur5e
 
@@ -98,9 +99,6 @@ BASE_TOLERANCE = 1e-8
 
 # Wanted coverage, ratio of residual torques, and time of a fit [s].
 WANTED_COVERAGE, WANTED_RATIO, WANTED_SECONDS = 0.90, 1.1, 120.0
-
-# Half width of a 95 % interval of a normal variable [standard deviations].
-NORMAL_95 = float(scipy.special.ndtri(0.975))
 
 
 @dataclass(frozen=True, kw_only=True)

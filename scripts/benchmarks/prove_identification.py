@@ -33,6 +33,7 @@ from mjfim.atomic_io import replacing
 from mjfim.excitation.task import DesignTask
 from mjfim.identification.identify import identify_system
 from mjfim.parallel import cores
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.recording import Recording
 
 # Top folder of the repository.
@@ -196,7 +197,7 @@ def run(job: tuple[int, int, float]) -> Outcome:
     first = found.missing_terms[0].path if found.missing_terms else ""
     return Outcome(
         inside=(low <= theta) & (theta <= high),
-        formally=np.abs(error) <= 1.96,
+        formally=np.abs(error) <= NORMAL_95,
         error=error,
         misfit=found.misfit,
         named=first == "joint/slide:frictionloss",

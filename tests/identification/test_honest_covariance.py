@@ -13,7 +13,6 @@ from mjfim.excitation import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification.honest_covariance import (
     AGREEMENT,
-    HALF_WIDTH,
     agreeing_covariance,
     between_covariance,
     honest_covariance,
@@ -23,6 +22,7 @@ from mjfim.identification.honest_covariance import (
 )
 from mjfim.records.estimate import Uncertainty
 from mjfim.records.horizons import HorizonStudy
+from mjfim.records.intervals import NORMAL_95
 from tests.identification.test_parameter_draws import COVARIANCE, STD, estimated, stated
 from tests.support.numerics import Array
 
@@ -167,7 +167,7 @@ def test_lengths_and_selections_widen_along_their_differences(system: System) ->
         widened, system.parameters, without_parts=without
     ).honest_covariance
     np.testing.assert_allclose(
-        np.sqrt(np.diag(found))[:2], 2.776 * jackknife / HALF_WIDTH, rtol=AGREEMENT + 0.01
+        np.sqrt(np.diag(found))[:2], 2.776 * jackknife / NORMAL_95, rtol=AGREEMENT + 0.01
     )
     assert size(found, np.append(PRODUCT, 0.0)) == pytest.approx(KNOWN, rel=0.2)
 

@@ -19,6 +19,7 @@ from mjfim.identification.independent_blocks import (
 from mjfim.identification.recording_comparison import compare_evidence
 from mjfim.identification.robust_covariance import robust_uncertainty
 from mjfim.output.summaries.verdicts import Level, verdict_of
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.prior_directions import PriorDirections
 from mjfim.records.recording import Recording
 from mjfim.records.robot_comparison import RobotComparison
@@ -86,7 +87,7 @@ def test_a_worn_joint_is_named() -> None:
     sigmas = 0.06 / np.hypot(0.01, 0.01)
     assert found.p[1] == pytest.approx(4 * 2 * student.sf(sigmas, 1e6), rel=1e-2)
     np.testing.assert_allclose(
-        found.interval[1], 0.06 + np.array([-1, 1]) * 1.96 * 0.01 * 2**0.5, rtol=1e-3
+        found.interval[1], 0.06 + np.array([-1, 1]) * NORMAL_95 * 0.01 * 2**0.5, rtol=1e-3
     )
 
     # The other way round, the sign changes.
@@ -136,7 +137,7 @@ def test_wide_intervals_count_and_bounds_do_not() -> None:
         interval=np.array([[1.8, 2.2], [0.0, 0.3], [0.9, 1.1]]),
         at_bound=("damping",),
     )
-    np.testing.assert_allclose(honest_std(wide) * 1.96, [0.2, 0.3, 0.1])
+    np.testing.assert_allclose(honest_std(wide) * NORMAL_95, [0.2, 0.3, 0.1])
 
 
 @pytest.mark.parametrize(
@@ -200,7 +201,7 @@ def test_known_combinations_are_compared_by_the_honest_covariance() -> None:
     assert joint_p(honest_covariance=formal) < 0.05
 
     # An interval that is 5 % wider does not hide the difference.
-    half = 1.96 * std * [1.05, 1.0, 1.0]
+    half = NORMAL_95 * std * [1.05, 1.0, 1.0]
     interval = np.column_stack([1.0 - half, 1.0 + half])
     assert joint_p(interval=interval, honest_covariance=formal) < 0.05
 

@@ -35,10 +35,8 @@ from mjfim.output.summaries.accuracy import BEST_CASE, improvement, relative, si
 from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.labels import Labels
-
-# Half width of the 95 % interval of a normal distribution, in standard deviations.
-QUANTILE_95 = 1.959964
 
 # Largest number of rows that are high; more rows are lower and their bars have no numbers.
 MAX_HIGH_ROWS = 12
@@ -305,7 +303,7 @@ def _difference_from_guess(estimate: Estimate) -> _RelativeEstimate:
     percent = np.where(sizes > 0.0, sizes, np.nan) / 100.0
     return _RelativeEstimate(
         centre=(estimate.theta - guess) / percent,
-        formal_half_width=QUANTILE_95 * estimate.std / percent,
+        formal_half_width=NORMAL_95 * estimate.std / percent,
         interval=(estimate.interval - guess[:, None]) / percent[:, None],
     )
 

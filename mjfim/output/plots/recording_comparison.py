@@ -26,11 +26,9 @@ from mjfim.output.plots.style import (
     shorten,
 )
 from mjfim.records.estimate import Estimate
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.labels import with_unit
 from mjfim.records.recording_comparison import RecordingComparison
-
-# Half width of a 95 % interval of a normal distribution [standard deviations].
-HALF_WIDTH = 1.96
 
 # Largest number of parameters and of recordings of a figure; of more parameters, those that differ
 # most are drawn.
@@ -106,7 +104,7 @@ def _draw_parameter(
 
     for row, k in enumerate(recordings):
         colour = DESIGNED_COLOUR if k in odd else MEASURED_COLOUR
-        value, reach = float(comparison.values[k, j]), HALF_WIDTH * float(comparison.std[k, j])
+        value, reach = float(comparison.values[k, j]), NORMAL_95 * float(comparison.std[k, j])
         if np.isfinite(value):
             _draw_interval(axes, value, reach, row, colour, (low, high))
 
@@ -152,7 +150,7 @@ def _draw_interval(
 
 def _limits(comparison: RecordingComparison, j: int) -> tuple[float, float]:
     """Return the range of an axis; few very wide intervals do not widen it. It is never empty."""
-    values, reach = comparison.values[:, j], HALF_WIDTH * comparison.std[:, j]
+    values, reach = comparison.values[:, j], NORMAL_95 * comparison.std[:, j]
     known = np.isfinite(values) & np.isfinite(reach)
     if not known.any():
         return -1.0, 1.0

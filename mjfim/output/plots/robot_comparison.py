@@ -22,11 +22,9 @@ from mjfim.output.plots.style import (
     shorten,
     shorten_label,
 )
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.labels import with_unit
 from mjfim.records.robot_comparison import RobotComparison
-
-# Half width of a 95 % interval of a normal distribution [standard deviations].
-HALF_WIDTH = 1.96
 
 # Largest number of parameters; of more, those with the most significant differences are drawn.
 MAX_PARAMETERS = 40
@@ -114,7 +112,7 @@ def _draw_difference(axes: Axes, comparison: RobotComparison, j: int, row: int) 
         axes.plot(centre, row, "o", color=colour, markersize=5.5, zorder=3)
 
     first, second = (
-        format_with_uncertainty(float(value), HALF_WIDTH * float(std))
+        format_with_uncertainty(float(value), NORMAL_95 * float(std))
         for value, std in zip(comparison.values[:, j], comparison.std[:, j], strict=True)
     )
     axes.text(

@@ -9,9 +9,9 @@ from matplotlib.lines import Line2D
 
 from mjfim.output.plots import style
 from mjfim.output.vocabulary import NOMINAL
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.robustness import (
     CONFIDENCE,
-    INTERVAL_HALF_WIDTH,
     REQUIRED_COVERAGE,
     Robustness,
 )
@@ -152,8 +152,8 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
     """Draw the errors of all estimates in standard deviations."""
     style.format_axes(axes, "", "(estimate − truth) / σ")
     axes.axhspan(
-        -INTERVAL_HALF_WIDTH,
-        INTERVAL_HALF_WIDTH,
+        -NORMAL_95,
+        NORMAL_95,
         color=style.GRID_COLOUR,
         alpha=0.8,
         linewidth=0.0,
@@ -165,7 +165,7 @@ def _draw_errors(axes: Axes, result: Robustness) -> None:
     for j in range(len(result.names)):
         z = np.clip(result.z[:, j], -LARGEST_DRAWN_ERROR, LARGEST_DRAWN_ERROR)
         x = j + rng.uniform(-0.28, 0.28, len(z))
-        inside = np.abs(z) <= INTERVAL_HALF_WIDTH
+        inside = np.abs(z) <= NORMAL_95
         for chosen, colour, opacity in (
             (inside, style.IDENTIFIED_COLOUR, 0.6),
             (~inside, style.DESIGNED_COLOUR, RED_OPACITY),

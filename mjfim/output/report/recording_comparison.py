@@ -17,11 +17,9 @@ from mjfim.output.report.page import Key, Panel, PlotGroup, Plotly, Section
 from mjfim.output.summaries.recording_comparison import describe_recordings
 from mjfim.output.vocabulary import DESIGNED, IDENTIFIED, MEASURED
 from mjfim.records.estimate import Estimate
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.labels import with_unit
 from mjfim.records.recording_comparison import RecordingComparison
-
-# Half width of a 95 % interval of a normal distribution [standard deviations].
-HALF_WIDTH = 1.96
 
 # Largest number of parameters with a plot; of more, those that differ most.
 MAX_PANELS = 24
@@ -94,7 +92,7 @@ def _intervals(
     comparison: RecordingComparison, j: int, members: list[int], name: str, role: str
 ) -> Plotly:
     """Return the values of some recordings with their intervals."""
-    values, reach = comparison.values[members, j], HALF_WIDTH * comparison.std[members, j]
+    values, reach = comparison.values[members, j], NORMAL_95 * comparison.std[members, j]
     texts = [
         f"{comparison.recordings[k]}: {value:.4g} ± {width:.2g} {comparison.units[j]}".rstrip()
         for k, value, width in zip(members, values, reach, strict=True)

@@ -10,6 +10,7 @@ from mjfim.arrays import Array
 from mjfim.identification.lagged_products import lagged_products
 from mjfim.output.distributions import chi_squared_quantiles
 from mjfim.records.estimate import Estimate
+from mjfim.records.intervals import NORMAL_95
 
 # Largest number of lags of an autocorrelation.
 MAX_LAGS = 100
@@ -19,9 +20,6 @@ SEGMENT_LENGTH = 256
 
 # Fewest residuals of a recording that are tested.
 MIN_RESIDUALS = 16
-
-# Half width of a 95 % interval of a normal distribution [standard deviations].
-NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -18,9 +18,9 @@ from mjfim.output.summaries.robustness import describe_robustness, robustness_se
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.summary_parts import Listing, Part
 from mjfim.output.vocabulary import DESIGNED, INITIAL, MEASURED
+from mjfim.records.intervals import NORMAL_95
 from mjfim.records.robustness import (
     CONFIDENCE,
-    INTERVAL_HALF_WIDTH,
     REQUIRED_COVERAGE,
     Robustness,
 )
@@ -128,7 +128,7 @@ def _error_plots(result: Robustness) -> PlotGroup:
     z = np.clip(result.z, -LARGEST_DRAWN_ERROR, LARGEST_DRAWN_ERROR)
     rows = np.concatenate([j + _spread(len(z)) for j in range(len(names))])
     errors = np.concatenate(z.T)
-    is_inside = np.abs(errors) <= INTERVAL_HALF_WIDTH
+    is_inside = np.abs(errors) <= NORMAL_95
     traces = []
     for chosen, name, role in (
         (is_inside, INSIDE, MEASURED.word),
@@ -145,7 +145,7 @@ def _error_plots(result: Robustness) -> PlotGroup:
         layout={
             "xaxis": axis("(estimate − true value) / σ [–]", range=[-reach, reach]),
             "yaxis": row_axis(names),
-            "shapes": [band(-INTERVAL_HALF_WIDTH, INTERVAL_HALF_WIDTH, across="y")],
+            "shapes": [band(-NORMAL_95, NORMAL_95, across="y")],
             "hovermode": "closest",
         },
         height=rows_height(len(names), 44),

@@ -18,7 +18,8 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.estimate import NORMAL_95, Estimate
+from mjfim.records.estimate import Estimate
+from mjfim.records.intervals import NORMAL_95
 
 # Heading of the standard deviation of the distribution.
 STD = "σ"
