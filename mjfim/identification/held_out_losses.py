@@ -17,6 +17,7 @@ from mjfim.arrays import Array, freeze
 from mjfim.budget import Budget
 from mjfim.identification.cross_validation import of_folds
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.jackknife import jackknife_std
 from mjfim.identification.leave_out_fits import (
     LeaveOutStep,
     fit_to_others,
@@ -99,15 +100,9 @@ class HeldOutLosses:
     def jackknife(self) -> Array:
         """(p,) standard errors of the estimates by leaving out each part [theta-unit].
 
-        They contain what differs between the parts of the data, also what no model explains. NaN
-        with fewer than two parts. Source: Efron and Stein, The jackknife estimate of variance,
-        1981.
+        NaN with fewer than two parts.
         """
-        K = len(self.estimates)
-        if K < 2:
-            return np.full(self.estimates.shape[1], np.nan)
-        scatter = self.estimates - self.estimates.mean(axis=0)
-        return np.asarray(np.sqrt((K - 1) / K * np.sum(scatter**2, axis=0)))
+        return jackknife_std(self.estimates)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,9 +22,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy
 
 from mjfim.arrays import Array
+from mjfim.identification.jackknife import jackknife_deviations, student_quantile
 from mjfim.identification.robust_covariance import LEVEL, covering_covariance
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate, Uncertainty
@@ -97,7 +97,7 @@ def with_honest_covariance(
     if covariance is not None and estimate.horizons is not None:
         inner = _covering(inner, _differences(inner, estimate.horizons, known))
     if without_parts is not None:
-        inner = _covering(inner, _jackknife(without_parts)[:, known])
+        inner = _covering(inner, _between_parts(without_parts)[:, known])
     found[place] = agreeing_covariance(inner, std[known])
     return replace(estimate, honest_covariance=found)
 
@@ -268,15 +268,13 @@ def _differences(covariance: Array, study: HorizonStudy, known: np.ndarray) -> A
     return np.concatenate(found)
 
 
-def _jackknife(without_parts: Array) -> Array:
-    """(K, p) deviations whose sum of squares is the variance by the jackknife, by Student's factor.
+def _between_parts(without_parts: Array) -> Array:
+    """(K, p) deviations between the parts of the data, by Student's factor, like the intervals.
 
     Args:
-        without_parts: (K, p) estimates without each of K parts of the data.
+        without_parts: (K, p) estimates without each of K parts of the data [theta-unit].
     """
     K = len(without_parts)
     if K < 2:
         return np.zeros_like(without_parts)
-    factor = float(scipy.special.stdtrit(K - 1, 0.5 + 0.5 * LEVEL)) / NORMAL_95
-    scatter = without_parts - without_parts.mean(axis=0)
-    return np.asarray(factor * np.sqrt((K - 1) / K) * scatter)
+    return student_quantile(K, LEVEL) / NORMAL_95 * jackknife_deviations(without_parts)

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.continuation import WholeFit
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.held_out_losses import BLOCKS, HeldOutLosses, losses_by_block
+from mjfim.identification.jackknife import jackknife_std, student_quantile
 from mjfim.identification.leave_out_fits import fit_to_others, leave_out_steps
 from mjfim.identification.left_out_parts import (
     MAX_FOLDS,
@@ -323,12 +323,9 @@ def _half_width(without: Array, confidence: float) -> Array:
         without: (K, p) values without each part.
         confidence: Probability that an interval holds the true value.
     """
-    K = len(without)
-    if K < 2:
+    if len(without) < 2:
         return np.full(without.shape[1], np.nan)
-    scatter = without - without.mean(axis=0)
-    deviation = np.sqrt((K - 1) / K * np.sum(scatter**2, axis=0))
-    return np.asarray(scipy.stats.t.ppf(0.5 + 0.5 * confidence, K - 1) * deviation)
+    return student_quantile(len(without), confidence) * jackknife_std(without)
 
 
 def _is_apart(fit: _LengthFit, chosen: _LengthFit) -> np.ndarray:

@@ -14,6 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction
 from mjfim.identification.honest_covariance import with_honest_covariance
+from mjfim.identification.jackknife import student_quantile
 from mjfim.identification.report import FitResult
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate
@@ -269,7 +270,7 @@ def with_selection(
     if parts < MIN_PARTS:
         estimate = replace(estimate, warnings=(*estimate.warnings, NOT_WIDENED))
     else:
-        quantile = float(scipy.stats.t.ppf(0.5 + 0.5 * CONFIDENCE, parts - 1))
+        quantile = student_quantile(parts, CONFIDENCE)
         low = np.minimum(low, estimate.theta - quantile * losses.jackknife)
         high = np.maximum(high, estimate.theta + quantile * losses.jackknife)
 

@@ -1,0 +1,28 @@
+"""The jackknife gives the standard error of a mean, and no scatter from a single part."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjfim.identification.jackknife import jackknife_deviations, jackknife_std, student_quantile
+
+
+def test_the_deviations_and_the_standard_error_of_means() -> None:
+    data = np.random.default_rng(3).normal([3.0, -1.0], [2.0, 0.1], (7, 2))
+    without = np.array([np.delete(data, i, axis=0).mean(axis=0) for i in range(7)])
+    np.testing.assert_allclose(jackknife_std(without), data.std(axis=0, ddof=1) / np.sqrt(7.0))
+
+    deviations = jackknife_deviations(without)
+    expected = np.cov(data, rowvar=False) / 7.0
+    np.testing.assert_allclose(deviations.T @ deviations, expected)
+
+
+def test_a_single_part_has_no_scatter() -> None:
+    assert not jackknife_deviations(np.ones((1, 3))).any()
+    assert np.isnan(jackknife_std(np.ones((1, 3)))).all()
+
+
+def test_the_quantile_is_that_of_student() -> None:
+    """Of 2 parts, 12.706 standard errors are 95 %; of many, 1.96."""
+    np.testing.assert_allclose(student_quantile(2, 0.95), 12.706, rtol=1e-4)
+    np.testing.assert_allclose(student_quantile(10**7, 0.95), 1.959964, rtol=1e-5)
