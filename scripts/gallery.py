@@ -151,7 +151,7 @@ class Robot:
 
 @dataclass(kw_only=True)
 class Shown:
-    """What one call left behind.
+    """Output of one call of the command line.
 
     Attributes:
         command: The command, with short paths.

@@ -47,7 +47,7 @@ VERBS = ("init", "check", "design", "simulate", "identify")
 
 @dataclass(kw_only=True)
 class Walk:
-    """What happened to one model.
+    """Outcome of all verbs for one model.
 
     Attributes:
         model: Name of the model.

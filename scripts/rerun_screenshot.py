@@ -35,7 +35,7 @@ SIZE = (1920, 1080)
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """What a picture shows of a recording.
+    """View of a recording in a picture.
 
     Attributes:
         rrd: Rerun recording.

@@ -47,7 +47,7 @@ CLOSING_SHARE = 0.05
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FoundWithinLimits:
-    """What a search within hard limits has found.
+    """Controls that a search within hard limits has found.
 
     Attributes:
         results: Result of every start that was begun.

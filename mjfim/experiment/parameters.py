@@ -193,7 +193,7 @@ def _target(stated: TargetSpec, source: ModelSource, outputs: Sequence[str]) -> 
 
 
 def _fault_beyond(bounds: tuple[float, float]) -> str:
-    """What is wrong with a value beyond the physical bounds of a parameter."""
+    """Describe the fault of a value beyond the physical bounds of a parameter."""
     is_sign = 0.0 in bounds and np.isinf(bounds).any()
     return "negative" if is_sign else f"leave its range {list(bounds)}"
 

@@ -146,7 +146,7 @@ def _cross_validate(
 
 
 def of_folds(problem: FitProblem, folds: Sequence[ProblemWork[T]], budget: Budget) -> Iterator[T]:
-    """What is found for all parts of the data, in one process or side by side on workers.
+    """Yield the results for all parts of the data, from one process or side by side from workers.
 
     Args:
         problem: Problem of all parts.

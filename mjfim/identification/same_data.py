@@ -51,7 +51,7 @@ def refuse_same_data(fitted: Sequence[Recording], held_out: Sequence[Recording])
 
 
 def _beginning(recording: Recording) -> Hashable:
-    """What recordings with the same data have in common: sizes, outputs and the first row."""
+    """Key that recordings with the same data share: sizes, outputs and the first row."""
     # Missing values are equal to each other and to zero here, and zero has no sign. Recordings that
     # begin alike are compared as a whole later.
     first = np.nan_to_num(recording.y[:1].ravel()) + 0.0

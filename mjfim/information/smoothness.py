@@ -169,7 +169,7 @@ def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:
 def _causes(
     plant: Plant, model: Any, theta: Array, trajectory: Trajectory, samples: range
 ) -> tuple[str, ...]:
-    """What acts at some samples of a trajectory, the limits of control laws among it."""
+    """Names of the constraints and limits of control laws that act at some samples."""
     if plant.laws is None:
         return active_constraints(model, trajectory, samples)
 

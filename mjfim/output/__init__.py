@@ -1,1 +1,1 @@
-"""What is written to disk or drawn: archives, figures, Rerun recordings, identified MJCF."""
+"""Files and pictures of results: archives, figures, Rerun recordings, identified MJCF."""

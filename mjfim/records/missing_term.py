@@ -86,7 +86,7 @@ class MissingTerm:
 
     @property
     def recipe(self) -> str:
-        """What to add to the experiment file: lines of TOML with a semicolon between them."""
+        """Lines of TOML to add to the experiment file, with a semicolon between them."""
         tables = [] if self.added is None else [_toml_line("terms", self.added)]
         targets = [self.path, *(parameter.path for parameter in self.further)]
         return "; ".join([*tables, *(f'target = "{path}"' for path in targets)])

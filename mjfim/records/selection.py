@@ -13,7 +13,7 @@ from mjfim.records.missing_term import AddedTerm, TermParameter
 
 
 class Decision(Enum):
-    """What a step of a selection did."""
+    """Decision on the model that a step of a selection tried."""
 
     BEGUN = "begun"
     ADDED = "added"

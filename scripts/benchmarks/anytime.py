@@ -55,7 +55,7 @@ HORIZON = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What one method found within one budget.
+    """Result of one method within one budget.
 
     Attributes:
         case: Name of the experiment.

@@ -410,7 +410,7 @@ def motion_of(log: Log, count: int) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fitted:
-    """What a fit says.
+    """Estimate of one fit, with its uncertainty and judgement.
 
     Attributes:
         theta: (p,) estimate.

@@ -1,4 +1,4 @@
-"""What became faster or better than at an earlier commit, and whether it meets its goal: one table.
+"""Table of the changes in time and quality since an earlier commit, with the goal of each.
 
     python -m scripts.benchmarks before_and_after                       # 70 minutes
     python -m scripts.benchmarks before_and_after --quick               # 12 minutes
@@ -247,7 +247,7 @@ def starts(sizes: Sizes) -> Iterator[Measurement]:
 
 
 def surveys(sizes: Sizes) -> Iterator[Measurement]:
-    """What is identifiable of the Panda, which a design finds out before its first iterate."""
+    """Time of the survey of what is identifiable, which a design makes before its first iterate."""
     for p in SURVEYS[:1] if sizes.is_quick else SURVEYS:
         yield _of(
             "survey",

@@ -50,7 +50,7 @@ BARE_STEPS = 20_000
 
 @dataclass(kw_only=True)
 class Part:
-    """What one purpose takes.
+    """Effort for one purpose.
 
     Attributes:
         calls: Number of calls.

@@ -58,7 +58,7 @@ class Command:
 
 @dataclass(frozen=True, kw_only=True)
 class Press:
-    """What became of a command.
+    """Outcome of a command that a pressed key has interrupted.
 
     Attributes:
         moment: Time from the start of the command to the press [s].

@@ -101,7 +101,7 @@ BEFORE: dict[str, float] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Passes:
-    """What one fit took.
+    """Effort of one fit.
 
     Attributes:
         by_reason: Passes over the data by their reason.

@@ -357,7 +357,7 @@ def peak_memory() -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """What a verb does in one process.
+    """Result and effort of a verb in one process.
 
     Attributes:
         fingerprint: Numbers of its result.

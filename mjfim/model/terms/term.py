@@ -1,4 +1,4 @@
-"""What every physical term of the library has: fields with units and sizes, elements, and text."""
+"""Base class of the physical terms of the library: fields with units and sizes, and elements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an experiment file states, as tables."""
+"""Tables of the contents of an experiment file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a video shows: which motions, in which views, how fast, and seen from where.
+"""Contents of a video: the motions, their views, the speed, and the camera.
 
 A film holds arrays and words only. `mjfim.output.video.rendering` draws it.
 """
