@@ -12,7 +12,7 @@ are screened by simulations with some of their values (`mjfim/identification/scr
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -114,8 +114,12 @@ class TermTests:
 
     @property
     def remark(self) -> str:
-        """Sentence about the tested data, with a space before it; empty where that is all data."""
-        return "" if self.data is None or self.data.is_complete else f" {self.data}"
+        """Sentences about what was not tested, each with a space before it; empty for none."""
+        if self.data is None:
+            return ""
+        about_data = "" if self.data.is_complete else f" {self.data}"
+        about_terms = f" {self.data.untested_sentence}" if self.data.untested else ""
+        return about_data + about_terms
 
 
 def find_missing_terms(
@@ -141,14 +145,17 @@ def find_missing_terms(
     tested, at = part.problem, part.unknowns(at)
 
     squares = 2.0 * tested.cost(at)
-    found = _by_score(tested, recordings, at, squares, groups)
+    found, untested = _by_score(tested, recordings, at, squares, groups)
     found += screened_terms(tested, recordings, at, squares)
 
     wanted = [term for term in found if term.share > MIN_EXPLAINED_SHARE]
     return TermTests(
         terms=tuple(_by_significance(wanted)[:MAX_NAMED_TERMS]),
         data=TermTestData(
-            share=part.share, recordings=part.recording_count, count=len(problem.recordings)
+            share=part.share,
+            recordings=part.recording_count,
+            count=len(problem.recordings),
+            untested=tuple(dict.fromkeys(untested)),
         ),
     )
 
@@ -166,22 +173,79 @@ def _by_score(
     at: UnknownValues,
     squares: float,
     groups: Sequence[Sequence[Candidate]],
-) -> list[MissingTerm]:
-    """Terms whose score tests are significant, in the order of the candidates."""
+) -> tuple[list[MissingTerm], list[str]]:
+    """Terms whose score tests are significant, and descriptions of those that were not tested.
+
+    Both are in the order of the candidates.
+    """
     count = sum(len(candidates) for candidates in groups)
 
     # Of the variants of one term, the most significant one stands for it.
     found: dict[str, MissingTerm] = {}
-    for candidates in groups:
-        linearisation = _linearise(problem, recordings, at, candidates)
-        if linearisation is None:
-            continue
-        for index, candidate in enumerate(candidates):
-            term = _score_test(candidate, index, linearisation, squares, count)
-            key = candidate.variant_of or candidate.path
-            if term is not None and (key not in found or term.sigmas > found[key].sigmas):
-                found[key] = term
-    return list(found.values())
+    untested: list[str] = []
+    for group in groups:
+        for candidates, linearisation in _linearised(problem, recordings, at, group):
+            if linearisation is None:
+                untested += [candidate.description for candidate in candidates]
+                continue
+            for index, candidate in enumerate(candidates):
+                term = _score_test(candidate, index, linearisation, squares, count)
+                key = candidate.variant_of or candidate.path
+                if term is not None and (key not in found or term.sigmas > found[key].sigmas):
+                    found[key] = term
+    return list(found.values()), untested
+
+
+def _linearised(
+    problem: FitProblem,
+    recordings: Sequence[Recording],
+    at: UnknownValues,
+    candidates: Sequence[Candidate],
+) -> Iterator[tuple[Sequence[Candidate], _Linearisation | None]]:
+    """Linearise by a group of candidates, and by parts of it where one of them prevents it.
+
+    Yields:
+        Candidates with their linearisation; None where the model cannot have them, or where the
+        simulation diverges.
+    """
+    linearisation = _linearise(problem, recordings, at, candidates)
+    if linearisation is not None or not candidates:
+        yield candidates, linearisation
+        return
+
+    # Where the simulation diverges next to the solution without any candidate, no group has a
+    # linearisation, and smaller ones need not be tried.
+    if _linearise(problem, recordings, at, ()) is None:
+        yield candidates, None
+        return
+
+    yield from _linearised_halves(problem, recordings, at, candidates)
+
+
+def _linearised_halves(
+    problem: FitProblem,
+    recordings: Sequence[Recording],
+    at: UnknownValues,
+    candidates: Sequence[Candidate],
+) -> Iterator[tuple[Sequence[Candidate], _Linearisation | None]]:
+    """Linearise by the halves of a group that has no linearisation as a whole.
+
+    One candidate must not hide the others, so that halves are divided until it is alone.
+
+    Yields:
+        As for `_linearised`.
+    """
+    if len(candidates) == 1:
+        yield candidates, None
+        return
+
+    middle = len(candidates) // 2
+    for half in (candidates[:middle], candidates[middle:]):
+        linearisation = _linearise(problem, recordings, at, half)
+        if linearisation is not None:
+            yield half, linearisation
+        else:
+            yield from _linearised_halves(problem, recordings, at, half)
 
 
 def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:

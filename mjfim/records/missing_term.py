@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from mjfim.errors import first_ones
+
 
 @dataclass(frozen=True, kw_only=True)
 class TermParameter:
@@ -122,11 +124,14 @@ class TermTestData:
         share: Share of the samples of all fitted recordings, 0 to 1.
         recordings: Number of recordings with tested samples.
         count: Number of all fitted recordings.
+        untested: Terms in words that could not be tested, because the model cannot have them or the
+            simulation diverges with them.
     """
 
     share: float
     recordings: int
     count: int
+    untested: tuple[str, ...] = ()
 
     @property
     def is_complete(self) -> bool:
@@ -145,6 +150,17 @@ class TermTestData:
             return f"{share}, from all {self.count} recordings"
         return f"{share}, from {self.recordings} of {self.count} recordings"
 
+    @property
+    def untested_sentence(self) -> str:
+        """Sentence about terms that could not be tested; empty for none."""
+        if not self.untested:
+            return ""
+        pronoun = "it" if len(self.untested) == 1 else "them"
+        return (
+            f"Not tested, because the simulation with {pronoun} diverges or the model cannot have "
+            f"{pronoun}: {first_ones(self.untested)}."
+        )
+
     def __str__(self) -> str:
         return f"Terms that the model may lack were tested on {self.amount}."
 
@@ -155,6 +171,7 @@ class TermTestData:
             "recordings": self.recordings,
             "of_recordings": self.count,
             "words": str(self),
+            "untested": list(self.untested),
         }
 
 

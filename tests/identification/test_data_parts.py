@@ -109,6 +109,18 @@ def test_the_tested_data_are_said() -> None:
         assert TermTests(data=part).remark == expected
 
 
+def test_terms_that_could_not_be_tested_are_said() -> None:
+    one = TermTestData(share=1.0, recordings=1, count=1, untested=("Stribeck friction of pivot",))
+    assert TermTests(data=one).remark == (
+        " Not tested, because the simulation with it diverges or the model cannot have it: "
+        "Stribeck friction of pivot."
+    )
+    assert one.summary()["untested"] == ["Stribeck friction of pivot"]
+    two = TermTestData(share=0.5, recordings=1, count=1, untested=("a", "b"))
+    assert "first part of the recording. Not tested" in TermTests(data=two).remark
+    assert two.untested_sentence.endswith("cannot have them: a, b.")
+
+
 @pytest.mark.slow
 def test_a_term_that_the_first_recording_does_not_show_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,18 @@ import pytest
 import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
+from mjfim.identification import missing_terms
+from mjfim.identification.candidates import Candidate, CandidateParameter
 from mjfim.identification.identify import identify_system
+from mjfim.identification.task import FitTask
 from mjfim.records.recording import Recording
+from tests.support.numerics import Array
 from tests.support.paths import ROOT
+from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum
 
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
+DAMPED = {"d": {"target": "joint/pivot:damping"}}
 
 
 def stated(**tables: object) -> mjfim.Experiment:
@@ -33,6 +41,14 @@ def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> 
     )
     task = DesignTask.resolve(other)
     return simulate_system(task.system, task.initial, seed)
+
+
+def rubbing_pendulum(folder: Path) -> Recording:
+    """A recording of the pendulum with dry friction; its model without it is in the folder."""
+    system = System.resolve(experiment_of(folder, "stribeck"))
+    recording = recorded(system, motor_torque(0.6, 100.0), 0)
+    write_pendulum(folder)
+    return recording
 
 
 @pytest.mark.parametrize(
@@ -127,3 +143,54 @@ def test_estimated_parameters_are_no_missing_terms(tmp_path: Path) -> None:
     assert not found.misfit
     f = found.parameters.index("f")
     assert abs(found.theta[f] - 0.5) < 4.0 * found.std[f]
+
+
+def with_failing(failing: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Test a further candidate between the others."""
+    usual = missing_terms.candidates_of
+
+    def extended(system: System, speeds: Array) -> Iterator[Candidate]:
+        """The candidates, of which the third one fails."""
+        found = list(usual(system, speeds))
+        yield from (*found[:2], failing, *found[2:])
+
+    monkeypatch.setattr(missing_terms, "candidates_of", extended)
+
+
+@pytest.mark.parametrize("path", ["joint/pivot:stiffness", "joint/pivot:nothing"])
+def test_a_candidate_that_diverges_or_is_invalid_is_named_and_hides_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    """Without it, the same terms are found."""
+    stated = experiment_of(tmp_path, "tilt", terms={}, parameters=DAMPED)
+    task = FitTask.resolve(stated, [rubbing_pendulum(tmp_path)], threads=1)
+    problem = task.problem()
+    at = problem.begin(task.start)
+    usual = missing_terms.find_missing_terms(problem, task.recordings, at)
+    assert usual.data is not None and not usual.data.untested
+    assert "joint/pivot:frictionloss" in {term.path for term in usual.terms}
+
+    number = CandidateParameter(
+        path=path, unit="", positive=False, value=0.0, linearised_at=-1e9, size=1.0
+    )
+    with_failing(Candidate(description="a strange spring", tested=(number,)), monkeypatch)
+    found = missing_terms.find_missing_terms(problem, task.recordings, at)
+    assert found.data is not None and found.data.untested == ("a strange spring",)
+    assert [term.path for term in found.terms] == [term.path for term in usual.terms]
+    assert found.remark.endswith("cannot have it: a strange spring.")
+
+
+@pytest.mark.slow
+def test_a_selection_says_which_terms_it_could_not_test(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stated = experiment_of(tmp_path, "tilt", terms={}, parameters=DAMPED, fit={"bootstrap": 0})
+    log = rubbing_pendulum(tmp_path)
+    number = CandidateParameter(
+        path="joint/pivot:nothing", unit="", positive=False, value=0.0, linearised_at=0.0, size=1.0
+    )
+    with_failing(Candidate(description="a strange spring", tested=(number,)), monkeypatch)
+    found = mjfim.select_terms(stated, [log])
+    assert found.selection is not None
+    assert found.selection.ending.endswith("cannot have it: a strange spring.")
+    assert any("a strange spring" in sentence for sentence in found.warnings)
