@@ -357,14 +357,14 @@ def robot_figure(size: Size) -> Figure:
     return plots.robot_figure(comparison)
 
 
-def drawn_robots(size: Size) -> Figure:
-    """Figure of 50 drawn robots."""
+def drawn_robots(size: Size, share: float = 1.0) -> Figure:
+    """Figure of 50 drawn robots, whose scatter is a share of the standard deviation."""
     found = estimate(size)
     noise = np.random.default_rng(0).normal(size=(50, size.parameters))
     draws = ParameterDraws(
         parameters=size.labels.parameters,
         units=size.labels.parameter_units,
-        values=found.theta + found.std * noise,
+        values=found.theta + share * found.std * noise,
         centre=found.theta,
         std=found.std,
     )
@@ -468,6 +468,16 @@ def test_texts_do_not_overlap_and_stay_inside(name: str, size: Size) -> None:
     if name.endswith("_pairs") and size.parameters < 2:
         pytest.skip("a pair needs two parameters")
     assert misplaced_texts(drawn(name, size)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [SMALL, USUAL, WIDE, LARGE], ids=str)
+def test_texts_of_robots_with_well_known_parameters_do_not_overlap(size: Size) -> None:
+    """The ticks are differences from a number above each histogram."""
+    figure = drawn_robots(size, 1e-6)
+    figure.set_dpi(50.0)
+    assert misplaced_texts(figure) == []
+    assert any("+ Δ" in axes.get_title() for axes in figure.axes)
 
 
 def test_overlapping_and_escaping_texts_are_found() -> None:

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
 
+from mjfim.output.plots.narrow_axis import place_ticks
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     IDENTIFIED_COLOUR,
@@ -17,13 +17,13 @@ from mjfim.output.plots.style import (
     SMALL_FONT,
     add_title,
     as_sentence,
-    fit_label,
+    fit_text,
     format_axes,
     new_figure,
     own_style,
     panel_width,
-    scale_axis,
     shorten,
+    text_width,
 )
 from mjfim.records.estimate import Estimate
 from mjfim.records.intervals import NORMAL_95
@@ -122,10 +122,13 @@ def _draw_parameter(
     for label, k in zip(axes.get_yticklabels(), recordings, strict=True):
         label.set_color(DESIGNED_COLOUR if k in odd else label.get_color())
     axes.tick_params(labelleft=is_left)
-    axes.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
-    power = scale_axis(axes.xaxis, max(abs(low), abs(high)))
-    label_text = with_unit(comparison.parameters[j], f"{power}{comparison.units[j]}".strip())
-    format_axes(axes, fit_label(label_text, panel_width(COLUMNS), SMALL_FONT))
+    middle = mean if np.isfinite(mean) else 0.5 * (low + high)
+    text = place_ticks(axes.xaxis, low, high, middle, intervals=3)
+    unit = f"{text.power}{comparison.units[j]}".strip()
+    suffix = with_unit(text.minus_offset, unit)
+    suffix = f" {suffix}" if suffix else ""
+    room = panel_width(COLUMNS) - text_width(suffix, SMALL_FONT)
+    format_axes(axes, fit_text(comparison.parameters[j], room, SMALL_FONT) + suffix)
 
 
 def _draw_interval(

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from mjfim.output.plots.narrow_axis import AxisText, place_ticks
 from mjfim.output.plots.style import (
     IDENTIFIED_COLOUR,
     MEASURED_COLOUR,
@@ -19,8 +19,8 @@ from mjfim.output.plots.style import (
     format_axes,
     new_figure,
     own_style,
-    scale_axis,
     shorten,
+    text_width,
 )
 from mjfim.output.vocabulary import IDENTIFIED
 from mjfim.records.estimate import Estimate
@@ -41,6 +41,9 @@ MARGIN = 0.06
 # Characters to which the names of parameters are shortened above a panel, and width of them beside
 # an axis [inch].
 NAME_WIDTH, LABEL_WIDTH = 18, 1.05
+
+# Sign of the differences from the value that stands above the histogram of a parameter.
+DIFFERENCE = "Δ"
 
 # Height of a row of panels, of the panel of a single parameter, and of all that is above and below
 # them [inch].
@@ -102,7 +105,6 @@ def _draw_histogram(axes: Axes, draws: ParameterDraws, j: int) -> None:
     axes.axvline(float(draws.centre[j]), color=IDENTIFIED_COLOUR, linewidth=1.4)
     axes.set(yticks=[])
     axes.spines["left"].set_visible(False)
-    axes.set_title(shorten(draws.parameters[j], NAME_WIDTH), fontsize=SMALL_FONT, pad=3)
 
 
 def _draw_pairs(axes: Axes, draws: ParameterDraws, j: int, i: int) -> None:
@@ -132,12 +134,12 @@ def _format(
     low, high = _range(draws, j)
     margin = MARGIN * (high - low)
     axes.set_xlim(low - margin, high + margin)
-    axes.xaxis.set_major_locator(MaxNLocator(2, steps=[1, 2, 5, 10]))
-    across = scale_axis(axes.xaxis, max(abs(low), abs(high)))
-    up = ""
-    if i != j:
-        axes.yaxis.set_major_locator(MaxNLocator(2, steps=[1, 2, 5, 10]))
-        up = scale_axis(axes.yaxis, float(np.abs(_range(draws, i)).max()))
+    across = place_ticks(axes.xaxis, low - margin, high + margin, float(draws.centre[j]))
+    up = AxisText()
+    if i == j:
+        _write_name(axes, draws.parameters[j], across)
+    else:
+        up = place_ticks(axes.yaxis, *axes.get_ylim(), float(draws.centre[i]))
 
     format_axes(
         axes,
@@ -147,10 +149,19 @@ def _format(
     axes.tick_params(labelbottom=is_lowest, labelleft=is_left)
 
 
-def _label(draws: ParameterDraws, j: int, power: str) -> str:
-    """Return the label of an axis: name and unit of a parameter, a line each."""
-    name = fit_text(draws.parameters[j], LABEL_WIDTH, SMALL_FONT)
-    unit = f"{power}{draws.units[j]}".strip()
+def _write_name(axes: Axes, name: str, text: AxisText) -> None:
+    """Write the name of a parameter above its histogram, and from which value its ticks count."""
+    title = shorten(name, NAME_WIDTH)
+    if text.offset:
+        title += f"\n= {text.offset} + {DIFFERENCE}"
+    axes.set_title(title, fontsize=SMALL_FONT, pad=3)
+
+
+def _label(draws: ParameterDraws, j: int, text: AxisText) -> str:
+    """Return the label of an axis: name of a parameter, and unit of the ticks, a line each."""
+    sign = f"{DIFFERENCE} " if text.offset else ""
+    name = sign + fit_text(draws.parameters[j], LABEL_WIDTH - text_width(sign), SMALL_FONT)
+    unit = f"{text.power}{draws.units[j]}".strip()
     return f"{name}\n[{unit}]" if unit else name
 
 

@@ -406,14 +406,32 @@ def scale_axis(axis: Axis, largest: float) -> str:
         The power with a space behind it, such as `10⁻³ `; empty where numbers of moderate size
         need none.
     """
+    power = power_of_ten(largest)
+    if power:
+        scale = 10.0**power
+        axis.set_major_formatter(lambda value, _: f"{value / scale:g}".replace("-", "−"))
+    return power_text(power)
+
+
+def power_of_ten(largest: float) -> int:
+    """Return the power of ten in which the ticks of an axis count; 0 for moderate numbers.
+
+    Args:
+        largest: Largest absolute value on the axis.
+    """
     power = int(np.floor(np.log10(largest))) if np.isfinite(largest) and largest > 0.0 else 0
     if -1 <= power < 4:
-        return ""
-    power = 3 * (power // 3) if power < 0 else power
+        return 0
+    return 3 * (power // 3) if power < 0 else power
 
-    scale = 10.0**power
-    axis.set_major_formatter(lambda value, _: f"{value / scale:g}".replace("-", "−"))
-    return f"10{str(power).translate(SUPERSCRIPTS)} "
+
+def power_text(power: int) -> str:
+    """Return a power of ten for a label, with a space behind it; empty for 0.
+
+    Args:
+        power: The exponent.
+    """
+    return f"10{str(power).translate(SUPERSCRIPTS)} " if power else ""
 
 
 def set_plain_log_ticks(axis: Axis) -> None:
