@@ -273,14 +273,14 @@ class Selection:
 
     @property
     def _about_errors(self) -> list[str]:
-        """Sentence about the held-out errors; none where no part of the data was predicted."""
+        """Sentence about the errors of left-out data; none where no part was predicted."""
         before, after = self.errors
         if isnan(before):
             return []
         begin = self.phases[-1][0]
         over = f" over {begin.description}" if begin.decision is Decision.SHORTENED else ""
         change = f" → {after:.3g}" if self.is_changed else ""
-        return [f"Held-out error{over} {before:.3g}{change} σ."]
+        return [f"Error of left-out data{over} {before:.3g}{change} σ."]
 
     @property
     def _simplifications(self) -> list[str]:

@@ -303,6 +303,29 @@ def selection_figure(size: Size) -> Figure:
     return plots.selection_figure(dataclasses.replace(estimate(size), selection=selection))
 
 
+def test_every_term_that_was_tried_has_its_name_unless_there_are_very_many() -> None:
+    """A term that predicts far worse than all others is an arrow at the right end."""
+    for count, is_named in ((3, True), (30, False)):
+        steps = [
+            SelectionStep(decision=Decision.REJECTED, description=f"term {i}", error=1.5 + i)
+            for i in range(count)
+        ]
+        begun = SelectionStep(decision=Decision.BEGUN, error=2.0)
+        added = SelectionStep(decision=Decision.ADDED, description="friction", count=1, error=1.0)
+        selection = Selection(terms=(), steps=(begun, *steps, added), ending="")
+        drawn = dataclasses.replace(estimate(SMALL), selection=selection)
+        axes = plots.selection_figure(drawn).axes[0]
+        names = [label.get_text() for label in axes.get_yticklabels()]
+        middle = [f"term {i}" for i in range(count)] if is_named else []
+        assert names == ["the stated model", *middle, "+ friction"]
+
+        line, *marks = axes.get_lines()
+        np.testing.assert_allclose(line.get_ydata(), [0, len(names) - 1])
+        assert [mark.get_marker() for mark in marks] == ["x", "x", *[">"] * (count - 2)]
+        rows = [float(np.ravel(mark.get_ydata())[0]) for mark in marks]
+        assert rows == ([1.0, 2.0, 3.0] if is_named else [1.0] * count)
+
+
 def horizons_figure(size: Size) -> Figure:
     """Figure of four lengths of segments, on which some parameters depend."""
     found = estimate(size)

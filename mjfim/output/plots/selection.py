@@ -1,6 +1,8 @@
-"""Figure of the selection of terms: held-out error against the number of terms."""
+"""Figure of the selection of terms: error of left-out data with each term that was tried."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -8,7 +10,7 @@ from matplotlib.lines import Line2D
 
 from mjfim.output.plots import style
 from mjfim.records.estimate import Estimate
-from mjfim.records.selection import Decision, SelectionStep
+from mjfim.records.selection import Decision, Selection, SelectionStep
 
 # Characters to which the names of terms are shortened.
 TERM_WIDTH = 40
@@ -16,8 +18,12 @@ TERM_WIDTH = 40
 # Height of a row, and of all else [inch].
 ROW_HEIGHT, FIXED_HEIGHT = 0.3, 1.4
 
-# Errors of rejected terms above this multiple of the largest kept one are drawn at the right end.
+# Errors of rejected terms above this multiple of the largest kept one are arrows at the right end.
 LARGEST_DRAWN_RATIO = 1.5
+
+# Largest number of rejected terms that have a row and a name each. More of them share the row of
+# the term that was added in their place.
+MAX_NAMED = 20
 
 
 @style.own_style
@@ -29,35 +35,33 @@ def selection_figure(estimate: Estimate) -> Figure:
     """
     selection = estimate.selection
     assert selection is not None
-    kept = [step for step in selection.steps if step.is_kept]
+    rows = _rows(selection)
 
-    figure = style.new_figure(FIXED_HEIGHT + ROW_HEIGHT * (len(kept) + 1))
+    figure = style.new_figure(FIXED_HEIGHT + ROW_HEIGHT * (len(rows.names) + 1))
     axes = figure.subplots()
     style.format_axes(axes, "error of left-out data [σ of the noise]")
 
-    # A row for each kept step, the stated model on top; the crosses of a row are the terms that
-    # were tried in its place.
-    first = 0
+    # The line joins the models with which the selection continued.
+    placed = list(zip(selection.steps, rows.places, strict=True))
+    kept_rows = iter([row for step, row in placed if step.is_kept])
     for phase in selection.phases:
-        rows = first + np.arange(len(phase))
         errors = [step.error for step in phase]
-        axes.plot(errors, rows, "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
-        first += len(phase)
-    right = LARGEST_DRAWN_RATIO * max(step.error for step in kept)
+        at = [next(kept_rows) for _ in phase]
+        axes.plot(errors, at, "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
+
+    right = LARGEST_DRAWN_RATIO * max(step.error for step in selection.steps if step.is_kept)
     if np.isnan(right):
         axes.set_xticks([])
-    row = 0
-    for step in selection.steps:
-        if step.is_kept:
-            row += 1
-        else:
-            axes.plot(min(step.error, right), row, "x", color=style.MUTED_COLOUR, markersize=6.0)
+    for step, row in placed:
+        if not step.is_kept:
+            is_beyond = step.error > right
+            marker, error = (">", right) if is_beyond else ("x", step.error)
+            axes.plot(error, row, marker, color=style.MUTED_COLOUR, markersize=6.0)
 
-    # Terms that were tried at the end, and not added, have a row of their own.
-    has_end = not selection.steps[-1].is_kept
-    names = [_label(step) for step in kept] + (["no further term"] if has_end else [])
-    axes.set_yticks(np.arange(len(names)), names)
-    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_yticks(np.arange(len(rows.names)), rows.names)
+    axes.set_ylim(len(rows.names) - 0.5, -0.5)
+    for label, is_kept in zip(axes.get_yticklabels(), rows.is_kept, strict=True):
+        label.set_color(style.TEXT_COLOUR if is_kept else style.MUTED_COLOUR)
 
     handles = [
         Line2D([], [], color=style.IDENTIFIED_COLOUR, marker="o", label="model of this step"),
@@ -76,6 +80,45 @@ def selection_figure(estimate: Estimate) -> Figure:
     return figure
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Rows:
+    """Rows of the figure, the stated model on top.
+
+    Attributes:
+        names: Name of each row.
+        is_kept: Whether the selection continued with the model of the row, by row.
+        places: Row of each step.
+    """
+
+    names: list[str]
+    is_kept: list[bool]
+    places: list[int]
+
+
+def _rows(selection: Selection) -> _Rows:
+    """Place the steps in rows: each in its own one, unless there are too many of them."""
+    steps = selection.steps
+    if sum(not step.is_kept for step in steps) <= MAX_NAMED:
+        return _Rows(
+            names=[_label(step) for step in steps],
+            is_kept=[step.is_kept for step in steps],
+            places=list(range(len(steps))),
+        )
+
+    # Rejected terms share the row of the next kept step; those at the end have a row of their own.
+    kept = [step for step in steps if step.is_kept]
+    before = np.cumsum([0, *(step.is_kept for step in steps)])[:-1]
+    names = [_label(step) for step in kept]
+    has_end = not steps[-1].is_kept
+    if has_end:
+        names.append("no further term")
+    return _Rows(
+        names=names,
+        is_kept=[True] * len(kept) + [False] * has_end,
+        places=before.tolist(),
+    )
+
+
 def _title(estimate: Estimate) -> str:
     """Return the outcome in a sentence."""
     selection = estimate.selection
@@ -84,10 +127,11 @@ def _title(estimate: Estimate) -> str:
     if np.isnan(before):
         return "No term was tried"
     if not selection.terms:
-        return f"No term was added: held-out error {before:.3g} σ"
+        return f"No term was added: error of left-out data {style.format_number(before)} σ"
     count = len(selection.terms)
     noun = "term" if count == 1 else "terms"
-    return f"{count} {noun} added: held-out error {before:.3g} σ → {after:.3g} σ"
+    change = f"{style.format_number(before)} σ → {style.format_number(after)} σ"
+    return f"{count} {noun} added: error of left-out data {change}"
 
 
 def _label(step: SelectionStep) -> str:
