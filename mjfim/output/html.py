@@ -87,6 +87,10 @@ def _rendered(part: Part) -> str:
 def _listing(listing: Listing) -> str:
     """Render sentences under a heading."""
     heading = _element("p", escape(listing.title), "font-weight: bold")
+    if listing.code:
+        blocks = [_element("pre", escape(item)) for item in listing.items]
+        return "\n".join([heading, *blocks])
+
     items = [_element("li", _lines(item)) for item in listing.items]
     return f"{heading}\n{_element('ul', ''.join(items), STYLES[listing.emphasis])}"
 

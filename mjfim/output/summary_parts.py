@@ -157,12 +157,14 @@ class Listing:
         items: The sentences; further lines of one sentence are separated by line breaks.
         emphasis: How strongly the sentences stand out.
         detail: True where a short form leaves it out.
+        code: True for items that are lines of a file to be copied.
     """
 
     title: str
     items: tuple[str, ...]
     emphasis: Emphasis = Emphasis.NORMAL
     detail: bool = False
+    code: bool = False
 
 
 Part = SummaryTable | Paragraph | Listing

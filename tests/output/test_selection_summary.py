@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import html
 import tomllib
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.output import html as page
+from mjfim.output.rerun import text
 from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.summaries.verdicts import verdict_of
-from mjfim.output.summary_parts import Emphasis, Listing, Paragraph, SummaryTable
+from mjfim.output.summary_parts import Emphasis, Listing, Paragraph, Summary, SummaryTable
 from mjfim.records.missing_term import AddedTerm, TermParameter
 from mjfim.records.selection import (
     AlternativeTerm,
@@ -111,6 +114,16 @@ def test_the_tables_to_keep_state_the_selected_experiment() -> None:
 
     # The lines fit into a terminal, so that none is folded.
     assert max(len(line) for item in listing.items for line in item.split("\n")) < 76
+
+
+def test_tables_to_be_copied_are_shown_as_they_are() -> None:
+    """In a list, a copied line would have a bullet, and Markdown would change some characters."""
+    selection = Selection(terms=(SLIDE_FRICTION,), steps=(BEGUN,), ending="")
+    (listing,) = (part for part in describe_selection(selection) if isinstance(part, Listing))
+    (toml,) = listing.items
+    summary = Summary(title="", outcome="", parts=(listing,))
+    assert f"```toml\n{toml}\n```" in text.render(summary)
+    assert f"<pre>{html.escape(toml)}</pre>" in page.render(summary)
 
 
 def stated_tables(experiment: mjfim.Experiment) -> dict[str, object]:

@@ -88,6 +88,9 @@ def _rendered(part: Part) -> str:
         title = f"**{escape(part.title)}**\n\n" if part.title else ""
         note = f"\n\n{escape(part.note)}" if part.note else ""
         return f"{title}{render_table(part, details_last=True)}{note}"
+    if isinstance(part, Listing) and part.code:
+        blocks = [f"```toml\n{item}\n```" for item in part.items]
+        return "\n\n".join([f"**{escape(part.title)}**", *blocks])
     if isinstance(part, Listing):
         return f"**{escape(part.title)}**\n\n{render_list(part.items)}"
     if part.emphasis in (Emphasis.STRONG, Emphasis.STRONG_WARNING):

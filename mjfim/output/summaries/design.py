@@ -60,9 +60,11 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
             )
         )
     )
+    count = design.iterations
+    iterations = "1 iteration" if count == 1 else f"{count} iterations"
     parts.append(
         Paragraph(
-            text=f"{design.iterations} iterations, {design.seconds:.2f} s, "
+            text=f"{iterations}, {design.seconds:.2f} s, "
             f"{design.steps / 1e6:.2f} million MuJoCo steps",
             detail=True,
         )

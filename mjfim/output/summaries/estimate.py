@@ -97,9 +97,9 @@ def describe_estimate(estimate: Estimate) -> Summary:
     if estimate.predictions:
         parts.append(_prediction_table(estimate.predictions))
         parts.append(_prediction_details(estimate.predictions))
-    parts.append(
-        Paragraph(text=f"{estimate.iterations} iterations, {estimate.seconds:.1f} s", detail=True)
-    )
+    count = estimate.iterations
+    iterations = "1 iteration" if count == 1 else f"{count} iterations"
+    parts.append(Paragraph(text=f"{iterations}, {estimate.seconds:.1f} s", detail=True))
     return Summary(
         title="Estimated parameters",
         outcome=estimate.status,

@@ -48,7 +48,7 @@ def describe_selection(selection: Selection) -> list[Part]:
     tables = tuple(_tables_to_keep(selection))
     if tables:
         title = "To keep this model, put these tables into the experiment file"
-        parts.append(Listing(title=title, items=tables, emphasis=Emphasis.WEAK))
+        parts.append(Listing(title=title, items=tables, emphasis=Emphasis.WEAK, code=True))
     return parts
 
 
