@@ -112,8 +112,10 @@ def _draw_parameter(
     count = len(recordings)
     new_row = count - 1 + NEW_GAP + 0.6
     if np.isfinite(comparison.prediction[j]).all():
-        ends = np.clip(comparison.prediction[j], low, high)
+        begin, end = comparison.prediction[j]
+        ends = np.clip((begin, end), low, high)
         axes.plot(ends, (new_row, new_row), color=MUTED_COLOUR, linewidth=3.0)
+        _mark_cut_ends(axes, begin, end, new_row, MUTED_COLOUR, (low, high))
 
     axes.set(xlim=(low, high), ylim=(new_row + 0.6, -0.6))
     axes.grid(False, axis="y")
@@ -125,7 +127,7 @@ def _draw_parameter(
     middle = mean if np.isfinite(mean) else 0.5 * (low + high)
     text = place_ticks(axes.xaxis, low, high, middle, intervals=3)
     unit = f"{text.power}{comparison.units[j]}".strip()
-    suffix = with_unit(text.minus_offset, unit)
+    suffix = with_unit(text.minus_offset, unit).strip()
     suffix = f" {suffix}" if suffix else ""
     room = panel_width(COLUMNS) - text_width(suffix, SMALL_FONT)
     format_axes(axes, fit_text(comparison.parameters[j], room, SMALL_FONT) + suffix)
@@ -143,12 +145,20 @@ def _draw_interval(
     low, high = limits
     ends = np.clip((value - reach, value + reach), low, high)
     axes.plot(ends, (row, row), color=colour, linewidth=1.2)
-    if value - reach < low:
-        axes.plot(low, row, "<", color=colour, markersize=5, clip_on=False)
-    if value + reach > high:
-        axes.plot(high, row, ">", color=colour, markersize=5, clip_on=False)
+    _mark_cut_ends(axes, value - reach, value + reach, row, colour, limits)
     if low <= value <= high:
         axes.plot(value, row, "o", color=colour, markersize=4.5, zorder=3)
+
+
+def _mark_cut_ends(
+    axes: Axes, begin: float, end: float, row: float, colour: str, limits: tuple[float, float]
+) -> None:
+    """Draw an arrow where the axis cuts off the end of an interval."""
+    low, high = limits
+    if begin < low:
+        axes.plot(low, row, "<", color=colour, markersize=5, clip_on=False)
+    if end > high:
+        axes.plot(high, row, ">", color=colour, markersize=5, clip_on=False)
 
 
 def _limits(comparison: RecordingComparison, j: int) -> tuple[float, float]:
