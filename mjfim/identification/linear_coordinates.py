@@ -99,12 +99,17 @@ class UnknownBody:
         # Near a rod or a plate, rounding may leave no way.
         return share if self.is_physical_after(values, share * step) else 0.0
 
+    def linear_slopes(self, values: Array) -> Array:
+        """(10, 10) derivatives of the barycentric coordinates by each parameter, in rows."""
+        if not self.is_logcholesky:
+            return np.eye(COUNT)
+        return barycentric_of(logcholesky_derivatives(values))
+
     def is_physical_after(self, values: Array, step: Array) -> bool:
         """Whether `moved` leads to a body with a volume, from parameters (10,) by a step (10,)."""
         if not self.is_logcholesky:
             return True
-        change = barycentric_of(logcholesky_derivatives(values))
-        return self.is_physical(self.linear(values) + step @ change)
+        return self.is_physical(self.linear(values) + step @ self.linear_slopes(values))
 
     def moved(self, values: Array, step: Array) -> Array:
         """(10,) parameters after a physical step along a straight line of linear coordinates.
@@ -114,8 +119,7 @@ class UnknownBody:
         """
         if not self.is_logcholesky or not step.any():
             return np.asarray(values + step)
-        change = barycentric_of(logcholesky_derivatives(values))
-        return self.values(self.linear(values) + step @ change)
+        return self.values(self.linear(values) + step @ self.linear_slopes(values))
 
     def is_physical(self, linear: Array) -> bool:
         """Whether the barycentric coordinates: (10,) are those of a body with a volume."""

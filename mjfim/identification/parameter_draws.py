@@ -4,7 +4,9 @@ The distribution is normal about the estimate, with its honest covariance
 (`mjfim/identification/honest_covariance.py`), and truncated at the bounds. Inertias of whole bodies
 move along straight lines of their barycentric coordinates, along which forces are linear, so that
 combinations that the recordings know well stay known in the drawn robots. Combinations that only
-the CAD prior determines stay at the estimate. Draws with an unphysical inertia are replaced.
+the CAD prior determines stay at the estimate. Draws with an unphysical inertia are replaced: where
+whole inertias are parameters, by draws from the distribution that is truncated at the inertias that
+no body has, a convex region of the barycentric coordinates, and else by further draws.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from mjfim.identification.honest_covariance import (
 )
 from mjfim.identification.linear_coordinates import UnknownBody, unknown_bodies
 from mjfim.identification.prior_share import InertiaCombinations
-from mjfim.identification.truncated_normal import draw_truncated_normal
+from mjfim.identification.truncated_normal import MatrixBound, draw_truncated_normal
+from mjfim.model.inertia_distance import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.targets import ModelField
 from mjfim.records.estimate import Estimate
@@ -217,12 +220,22 @@ def _physical_draws(
     places = [
         (body, np.searchsorted(drawn, body.columns)) for body in unknown_bodies(system.parameters)
     ]
+    physical = [
+        bound
+        for body, place in places
+        if (bound := _physical_bound(body, place, centre)) is not None
+    ]
     values = np.zeros((count, len(drawn)))
     missing = np.arange(count)
     replaced = 0
 
-    for _ in range(MAX_ROUNDS):
-        tried = draw_truncated_normal(centre, covariance, lower, upper, len(missing), rng)
+    for attempt in range(MAX_ROUNDS):
+        # Most inertias are known well, so that hardly any draw is unphysical. Only where one is,
+        # draws are made inside the physical region, which takes longer.
+        matrices = physical if attempt else []
+        tried = draw_truncated_normal(
+            centre, covariance, lower, upper, len(missing), rng, matrices=matrices
+        )
         is_physical = np.zeros(len(missing), dtype=bool)
         for i, row in zip(missing, range(len(missing)), strict=True):
             robot = _moved(places, centre, tried[row])
@@ -238,6 +251,25 @@ def _physical_draws(
         f"been replaced {MAX_ROUNDS} times; the recordings determine the inertias too poorly. "
         "State them as a whole (`inertial`) with a `cad_prior`, or with a narrower `prior`"
     )
+
+
+def _physical_bound(body: UnknownBody, place: np.ndarray, centre: Array) -> MatrixBound | None:
+    """The pseudo-inertia of a body as a bound of the draws; None if it is unphysical at the centre.
+
+    Args:
+        body: A body whose whole inertia is drawn.
+        place: (10,) places of its coordinates.
+        centre: (q,) centre of the distribution.
+    """
+    begin = centre[place]
+    linear = body.linear(begin)
+    if not body.is_physical(linear):
+        return None
+
+    # Pseudo-inertias are linear in the barycentric coordinates, and these in the draws.
+    slopes = np.zeros((len(centre), *BARYCENTRIC_DERIVATIVES.shape[1:]))
+    slopes[place] = np.tensordot(body.linear_slopes(begin), BARYCENTRIC_DERIVATIVES, axes=1)
+    return MatrixBound(at_mean=pseudo_inertia_of(linear), slopes=slopes)
 
 
 def _moved(

@@ -1,4 +1,7 @@
-"""Draws from a normal distribution of several variables between bounds.
+"""Draws from a normal distribution of several variables inside bounds.
+
+Bounds of single variables may be joined by matrices that depend linearly on the variables and have
+to be positive definite, as pseudo-inertias have. The region inside all of them is convex.
 
 The draws are made by Gibbs sampling (Robert, Simulation of truncated normal variables, Statistics
 and Computing, 1995) in coordinates in which the untruncated distribution is standard normal. There,
@@ -8,6 +11,7 @@ Every draw is the end of a chain of its own, so that the draws are independent o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,11 +26,32 @@ REACH = 8.0
 # Sweeps of a chain over all coordinates.
 SWEEPS = 200
 
+# Number of matrices that are factorised at most, and fewest sweeps: many chains with many matrices
+# take fewer sweeps.
+MAX_FACTORISED = 10_000_000
+MIN_SWEEPS = 50
+
+# Share of the way to a matrix that is not positive definite that one move may go.
+INSIDE = 1.0 - 1e-6
+
 # Eigenvalues of the correlation matrix below this share of the largest one count as zero.
 RANK_TOLERANCE = 1e-12
 
 # Coefficients of a bound below this share of the largest one do not limit a coordinate.
 SMALLEST_COEFFICIENT = 1e-12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MatrixBound:
+    """A symmetric matrix that is positive definite inside the bound.
+
+    Attributes:
+        at_mean: (d, d) the matrix at the mean of the distribution, positive definite.
+        slopes: (p, d, d) its derivatives by the variables.
+    """
+
+    at_mean: Array
+    slopes: Array
 
 
 def draw_truncated_normal(
@@ -36,6 +61,8 @@ def draw_truncated_normal(
     upper: Array,
     count: int,
     rng: np.random.Generator,
+    *,
+    matrices: Sequence[MatrixBound] = (),
 ) -> Array:
     """Draw from a normal distribution that is truncated at bounds.
 
@@ -46,18 +73,20 @@ def draw_truncated_normal(
         upper: (p,) upper bounds; may be infinite.
         count: Number of draws n.
         rng: Source of random numbers.
+        matrices: Matrices that are positive definite inside the bounds; default: none.
 
     Returns:
         (n, p) draws inside the bounds.
     """
     factor = _factor(covariance)
     bounds = _Bounds.near(mean, factor, lower, upper)
-    if not len(bounds.distance):
+    cones = [_Cone.of(matrix, factor) for matrix in matrices]
+    if not len(bounds.distance) and not cones:
         z = rng.standard_normal((count, factor.shape[1]))
     else:
         z = np.zeros((count, factor.shape[1]))
-        for _ in range(SWEEPS):
-            _sweep(z, bounds, rng)
+        for _ in range(_sweeps(z.size * len(cones))):
+            _sweep(z, bounds, cones, rng)
 
     # Rounding may exceed a bound.
     return np.asarray(np.clip(mean + z @ factor.T, lower, upper))
@@ -99,6 +128,53 @@ class _Bounds:
         )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Cone:
+    """Where a matrix is positive definite, in the k coordinates z.
+
+    Attributes:
+        slopes: (k, d, d) derivatives of the matrix by the coordinates, in a basis in which it is
+            the unit matrix at z = 0. This removes the units of its rows and columns.
+    """
+
+    slopes: Array
+
+    @staticmethod
+    def of(matrix: MatrixBound, factor: Array) -> _Cone:
+        """The bound in the coordinates z.
+
+        Args:
+            matrix: The bound in the variables.
+            factor: (p, k) factor of the covariance.
+        """
+        inverse = np.linalg.inv(np.linalg.cholesky(matrix.at_mean))
+        slopes = np.tensordot(factor.T, matrix.slopes, axes=1)
+        return _Cone(slopes=inverse @ slopes @ inverse.T)
+
+    def at(self, z: Array) -> Array:
+        """(n, d, d) matrices at (n, k) points."""
+        return np.asarray(np.eye(self.slopes.shape[1]) + np.tensordot(z, self.slopes, axes=1))
+
+    def room(self, matrices: Array, i: int) -> tuple[Array, Array]:
+        """(n,) moves down, not positive, and up, not negative, that one coordinate may make.
+
+        Args:
+            matrices: (n, d, d) matrices at the present points.
+            i: Index of the coordinate.
+        """
+        inverse = np.linalg.inv(np.linalg.cholesky(matrices))
+        eigenvalues = np.linalg.eigvalsh(inverse @ self.slopes[i] @ inverse.transpose(0, 2, 1))
+        with np.errstate(divide="ignore"):
+            down = -INSIDE / np.maximum(eigenvalues[:, -1], 0.0)
+            up = INSIDE / np.maximum(-eigenvalues[:, 0], 0.0)
+        return down, up
+
+
+def _sweeps(matrices: int) -> int:
+    """Number of sweeps in which a number of matrices each are factorised."""
+    return int(np.clip(MAX_FACTORISED // max(matrices, 1), MIN_SWEEPS, SWEEPS))
+
+
 def _factor(covariance: Array) -> Array:
     """(p, k) factor A of a covariance `A A'` of rank k."""
     std = np.sqrt(np.diag(covariance))
@@ -110,15 +186,17 @@ def _factor(covariance: Array) -> Array:
     return np.asarray(scale[:, None] * vectors[:, is_positive] * root)
 
 
-def _sweep(z: Array, bounds: _Bounds, rng: np.random.Generator) -> None:
+def _sweep(z: Array, bounds: _Bounds, cones: Sequence[_Cone], rng: np.random.Generator) -> None:
     """Draw every coordinate anew, given the others.
 
     Args:
         z: (n, k) present points of the chains, which are changed in place.
-        bounds: The bounds.
+        bounds: The bounds of single variables.
+        cones: The bounds by matrices.
         rng: Source of random numbers.
     """
     distance = bounds.distance - z @ bounds.normals.T
+    matrices = [cone.at(z) for cone in cones]
     for i in range(z.shape[1]):
         g = bounds.normals[:, i]
         room = distance + z[:, i : i + 1] * g
@@ -128,8 +206,14 @@ def _sweep(z: Array, bounds: _Bounds, rng: np.random.Generator) -> None:
         high = np.min(room[:, rises] / g[rises], axis=1, initial=np.inf)
         low = np.max(room[:, falls] / g[falls], axis=1, initial=-np.inf)
         high, low = np.maximum(high, z[:, i]), np.minimum(low, z[:, i])
+        for cone, at in zip(cones, matrices, strict=True):
+            down, up = cone.room(at, i)
+            low, high = np.maximum(low, z[:, i] + down), np.minimum(high, z[:, i] + up)
 
+        before = np.array(z[:, i])
         z[:, i] = _draw_between(low, high, rng)
+        for cone, at in zip(cones, matrices, strict=True):
+            at += (z[:, i] - before)[:, None, None] * cone.slopes[i]
         distance = room - z[:, i : i + 1] * g
 
 

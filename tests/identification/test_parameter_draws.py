@@ -232,9 +232,12 @@ class KnownMoment:
     inertia: Array
 
     @staticmethod
-    def of(folder: Path) -> KnownMoment:
-        """The estimate with the model as prior knowledge."""
-        tables = {"link1": {"inertial": "link1"}, "armature": {"target": "joint/joint1:armature"}}
+    def of(folder: Path, **prior: Any) -> KnownMoment:
+        """The estimate with the model as prior knowledge, or with stated priors."""
+        tables = {
+            "link1": {"inertial": "link1", **prior},
+            "armature": {"target": "joint/joint1:armature"},
+        }
         system = System.resolve(arm_experiment(folder, 1, parameters=tables))
         parameters = system.parameters
         (body,) = unknown_bodies(parameters)
@@ -248,7 +251,8 @@ class KnownMoment:
         inertia[body.columns] = by_linear[:, 9] / (linear[9] + guess[10])
         inertia[10] = 1.0 / (linear[9] + guess[10])
         data = sum(np.outer(row, row) / KNOWN**2 for row in (moment, inertia))
-        inverse = np.linalg.inv(data + CadPrior.of(parameters).information(guess))
+        known = CadPrior.of(parameters).information(guess) + parameters.prior_information
+        inverse = np.linalg.inv(data + known)
         covariance = np.asarray(inverse, dtype=np.float64)
         estimate = estimated(system, covariance, data=data, honest_covariance=covariance)
         return KnownMoment(
@@ -283,3 +287,26 @@ def test_combinations_that_recordings_know_stay_known(tmp_path: Path) -> None:
     )
     lost = [body.linear(robot[body.columns])[1] / begin[1] for robot in curved]
     assert np.std(lost) > 50 * KNOWN
+
+
+@pytest.mark.parametrize("prior", [0.5, 3.0])
+def test_a_wide_prior_on_a_whole_inertia_gives_physical_robots(
+    tmp_path: Path, prior: float
+) -> None:
+    """Nearly all draws of the normal distribution are no bodies, so that replacing them failed."""
+    known = KnownMoment.of(tmp_path, cad_prior=False, prior=prior)
+    system, estimate, body = known.system, known.estimate, known.body
+    draws = draw_parameters_system(system, estimate, 50, np.random.default_rng(7))
+    linear = np.array([body.linear(robot[body.columns]) for robot in draws.values])
+    assert all(body.is_physical(each) for each in linear)
+    for values_of_robot in draws.values[:5]:
+        assert system.model_at(values_of_robot).body("link1").mass[0] > 0.0
+
+    # The combinations that the recordings determine stay known, and the mass is not.
+    begin = body.linear(estimate.theta[body.columns])
+    moment = linear[:, 1] / begin[1]
+    inertia = (linear[:, 9] + draws.values[:, 10]) / (begin[9] + estimate.theta[10])
+    for values in (moment, inertia):
+        assert 0.5 * KNOWN < np.std(values) < 1.3 * KNOWN
+        assert np.mean(values) == pytest.approx(1.0, abs=KNOWN)
+    assert np.std(linear[:, 0]) > 0.1 * begin[0]

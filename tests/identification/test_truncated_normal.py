@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import ks_2samp, kstest, norm, truncnorm
 
-from mjfim.identification.truncated_normal import draw_truncated_normal
+from mjfim.identification import truncated_normal
+from mjfim.identification.truncated_normal import (
+    MIN_SWEEPS,
+    SWEEPS,
+    MatrixBound,
+    draw_truncated_normal,
+)
 from tests.support.numerics import Array
 
 INFINITE = np.full(3, np.inf)
@@ -75,6 +81,50 @@ def test_a_singular_covariance_keeps_its_directions() -> None:
     np.testing.assert_allclose(drawn[:, 0] * 2.0 + drawn[:, 1], 4.0, atol=1e-9)
     np.testing.assert_array_equal(drawn[:, 2], 3.0)
     assert drawn[:, 0].min() >= 0.5
+
+
+# A matrix [[x, y], [y, z]] of three variables, by its slopes.
+SLOPES = np.array([[[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]], dtype=float)
+
+
+@pytest.mark.parametrize("sweeps", [SWEEPS, MIN_SWEEPS])
+@pytest.mark.parametrize("correlation", [0.0, -0.45, 0.9])
+def test_a_positive_definite_matrix_cuts_off_as_rejection_does(
+    correlation: float, sweeps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bound of a single variable holds as well."""
+    monkeypatch.setattr(truncated_normal, "SWEEPS", sweeps)
+    mean, std = np.array([1.0, 0.3, 0.5]), np.array([1.0, 3.0, 0.5])
+    covariance = covariance_of(std, correlation)
+    lower, upper = np.array([-np.inf, -0.4, -np.inf]), INFINITE
+    bound = MatrixBound(at_mean=np.tensordot(mean, SLOPES, axes=1), slopes=SLOPES)
+    rng = np.random.default_rng(6)
+    drawn = draw_truncated_normal(mean, covariance, lower, upper, 800, rng, matrices=[bound])
+
+    def is_inside(x: Array) -> Array:
+        """Whether the matrix is positive definite and the bound holds."""
+        is_positive = (x[:, 0] > 0.0) & (x[:, 0] * x[:, 2] > x[:, 1] ** 2)
+        return np.asarray(is_positive & (x[:, 1] >= lower[1]))
+
+    assert is_inside(drawn).all()
+    plain = rng.multivariate_normal(mean, covariance, 60_000)
+    kept = plain[is_inside(plain)]
+    assert 1000 < len(kept) < 30_000
+    for direction in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0.3, 0], [1, -0.3, 1], [0, 1, -6]):
+        assert ks_2samp(drawn @ direction, kept @ direction).pvalue > 1e-3
+
+
+def test_units_of_a_matrix_do_not_change_the_draws() -> None:
+    mean, covariance = np.array([1.0, 0.3, 0.5]), covariance_of(np.array([1.0, 3.0, 0.5]), 0.5)
+    at_mean = np.tensordot(mean, SLOPES, axes=1)
+    drawn = []
+    for units in (np.ones((2, 2)), np.outer([1e-6, 1e4], [1e-6, 1e4])):
+        bound = MatrixBound(at_mean=at_mean * units, slopes=SLOPES * units)
+        rng = np.random.default_rng(7)
+        drawn.append(
+            draw_truncated_normal(mean, covariance, -INFINITE, INFINITE, 50, rng, matrices=[bound])
+        )
+    np.testing.assert_allclose(drawn[0], drawn[1], rtol=1e-6, atol=1e-9)
 
 
 def test_draws_depend_on_the_generator_alone() -> None:
