@@ -44,6 +44,7 @@ from mjfim.output.picture_format import PictureFormat
 if TYPE_CHECKING:
     from mjfim.experiment.system import System
     from mjfim.records.estimate import Estimate
+    from mjfim.records.parameter_draws import ParameterDraws
 
 
 @verb
@@ -190,11 +191,21 @@ def _with_draws(
     import numpy as np
 
     from mjfim.identification.parameter_draws import draw_parameters_system
+    from mjfim.interruption import run_optional
 
     if not count:
         return result, ()
+
+    # Many bodies and robots take long, and Ctrl-C must not lose the fit.
+    found: list[ParameterDraws] = []
+    rng = np.random.default_rng(seed)
     try:
-        draws = draw_parameters_system(system, result, count, np.random.default_rng(seed))
+        run_optional(lambda: found.append(draw_parameters_system(system, result, count, rng)))
     except ExperimentError as error:
         return result, (f"--samples: no robots were drawn: {error}",)
-    return replace(result, draws=replace(draws, seed=seed)), ()
+    if not found:
+        return result, (
+            "--samples: no robots were drawn, because the run was interrupted; in Python, "
+            "mjfim.draw_parameters draws them from this estimate",
+        )
+    return replace(result, draws=replace(found[0], seed=seed)), ()

@@ -72,8 +72,8 @@ def payload(
         typer.Option(
             "--size",
             metavar="METRES",
-            help="Edge of a cube with the payload's volume [m], for its rotational inertia where "
-            "the logs do not determine it. Default: a cube of water.",
+            help="Edge of a cube with the payload's volume in metres, for its rotational inertia "
+            "where the logs do not determine it. Default: a cube of water.",
             show_default=False,
         ),
     ] = None,

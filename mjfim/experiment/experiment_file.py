@@ -9,7 +9,9 @@ from typing import Any
 from mjfim.errors import ExperimentError
 
 MAX_FILE_SIZE = 64 * 2**20  # Largest size of an experiment file [characters].
-MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")  # Endings of model files, which are no experiments.
+# Endings of files of other kinds, which are no experiments.
+MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")
+LOG_ENDINGS = (".csv", ".gz", ".parquet", ".npz", ".json", ".mcap", ".db3")
 
 
 def read_tables(path: Path) -> dict[str, Any]:
@@ -32,6 +34,10 @@ def read_tables(path: Path) -> dict[str, Any]:
             raise ExperimentError(
                 f"{path}: a model, but an experiment file (TOML) is needed, which states the "
                 f"model; `mjfim init {path}` writes a first one"
+            ) from None
+        if path.suffix.lower() in LOG_ENDINGS:
+            raise ExperimentError(
+                f"{path}: a log, but an experiment file (TOML) is needed; it comes before the logs"
             ) from None
         raise ExperimentError(f"{path}: not valid TOML: {error}") from None
     except RecursionError:

@@ -87,7 +87,7 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
         return unknown("key", keys[-1], valid_keys(parent, hidden))
 
     if fault["type"] == "missing":
-        return "this key is required"
+        return "this key is required" + _meaning_of(table, fault["loc"])
 
     # If the value has the right type for no branch, all branches are suggested; otherwise only
     # faults of the chosen kind are shown.
@@ -137,6 +137,17 @@ def _example_of(table: type[BaseModel], location: Sequence[str | int]) -> str:
 
     entries = [f"{name} = {value}" for name, value in field.examples[0].items()]
     return f" by name, for example {{ {', '.join(entries)} }}"
+
+
+def _meaning_of(table: type[BaseModel], location: Sequence[str | int]) -> str:
+    """First sentence about a key, which ends a message; empty where its table has none."""
+    _, parent = _walk(table, location[:-1])
+    field = getattr(parent, "model_fields", {}).get(str(location[-1]))
+    if field is None or not field.description:
+        return ""
+
+    sentence = field.description.split(". ")[0].removesuffix(".")
+    return f": {sentence[0].lower()}{sentence[1:]}"
 
 
 def _walk(table: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], Any]:

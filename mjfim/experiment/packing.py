@@ -82,6 +82,11 @@ def model_of(experiment: Experiment) -> ModelSource:
     """
     path = experiment.directory / experiment.model
     if experiment.files is None or experiment.files.content(path) is None:
+        if not path.is_file():
+            raise ModelError(
+                f"{experiment.source}: model: {path}: no such model file; state the path of an "
+                "MJCF or URDF, which begins in the folder of the experiment file"
+            )
         return ModelSource(path)
     return packed_model(experiment.files, path)
 

@@ -156,11 +156,13 @@ def _single_parameter(
                 f"{_fault_beyond(bounds)}, which is not physical; state another value, or "
                 "`bounds` that contain it"
             )
-    if not bounds[0] <= guess <= bounds[1]:
-        raise ExperimentError(
-            f"parameters.{name}.guess: the value {guess:g} in the model is outside bounds "
-            f"{list(bounds)}"
-        )
+    for key, value, origin in (("guess", guess, spec.guess), ("true", spec.true, spec.true)):
+        if value is not None and not bounds[0] <= value <= bounds[1]:
+            place = " in the model" if origin is None else ""
+            raise ExperimentError(
+                f"parameters.{name}.{key}: the value {value:g}{place} is outside bounds "
+                f"{list(bounds)}"
+            )
 
     magnitude = max(abs(guess), magnitude)
     return Parameter(

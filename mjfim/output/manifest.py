@@ -235,7 +235,7 @@ def claimed(folder: Path, guard: OutputGuard, *, exclusive: bool) -> Iterator[No
         exclusive: Whether other runs are kept out; False for single files, which mix with nothing.
 
     Raises:
-        OutputError: Another process writes into the folder.
+        OutputError: The folder cannot be created, or another process writes into it.
     """
     if not exclusive:
         with atomic_io.guarded_by(guard):
@@ -243,7 +243,12 @@ def claimed(folder: Path, guard: OutputGuard, *, exclusive: bool) -> Iterator[No
         return
 
     new = [place for place in (folder, *folder.parents) if not place.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: this folder cannot be created: {error.strerror}; choose another one with -o"
+        ) from None
     lock = FileLock(folder / FOLDER_LOCK)
     if not lock.acquire():
         raise OutputError(

@@ -16,6 +16,7 @@ from mjfim.cli.common import ProgressDisplay
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
+from mjfim.identification import parameter_draws
 from mjfim.interruption import NOTHING_SENTENCE
 from mjfim.output import archive, plots
 from mjfim.output.folders import DESIGN_ARCHIVE, TABLE_FILES
@@ -85,6 +86,23 @@ def test_two_presses_during_an_estimation_keep_its_data(
     assert names(tmp_path / "fit") == {*ESTIMATE_DATA, MANIFEST}
     assert "holds only a part of the results" in result.stderr
     assert "interrupted" in read(tmp_path / "fit" / "estimate.json")["status"]
+
+
+@pytest.mark.slow
+def test_presses_while_robots_are_drawn_keep_the_fit(
+    study: Path, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drawn_for_ever(*_: object) -> None:
+        """A user presses twice while robots are drawn, which takes long."""
+        interrupt()
+        interrupt()
+        pytest.fail("drawing goes on")
+
+    monkeypatch.setattr(parameter_draws, "draw_parameters_system", drawn_for_ever)
+    result = run("identify", study, recorded, "-o", tmp_path / "fit", "--samples", 3)
+    assert (result.exit_code, type(result.exception)) == (1, SystemExit)
+    assert names(tmp_path / "fit") == {*ESTIMATE_DATA, MANIFEST}
+    assert "no robots were drawn, because the run was interrupted" in result.stderr
 
 
 @pytest.mark.usefixtures("empty_figures")

@@ -476,7 +476,11 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [HOME, "descent.iterations", "unknown key", "max_iterations"],
     ),
     "reserved key": ('source = "x"\n' + SHORT, E, [HOME, "source", "valid:", "model"]),
-    "missing key": (edited("rate = 100.0", ""), E, [HOME, "rate", "required"]),
+    "missing key": (
+        edited("rate = 100.0", ""),
+        E,
+        [HOME, "rate: this key is required: rate of the samples and of the control", "[Hz]"],
+    ),
     # names
     "tracking joint": (
         edited("[cost]", "[cost]\ntracking = { slid = 1 }"),
@@ -556,7 +560,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "model missing": (
         edited("cart_pendulum.xml", "gone.xml"),
         M,
-        ["gone.xml", "no such model file"],
+        [HOME, ": model: ", "gone.xml: no such model file", "folder of the experiment file"],
     ),
     "model not XML": (
         edited("cart_pendulum.xml", "text.xml"),
@@ -685,6 +689,21 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         parameter('target = "body/bob:mass"\nbounds = [3, 5]'),
         E,
         [HOME, "parameters.m.guess", "the value 2 in the model", "[3.0, 5.0]"],
+    ),
+    "wrong unit and outside": (
+        parameter('target = "body/bob:mass"\nguess = "2.5 deg"\nbounds = [1, 5]'),
+        E,
+        [HOME, "parameters.m.guess: '2.5 deg' is no number in kg", "kg, g"],
+    ),
+    "right unit and outside": (
+        parameter('target = "body/bob:mass"\nguess = "2.5 g"\nbounds = [1, 5]'),
+        E,
+        [HOME, "parameters.m.guess: the value 0.0025 is outside bounds [1.0, 5.0]"],
+    ),
+    "true outside of bounds with a unit": (
+        parameter('target = "body/bob:mass"\nbounds = ["1 kg", "5 kg"]\ntrue = 0.5'),
+        E,
+        [HOME, "parameters.m.true: the value 0.5 is outside bounds [1.0, 5.0]"],
     ),
     "true outside": (
         parameter('target = "body/bob:mass"\nbounds = [1, 5]\ntrue = 0.5'),
@@ -973,6 +992,14 @@ def test_not_toml(data: bytes, fragment: str, tmp_path: Path) -> None:
         Experiment.from_file(path)
     assert str(caught.value).startswith(f"{path}: not valid TOML: ")
     assert fragment in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.npz"])
+def test_a_log_in_place_of_an_experiment_is_named_as_one(name: str, tmp_path: Path) -> None:
+    """The arguments are in the wrong order."""
+    (tmp_path / name).write_bytes(b"t,ctrl:force\n0,1\n" if name == "log.csv" else b"PK\x03\xff")
+    with pytest.raises(ExperimentError, match=rf"{name}: a log, but an experiment file \(TOML\)"):
+        Experiment.from_file(tmp_path / name)
 
 
 def test_a_file_that_is_nested_too_deeply(tmp_path: Path) -> None:

@@ -142,6 +142,18 @@ def test_the_manifest_has_one_entry_per_file(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {MANIFEST, "a.txt", "b.txt"}
 
 
+def test_a_folder_that_cannot_be_created_is_named(tmp_path: Path) -> None:
+    """A file has the name of one of the folders above it."""
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    folder = tmp_path / "file" / "out"
+    with (
+        pytest.raises(OutputError, match=r"out: this folder cannot be created: .*another one"),
+        claimed(folder, OutputGuard([], force=False), exclusive=True),
+    ):
+        pytest.fail("the context is not entered")
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
+
+
 def test_a_second_run_is_kept_out_of_a_folder(tmp_path: Path) -> None:
     """The message names the folder and the process; the first run is not disturbed."""
     guard, folder = OutputGuard([], force=True), tmp_path / "out"

@@ -195,13 +195,18 @@ def test_text_is_a_fault_only_if_it_is_used(tmp_path: Path) -> None:
     assert table.column("big")[0] == 1.7e18
     with pytest.raises(RecordingError, match=r"log\.csv: column 'mode' is not numeric"):
         table.column("mode")
+    mistyped = tmp_path / "mistyped.csv"
+    mistyped.write_text("t,q\n0,1.5\n0.1,abc\n0.2,\n", encoding="utf-8")
+    table = read_columns(mistyped, ALL)
+    with pytest.raises(RecordingError, match=r"'q' is not numeric: row 2 holds 'abc'$"):
+        table.column("q")
     pyarrow.parquet.write_table(
         pyarrow.table({"t": [0.0, 1.0], "mode": ["1", "2"], "on": [True, False]}),
         tmp_path / "a.parquet",
     )
     table = read_columns(tmp_path / "a.parquet", ALL)
     assert table.column("on").tolist() == [1.0, 0.0]
-    with pytest.raises(RecordingError, match="'mode' is not numeric"):
+    with pytest.raises(RecordingError, match=r"'mode' is not numeric$"):
         table.column("mode")
 
 

@@ -210,15 +210,19 @@ def _verdict_on_fit(estimate: Estimate) -> Verdict:
         text = f"These estimates are not reliable: {_why_not_reliable(estimate)}."
         return Verdict(text=text, level=Level.BAD)
 
+    # A search that is stopped early has not tried all that may explain the recordings.
+    if estimate.interrupted:
+        text = (
+            "Interrupted: the estimates are the best ones that were found until then, and the "
+            f"residuals are {ratio:.2f} times the noise."
+        )
+        return Verdict(text=text, level=Level.DOUBTFUL)
+
     if estimate.misfit:
         text = (
             f"{_model(estimate)} does not explain the recordings: the residuals are {ratio:.2f} "
             "times the noise or are no white noise, so the true errors may exceed the intervals."
         )
-        return Verdict(text=text, level=Level.DOUBTFUL)
-
-    if estimate.interrupted:
-        text = "Interrupted: the estimates are the best ones that were found until then."
         return Verdict(text=text, level=Level.DOUBTFUL)
 
     model = _model(estimate)

@@ -17,7 +17,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError
+from mjfim.errors import RecordingError, shortened
 from mjfim.recordings.formats.json_records import read_json
 from mjfim.recordings.formats.lerobot import (
     is_lerobot_dataset,
@@ -41,6 +41,9 @@ DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.e
 
 # Explanation of pyarrow's error for a line that is longer than the blocks in which it reads.
 LONG_LINE = "it has a line of about 1 MB or more; each row of the log needs a line of its own"
+
+# Largest number of rows of a column of text in which one is looked for that is no number.
+MAX_SEARCHED_ROWS = 100_000
 
 # Number of bytes that are unpacked at once.
 CHUNK = 1 << 20
@@ -223,7 +226,7 @@ def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
             columns[name] = np.array(numbers.to_numpy(zero_copy_only=False))
             del numbers
         else:
-            faults[name] = fault
+            faults[name] = fault + _first_text(column)
 
         # Arrow keeps freed memory for later tables, unless it is asked to give it back.
         del column
@@ -236,6 +239,30 @@ def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
         unread=unread,
         truth_values=frozenset(truth_values),
     )
+
+
+def _first_text(column: Any) -> str:
+    """Name the first text of an arrow column that is no number, to end the sentence of its fault.
+
+    It is empty for a column of another type, and where the first rows hold no such text.
+    """
+    types = pyarrow.types
+    if not (types.is_string(column.type) or types.is_large_string(column.type)):
+        return ""
+
+    for row, value in enumerate(column[:MAX_SEARCHED_ROWS].to_pylist(), start=1):
+        if value and not _is_number(value):
+            return f": row {row} holds {shortened(repr(value))}"
+    return ""
+
+
+def _is_number(text: str) -> bool:
+    """Whether a text looks like a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _fault_of_type(kind: Any) -> str | None:
