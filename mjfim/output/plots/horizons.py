@@ -19,8 +19,9 @@ MAX_PARAMETERS = 6
 # Height of the panels of errors, of a parameter, and of all else [inch].
 ERRORS_HEIGHT, ROW_HEIGHT, FIXED_HEIGHT = 2.6, 0.9, 1.3
 
-# Dashes of the curves of the lengths that were not chosen.
-LINE_STYLES = (":", "--", "-.", (0, (1, 3)), (0, (5, 5)))
+# Dashes and markers of the curves of the lengths that were not chosen.
+LINE_STYLES = (":", "--", "-.", (0, (8, 2)), (0, (1, 4)))
+MARKERS = ("s", "^", "D", "v", "P")
 
 # Characters of a label above which its unit has a line of its own.
 MAX_LABEL = 9
@@ -109,8 +110,8 @@ def _line(study: HorizonStudy, index: int) -> dict[str, Any]:
         "color": style.MUTED_COLOUR,
         "linewidth": 1.1,
         "linestyle": LINE_STYLES[index % len(LINE_STYLES)],
-        "marker": "o",
-        "markersize": 3.0,
+        "marker": MARKERS[index % len(MARKERS)],
+        "markersize": 4.5,
     }
 
 
