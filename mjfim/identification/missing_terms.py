@@ -12,6 +12,7 @@ are screened by simulations with some of their values (`mjfim/identification/scr
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -183,16 +184,16 @@ def _by_score(
     # Of the variants of one term, the most significant one stands for it.
     found: dict[str, MissingTerm] = {}
     untested: list[str] = []
-    for group in groups:
-        for candidates, linearisation in _linearised(problem, recordings, at, group):
-            if linearisation is None:
-                untested += [candidate.description for candidate in candidates]
-                continue
-            for index, candidate in enumerate(candidates):
-                term = _score_test(candidate, index, linearisation, squares, count)
-                key = candidate.variant_of or candidate.path
-                if term is not None and (key not in found or term.sigmas > found[key].sigmas):
-                    found[key] = term
+    parts = (_linearised(problem, recordings, at, group) for group in groups)
+    for candidates, linearisation in itertools.chain.from_iterable(parts):
+        if linearisation is None:
+            untested += [candidate.description for candidate in candidates]
+            continue
+        for index, candidate in enumerate(candidates):
+            term = _score_test(candidate, index, linearisation, squares, count)
+            key = candidate.variant_of or candidate.path
+            if term is not None and (key not in found or term.sigmas > found[key].sigmas):
+                found[key] = term
     return list(found.values()), untested
 
 
