@@ -26,6 +26,7 @@ often `misfit` is raised. At last it takes the time of whole identifications of 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import tempfile
 import time
@@ -363,6 +364,7 @@ def inverse_torques(model: mujoco.MjModel, motion: Array) -> Array:
         model: The model; its dry friction is left out.
         motion: (K, 3, n) angles, speeds and accelerations.
     """
+    model = copy.copy(model)
     model.dof_frictionloss[:] = 0.0
     data = mujoco.MjData(model)
     found = np.zeros((len(motion), model.nv))
