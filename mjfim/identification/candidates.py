@@ -32,6 +32,9 @@ LINEARISATION_SIZE = 1e-4
 # Stribeck speeds that are tried, over the root mean square of the speed of the joint.
 STRIBECK_SHARES = (0.03, 0.1, 0.3)
 
+# Friction with the Stribeck effect in words.
+STRIBECK = "Stribeck friction"
+
 # Fields of a joint that are candidates, with their names in words.
 JOINT_TERMS = {
     "frictionloss": "dry friction",
@@ -87,6 +90,9 @@ class Candidate:
         added: Table of the library that it needs; None for numbers of the model.
         variant_of: What several candidates are variants of, of which only the best one is reported;
             empty for a candidate of its own.
+        kind: The kind of term in words, which other joints may have as well; empty for a term of no
+            joint.
+        joint: Name of its joint; empty where `kind` is.
         source: Publication that describes the term; may be empty.
     """
 
@@ -95,6 +101,8 @@ class Candidate:
     further: tuple[TermParameter, ...] = ()
     added: AddedTerm | None = None
     variant_of: str = ""
+    kind: str = ""
+    joint: str = ""
     source: str = ""
 
     @property
@@ -294,7 +302,12 @@ def _joint_terms(system: System) -> Iterator[Candidate]:
                 linearised_at=value or size,
                 size=size,
             )
-            yield _single(f"{words} of {joint.name}", number)
+            yield Candidate(
+                description=f"{words} of {joint.name}",
+                tested=(number,),
+                kind=words,
+                joint=joint.name,
+            )
 
 
 def stated_joints(system: System) -> tuple[ScalarJoint, ...]:
@@ -386,6 +399,8 @@ def _asymmetric(system: System, joint: ScalarJoint, size: float) -> Iterator[Can
         description=f"friction of {joint.name} that differs by direction",
         tested=(offset,),
         added=added,
+        kind="friction that differs by direction",
+        joint=joint.name,
         source=KINDS[kind].sources[0],
     )
 
@@ -406,11 +421,13 @@ def _stribeck(system: System, joint: ScalarJoint, speed: float, size: float) -> 
             scale=stribeck_speed,
         )
         yield Candidate(
-            description=f"Stribeck friction of {joint.name}",
+            description=f"{STRIBECK} of {joint.name}",
             tested=(excess,),
             further=(further,),
             added=added,
             variant_of=added.name,
+            kind=STRIBECK,
+            joint=joint.name,
             source=KINDS[kind].sources[0],
         )
 

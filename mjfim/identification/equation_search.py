@@ -15,9 +15,11 @@ import numpy as np
 
 from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.experiment.system import System
+from mjfim.identification.averages import PER_WINDOW
 from mjfim.identification.equation_priors import EquationPriors
 from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.identification.motion_equations import MotionEquations, Rows
+from mjfim.identification.steady_bristles import StribeckParameters, stribeck_parameters
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.sizes import model_length, translations
 from mjfim.optimize.condensed_least_squares import bounded_least_squares, triangle
@@ -26,6 +28,13 @@ from mjfim.optimize.condensed_least_squares import bounded_least_squares, triang
 # because the slopes by linear coordinates are exact.
 INERTIA_STEP = 0.1
 OTHER_STEP = 1e-4
+
+# Stribeck speeds that are tried, over the root mean square of the speed of the joint.
+STRIBECK_SHARES = tuple(np.geomspace(0.03, 0.5, 8).tolist())
+
+# Stribeck speeds explain rows equally well where the sums of squares differ by no more than the
+# square of this number of standard deviations.
+EQUAL_SIGMAS = 2.0
 
 # Largest number of linearisations.
 MAX_LINEARISATIONS = 20
@@ -146,7 +155,8 @@ class EquationSearch:
         parameters: The parameters.
         coordinates: Their linear coordinates.
         impossible: Indices of parameters with which a body is not physical, by theta: (p,).
-        active: Indices of the parameters that the equations contain.
+        active: Indices of the parameters that the equations contain, without Stribeck speeds.
+        stribeck: Unknowns of the Stribeck effect, whose speeds are chosen from a few values.
         start: (p,) linear coordinates at which the search starts.
         priors: Priors on the linear coordinates.
         of_row: (R,) index of the equation of each row.
@@ -159,6 +169,7 @@ class EquationSearch:
     coordinates: LinearCoordinates
     impossible: Callable[[Array], list[int]]
     active: np.ndarray
+    stribeck: tuple[StribeckParameters, ...]
     start: Array
     priors: EquationPriors
     of_row: np.ndarray
@@ -178,6 +189,12 @@ class EquationSearch:
         coordinates = LinearCoordinates.of(parameters, theta)
         contained = parameters.changes_model | (parameters.delay_derivative != 0.0)
         contained &= ~np.isin(parameters.names, system.experiment.fit.hold)
+        stribeck = tuple(
+            each
+            for each in stribeck_parameters(system.model, parameters)
+            if contained[[each.excess, each.speed]].all()
+        )
+        contained[[each.speed for each in stribeck]] = False
         active, start = np.flatnonzero(contained), coordinates.linear(theta)
         rows = equations.rows(theta[None])[0]
         return EquationSearch(
@@ -186,6 +203,7 @@ class EquationSearch:
             coordinates=coordinates,
             impossible=system.impossible,
             active=active,
+            stribeck=stribeck,
             start=start,
             priors=EquationPriors(
                 parameters=parameters, coordinates=coordinates, active=active, start=start
@@ -200,7 +218,9 @@ class EquationSearch:
 
         Only where the equations are not linear, another start can lead to another result.
         """
-        best = self._searched(self.start, self.rows_at_start)
+        start = self._with_stribeck_speeds()
+        moved = not np.array_equal(start, self.start)
+        best = self._searched(start, self._rows(start) if moved else self.rows_at_start)
         if best.success and best.count == 1:
             return best
 
@@ -213,6 +233,58 @@ class EquationSearch:
             if found_cost < cost:
                 best, cost = found, found_cost
         return best
+
+    def _with_stribeck_speeds(self) -> Array:
+        """(p,) the start with those of some Stribeck speeds that explain the rows best.
+
+        Without an excess of the static friction, the rows do not depend on the Stribeck speed, and
+        at a wrong speed the best excess may be none. Then a search would stay there. With an
+        excess, averages over windows hardly tell a large one at a small speed from a small one at a
+        large speed. So speeds are chosen from a few values that do not lead to extreme ones.
+        Bristles of different joints hardly act on each other's rows, so that each value is tried
+        at all joints together.
+        """
+        if not self.stribeck:
+            return self.start
+
+        # The linearisation without excess is that at every Stribeck speed, but for the columns of
+        # the excess.
+        columns = np.array([each.excess for each in self.stribeck])
+        speeds = np.array([each.speed for each in self.stribeck])
+        x = np.array(self.start)
+        x[columns] = self.coordinates.lower[columns]
+        at = self._linearised(x, self._rows(x))
+        weights = 1.0 / self.forces[self.of_row]
+
+        dofs = np.array([each.dof for each in self.stribeck])
+        own = np.array([equation.dof for equation in self.equations.equations])[self.of_row]
+        usual = self._usual_speeds()[dofs]
+        points = []
+        for values in (self.start[speeds], *(share * usual for share in STRIBECK_SHARES)):
+            moved = np.array(x)
+            lower, upper = self.coordinates.lower[speeds], self.coordinates.upper[speeds]
+            moved[speeds] = np.clip(values, lower, upper)
+            found = self._linearised(moved, at.rows, columns, at.slopes)
+            moved = self._minimum(found, weights, moved)
+            squares = (weights * found.residual(moved)) ** 2
+            points.append((moved, np.array([squares[own == dof].sum() for dof in dofs])))
+
+        # Of the speeds that explain the rows of a joint equally well, the largest one needs the
+        # smallest excess.
+        counts = np.array([np.sum(own == dof) for dof in dofs]) / PER_WINDOW
+        most = np.min([squares for _, squares in points], axis=0)
+        most = most * (1.0 + EQUAL_SIGMAS**2 / np.maximum(counts, 1.0))
+        best = np.array(self.start)
+        for k, each in enumerate(self.stribeck):
+            equal = [moved for moved, squares in points if squares[k] <= most[k]]
+            chosen = max(equal, key=lambda moved: float(moved[each.speed]))
+            best[each.speed], best[each.excess] = chosen[each.speed], chosen[each.excess]
+        return best
+
+    def _usual_speeds(self) -> Array:
+        """(nv,) root mean square of the measured speeds [m/s or rad/s]."""
+        qvel = np.concatenate([each.motion.qvel for each in self.equations.recorded])
+        return np.asarray(np.sqrt(np.mean(qvel**2, axis=0)))
 
     def _other_starts(self) -> Iterator[Array]:
         """Starts with other values of the parameters that are no inertias of whole bodies."""
@@ -301,8 +373,22 @@ class EquationSearch:
         """The rows at x: (p,)."""
         return self.equations.rows(self.coordinates.theta(x)[None])[0]
 
-    def _linearised(self, x: Array, rows: Rows) -> Linearisation:
-        """Linearise about x: (p,), with the rows there."""
+    def _linearised(
+        self,
+        x: Array,
+        rows: Rows,
+        columns: np.ndarray | None = None,
+        known: Array | None = None,
+    ) -> Linearisation:
+        """Linearise about a point.
+
+        Args:
+            x: (p,) the point.
+            rows: Rows there.
+            columns: Indices of the parameters whose slopes are computed; None for all active ones.
+            known: (R, p) slopes by the other ones; None for none.
+        """
+        active = self.active if columns is None else columns
         coordinates, parameters = self.coordinates, self.parameters
         theta = coordinates.theta(x)
         steps = OTHER_STEP * parameters.magnitude
@@ -312,16 +398,18 @@ class EquationSearch:
         # Steps go to the side that has more room.
         below, above = theta - parameters.lower, parameters.upper - theta
         steps = np.where(above >= below, steps, -steps)
-        points = np.repeat(theta[None], len(self.active), axis=0)
-        points[np.arange(len(points)), self.active] += steps[self.active]
+        points = np.repeat(theta[None], len(active), axis=0)
+        points[np.arange(len(points)), active] += steps[active]
         found = self.equations.rows(points)
 
         differences = np.zeros((len(rows.residual), len(x)))
         moves = np.diag(steps)
-        for place, j in enumerate(self.active.tolist()):
+        for place, j in enumerate(active.tolist()):
             differences[:, j] = found[place].residual - rows.residual
             moves[:, j] = coordinates.linear(points[place]) - x
         slopes = coordinates.slopes(np.nan_to_num(differences), moves)
+        if known is not None:
+            slopes = np.where(np.isin(np.arange(len(x)), active), slopes, known)
         return Linearisation(x=x, rows=rows, slopes=slopes)
 
     def _agrees(self, at: Linearisation, rows: Rows, x: Array, weights: Array) -> bool:
@@ -459,7 +547,10 @@ class EquationSearch:
         least = max(float(singular[max(known, 1) - 1]), np.finfo(float).tiny)
         return EquationAccuracy(
             covariance=covariance,
-            undetermined=np.intersect1d(np.flatnonzero(is_wide), self.active),
+            undetermined=np.union1d(
+                np.intersect1d(np.flatnonzero(is_wide), self.active),
+                [each.speed for each in self.stribeck],
+            ).astype(np.intp),
             determined=known,
             condition=float(singular[0]) / least,
         )

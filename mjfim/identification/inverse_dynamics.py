@@ -169,7 +169,7 @@ def _record(
     unknown = accuracy.undetermined.tolist()
     without_prior = [j for j in unknown if parameters.parameters[j].prior is None]
     std[without_prior] = np.inf
-    absent = np.setdiff1d(np.arange(len(parameters)), search.active)
+    absent = np.setdiff1d(np.arange(len(parameters)), [*search.active, *unknown])
     std[absent] = np.nan
     return InverseDynamicsFit(
         parameters=parameters.names,

@@ -17,12 +17,8 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.model.servos import actuator_gear
-from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN
+from mjfim.identification.steady_bristles import bristles_of
 from mjfim.model.terms.extension import FILTERS
-
-# Columns of the friction of a `dcmotor` in its bias: Coulomb, static, Stribeck speed.
-FRICTION_COLUMNS = slice(3, 6)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,11 +102,6 @@ class KnownActivations:
 
     def _bent(self, actuator: int, qvel: Array) -> Array:
         """(n,) deflections of a bristle in steady sliding at velocities qvel: (n, nv)."""
-        joint = int(self.model.actuator_trnid[actuator, 0])
-        speed = actuator_gear(self.model, actuator) * qvel[:, int(self.model.jnt_dofadr[joint])]
-
-        stiffness = float(self.model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
-        coulomb, static, stribeck = self.model.actuator_biasprm[actuator, FRICTION_COLUMNS]
-        ratio = speed / max(float(stribeck), mujoco.mjMINVAL)
-        friction = coulomb + (static - coulomb) * np.exp(-(ratio**2))
-        return np.asarray(np.sign(speed) * friction / stiffness)
+        bristle = next(each for each in bristles_of(self.model) if each.actuator == actuator)
+        speed = bristle.speed(self.model, qvel)
+        return bristle.deflection(self.model, speed, np.sign(speed))

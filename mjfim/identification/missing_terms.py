@@ -72,6 +72,9 @@ SMALLEST_NORM = 1e-300
 # its differences. With more data, a part of every recording is enough for the tests.
 MAX_SIMULATED = 400_000
 
+# Fewest joints at which terms of one kind are tested together. With fewer, single terms are tried.
+FEWEST_JOINTS = 3
+
 # Samples of the motion from which the speeds of the joints are taken.
 SPEED_SAMPLES = 2000
 
@@ -95,6 +98,36 @@ class _Linearisation:
     columns: list[list[int]]
     others: np.ndarray
     inverse: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Member:
+    """A significant term, which may be one of several of its kind.
+
+    Attributes:
+        candidate: The candidate.
+        index: Its place in the linearisation.
+        term: The term.
+    """
+
+    candidate: Candidate
+    index: int
+    term: MissingTerm
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ScoreTest:
+    """Result of one score test.
+
+    Attributes:
+        values: (k,) estimated values of the numbers.
+        explained: Reduction of the sum of squared residuals.
+        sigmas: The equivalent deviation of a normal variable.
+    """
+
+    values: Array
+    explained: float
+    sigmas: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,18 +216,36 @@ def _by_score(
 
     # Of the variants of one term, the most significant one stands for it.
     found: dict[str, MissingTerm] = {}
+    of_joints: list[MissingTerm] = []
     untested: list[str] = []
     parts = (_linearised(problem, recordings, at, group) for group in groups)
     for candidates, linearisation in itertools.chain.from_iterable(parts):
         if linearisation is None:
             untested += [candidate.description for candidate in candidates]
             continue
+        own: dict[str, _Member] = {}
         for index, candidate in enumerate(candidates):
             term = _score_test(candidate, index, linearisation, squares, count)
             key = candidate.variant_of or candidate.path
             if term is not None and (key not in found or term.sigmas > found[key].sigmas):
                 found[key] = term
-    return list(found.values()), untested
+                own[key] = _Member(candidate=candidate, index=index, term=term)
+        for members in _of_one_kind(list(own.values())):
+            together = _joint_score_test(members, linearisation, squares, count)
+            of_joints += [] if together is None else [together]
+    return [*found.values(), *of_joints], untested
+
+
+def _of_one_kind(members: Sequence[_Member]) -> list[list[_Member]]:
+    """Significant terms of one kind at enough joints, the most significant one first."""
+    kinds: dict[str, list[_Member]] = {}
+    for member in members:
+        kinds.setdefault(member.candidate.kind, []).append(member)
+    return [
+        sorted(of_kind, key=lambda member: -member.term.sigmas)
+        for kind, of_kind in kinds.items()
+        if kind and len(of_kind) >= FEWEST_JOINTS
+    ]
 
 
 def _linearised(
@@ -258,20 +309,29 @@ def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
         candidates: The candidates.
 
     Returns:
-        The groups, in the order of the candidates, with at most `MAX_TESTED` numbers each.
+        The groups, in the order of the candidates, with at most `MAX_TESTED` numbers each. The
+        terms of the joints that follow each other are in one group where that is possible.
     """
     total = sum(len(candidate.tested) for candidate in candidates)
     count = max(-(-total // MAX_TESTED), 1)
     most = -(-total // count)
 
+    # Terms of the joints stay together as far as possible, so that those of one kind can be tested
+    # together.
     groups: list[list[Candidate]] = []
     size = most
-    for candidate in candidates:
-        size += len(candidate.tested)
-        if size > most:
-            groups.append([])
-            size = len(candidate.tested)
-        groups[-1].append(candidate)
+    for _, neighbours in itertools.groupby(candidates, key=lambda candidate: bool(candidate.kind)):
+        block = list(neighbours)
+        count = sum(len(candidate.tested) for candidate in block)
+        is_whole = block[0].kind != "" and count <= MAX_TESTED
+        if is_whole and size + count > most:
+            size = most
+        for place, candidate in enumerate(block):
+            size += len(candidate.tested)
+            if size > most and (place == 0 or not is_whole):
+                groups.append([])
+                size = len(candidate.tested)
+            groups[-1].append(candidate)
     return groups
 
 
@@ -379,50 +439,122 @@ def _score_test(
         squares: Sum of squared residuals.
         count: Number of candidates.
     """
-    H, g = linearisation.H, linearisation.g
-    columns = np.array(linearisation.columns[index])
-    others = linearisation.others
-
-    # Information and score after the parameters are eliminated.
-    response = linearisation.inverse @ H[np.ix_(others, columns)]
-    information = H[np.ix_(columns, columns)] - H[np.ix_(columns, others)] @ response
-    score = g[columns] - g[others] @ response
-
-    # The term is not identifiable separately from the parameters of the experiment.
-    least = MIN_REMAINING_SHARE * np.diag(H)[columns]
-    if not (np.diag(information) > least).all():
+    found = _tested(linearisation, linearisation.columns[index])
+    if found is None or not _is_significant(found, squares, count):
         return None
-
-    step = -np.linalg.pinv(information, rcond=INVERSE_TOLERANCE, hermitian=True) @ score
-    explained = float(-score @ step)
-    values = step / linearisation.norms[columns]
-    sigmas = equivalent_sigmas(explained, len(columns))
-    share = explained / squares
-
-    # A share above 1 means that the fit is too far from its minimum for a linear test.
-    is_impossible = any(
-        number.positive and number.value + value < 0.0
-        for number, value in zip(candidate.tested, values, strict=True)
-    )
-    is_significant = sigmas > -scipy.special.ndtri(0.5 * SIGNIFICANCE / count)
-    if is_impossible or not is_significant or not MIN_EXPLAINED_SHARE < share < 1.0:
+    if _impossible(candidate.tested, found.values):
         return None
 
     main, *others_tested = candidate.tested
     tested_too = tuple(
         TermParameter(path=each.path, value=float(value), unit=each.unit, scale=_scale(value, each))
-        for each, value in zip(others_tested, values[1:], strict=True)
+        for each, value in zip(others_tested, found.values[1:], strict=True)
     )
     return MissingTerm(
         description=candidate.description,
         path=main.path,
-        value=float(values[0]),
+        value=float(found.values[0]),
         unit=main.unit,
-        sigmas=sigmas,
-        share=float(share),
+        sigmas=found.sigmas,
+        share=found.explained / squares,
         further=(*tested_too, *candidate.further),
         added=candidate.added,
         source=candidate.source,
+    )
+
+
+def _joint_score_test(
+    members: Sequence[_Member], linearisation: _Linearisation, squares: float, count: int
+) -> MissingTerm | None:
+    """Score test of terms of one kind at several joints together; None where it is not significant.
+
+    Friction that the model of one joint of an arm lacks is usually missing at all of them. One by
+    one, such terms are told apart poorly, and each needs a fit.
+
+    Args:
+        members: The terms, the most significant one first, each with one number.
+        linearisation: Normal equations of parameters and candidates.
+        squares: Sum of squared residuals.
+        count: Number of candidates.
+    """
+    left = list(members)
+    while len(left) >= FEWEST_JOINTS:
+        columns = [column for each in left for column in linearisation.columns[each.index]]
+        found = _tested(linearisation, columns)
+        if found is None:
+            return None
+        impossible = [
+            _impossible(each.candidate.tested, value[None])
+            for each, value in zip(left, found.values, strict=True)
+        ]
+        if not any(impossible):
+            break
+        left = [each for each, flag in zip(left, impossible, strict=True) if not flag]
+    else:
+        return None
+    if not _is_significant(found, squares, count):
+        return None
+
+    first, *others = left
+    further = list(first.candidate.further)
+    for each, value in zip(others, found.values[1:].tolist(), strict=True):
+        number = each.candidate.tested[0]
+        further.append(
+            TermParameter(
+                path=number.path, value=value, unit=number.unit, scale=_scale(value, number)
+            )
+        )
+        further += each.candidate.further
+    return replace(
+        first.term,
+        description=f"{first.candidate.kind} at {len(left)} joints",
+        value=float(found.values[0]),
+        sigmas=found.sigmas,
+        share=found.explained / squares,
+        further=tuple(further),
+        more_added=tuple(each.term.added for each in others if each.term.added is not None),
+        joints=tuple(each.candidate.joint for each in left),
+    )
+
+
+def _tested(linearisation: _Linearisation, columns: Sequence[int]) -> _ScoreTest | None:
+    """Score test of some columns; None where the parameters may stand for one of them."""
+    H, g = linearisation.H, linearisation.g
+    others, tested = linearisation.others, np.array(columns)
+
+    # Information and score after the parameters are eliminated.
+    response = linearisation.inverse @ H[np.ix_(others, tested)]
+    information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
+    score = g[tested] - g[others] @ response
+
+    # The term is not identifiable separately from the parameters of the experiment.
+    least = MIN_REMAINING_SHARE * np.diag(H)[tested]
+    if not (np.diag(information) > least).all():
+        return None
+
+    step = -np.linalg.pinv(information, rcond=INVERSE_TOLERANCE, hermitian=True) @ score
+    explained = float(-score @ step)
+    return _ScoreTest(
+        values=step / linearisation.norms[tested],
+        explained=explained,
+        sigmas=equivalent_sigmas(explained, len(tested)),
+    )
+
+
+def _is_significant(found: _ScoreTest, squares: float, count: int) -> bool:
+    """Whether a test is significant among some candidates, and explains enough.
+
+    A share above 1 means that the fit is too far from its minimum for a linear test.
+    """
+    is_unlikely = found.sigmas > -scipy.special.ndtri(0.5 * SIGNIFICANCE / count)
+    return is_unlikely and MIN_EXPLAINED_SHARE < found.explained / squares < 1.0
+
+
+def _impossible(numbers: Sequence[CandidateParameter], values: Array) -> bool:
+    """Whether one of some numbers would have a value that makes no sense."""
+    return any(
+        number.positive and number.value + value < 0.0
+        for number, value in zip(numbers, values, strict=True)
     )
 
 
@@ -441,4 +573,11 @@ def equivalent_sigmas(explained: float, count: int) -> float:
     if count == 1:
         return float(np.sqrt(max(explained, 0.0)))
     log_probability = scipy.stats.chi2.logsf(max(explained, 0.0), count)
+
+    # Far out, the probability is below the smallest number. Then its expansion is exact enough
+    # (Abramowitz and Stegun, Handbook of Mathematical Functions, 1964, 6.5.32).
+    if not np.isfinite(log_probability):
+        half, shape = 0.5 * explained, 0.5 * count
+        log_probability = (shape - 1.0) * np.log(half) - half - scipy.special.gammaln(shape)
+        log_probability += np.log1p((shape - 1.0) / half)
     return float(-scipy.special.ndtri_exp(log_probability - np.log(2.0)))

@@ -14,6 +14,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.averages import Averages, hann_averages
 from mjfim.identification.measured_forces import MeasuredForce
 from mjfim.identification.measured_motion import POINTS_PER_INTERVAL, REACH, MeasuredMotion
+from mjfim.identification.steady_bristles import bristles_of
 from mjfim.model.coordinates import dof_names
 from mjfim.model.sizes import translations
 from mjfim.model.targets import ModelField
@@ -134,6 +135,27 @@ class EquationModel:
         if not system.space.na:
             return [np.zeros((len(motion.t), 0))]
 
+        # The joints are held in the simulation, so that bristles follow from the measured velocity.
+        bristles = bristles_of(models[0])
+        same = all(
+            np.array_equal(model.actuator_dynprm, models[0].actuator_dynprm)
+            and all(each.friction(model) == each.friction(models[0]) for each in bristles)
+            for model in models
+        )
+        chosen = models[:1] if same else models
+        found = self._simulated(models, motion)
+        acts = [np.array(found[min(k, len(found) - 1)]) for k in range(len(chosen))]
+        for act, model in zip(acts, chosen, strict=True):
+            for bristle in bristles:
+                share = motion.qvel[:, bristle.dof] / self.friction_speeds[bristle.dof]
+                speed = bristle.speed(model, motion.qvel)
+                direction = np.sign(speed) * np.minimum(np.abs(share), 1.0)
+                act[:, bristle.address] = bristle.deflection(model, speed, direction)
+        return acts
+
+    def _simulated(self, models: Sequence[Any], motion: MeasuredMotion) -> list[Array]:
+        """(n, na) activations at joints that are held, for each model or for all together."""
+        system = self.system
         same = all(
             np.array_equal(model.actuator_dynprm, models[0].actuator_dynprm) for model in models
         )
@@ -225,6 +247,7 @@ class EquationModel:
     def _has_friction(self, model: Any) -> np.ndarray:
         """(nv,) True for degrees of freedom on which dry friction may act."""
         found = np.asarray(model.dof_frictionloss > 0.0)
+        found[[bristle.dof for bristle in bristles_of(model)]] = True
         for parameter in self.system.parameters.parameters:
             for target in parameter.targets:
                 field = target.field

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from mjfim.errors import first_ones
+from mjfim.errors import first_ones, listed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +73,8 @@ class MissingTerm:
         share: Fraction of the sum of squared residuals that the term explains, 0 to 1.
         further: Further parameters that belong to the term.
         added: Table of the library of terms that it needs; None for a number of the model.
+        more_added: The tables of further joints, where it is one kind of term at several joints.
+        joints: Names of these joints, that of the main parameter first; empty for a single term.
         source: Publication that describes the term; may be empty.
     """
 
@@ -84,14 +86,22 @@ class MissingTerm:
     share: float
     further: tuple[TermParameter, ...] = ()
     added: AddedTerm | None = None
+    more_added: tuple[AddedTerm, ...] = ()
+    joints: tuple[str, ...] = ()
     source: str = ""
 
     @property
     def recipe(self) -> str:
-        """Lines of TOML to add to the experiment file, with a semicolon between them."""
+        """Lines of TOML to add to the experiment file, with a semicolon between them.
+
+        Of a term at several joints, the lines of the first joint stand for those of the others.
+        """
         tables = [] if self.added is None else [_toml_line("terms", self.added)]
-        targets = [self.path, *(parameter.path for parameter in self.further)]
-        return "; ".join([*tables, *(f'target = "{path}"' for path in targets)])
+        element = self.path.partition(":")[0]
+        own = [each.path for each in self.further if each.path.partition(":")[0] == element]
+        targets = [self.path, *(own if self.joints else (each.path for each in self.further))]
+        others = [f"the same for {listed(self.joints[1:])}"] if self.joints else []
+        return "; ".join([*tables, *(f'target = "{path}"' for path in targets), *others])
 
     def __str__(self) -> str:
         amount = f"{self.value:.2g} {self.unit}".strip()
@@ -112,7 +122,8 @@ class MissingTerm:
         if self.further:
             found["further"] = {each.path: each.value for each in self.further}
         if self.added is not None:
-            found["terms"] = {self.added.name: self.added.table}
+            tables = (self.added, *self.more_added)
+            found["terms"] = {table.name: table.table for table in tables}
         return found
 
 

@@ -37,6 +37,7 @@ class SelectedTerm:
         scale: Size of the term [unit].
         further: Its further parameters by name.
         added: Table of the library of terms that it needs; None for a number of the model.
+        more_added: The tables of further joints, where it is one kind of term at several joints.
         source: Publication that describes the term; may be empty.
     """
 
@@ -47,6 +48,7 @@ class SelectedTerm:
     scale: float
     further: dict[str, TermParameter] = field(default_factory=dict)
     added: AddedTerm | None = None
+    more_added: tuple[AddedTerm, ...] = ()
     source: str = ""
 
     @property
@@ -62,8 +64,9 @@ class SelectedTerm:
 
     @property
     def terms(self) -> dict[str, dict[str, object]]:
-        """The table of the library of terms that it needs, by name; empty without one."""
-        return {} if self.added is None else {self.added.name: self.added.table}
+        """The tables of the library of terms that it needs, by name; empty without one."""
+        tables = () if self.added is None else (self.added, *self.more_added)
+        return {table.name: table.table for table in tables}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -90,6 +90,7 @@ def selected_term(candidate: MissingTerm, taken: Iterable[str]) -> SelectedTerm:
         scale=abs(candidate.value),
         further=further,
         added=candidate.added,
+        more_added=candidate.more_added,
         source=candidate.source,
     )
 

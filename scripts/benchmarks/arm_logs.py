@@ -1,7 +1,7 @@
 """Identification of simulated arms from closed-loop logs: coverage, held-out torques and time.
 
-    python -m scripts.benchmarks arm_logs [--runs 50] [--seconds 18] [--long 2] [--seed 0]
-    [-o FILE.json]
+    python -m scripts.benchmarks arm_logs [--runs 50] [--seconds 18] [--selected 4] [--long 2]
+    [--seed 0] [-o FILE.json]
 
 The arms are the Franka Emika Panda (its model lies beside the repository; it is left out where that
 is absent) and an arm with the dimensions and masses of a UR5e. Position servos follow Fourier
@@ -10,8 +10,10 @@ milliseconds late. The true inertias differ from those of the model at random, a
 and dry friction of the joints. The fit knows the servos and the rotors. It estimates ten inertial
 parameters of every link, damping and dry friction of every joint, and the delay.
 
-In half of the runs, the robot has friction that the fitted model lacks: Stribeck friction and a
-Coulomb friction that differs by direction. The script counts how often the 95 % intervals hold
+In half of the runs, the robot has friction that the stated model lacks: Stribeck friction and a
+Coulomb friction that differs by direction. These are fitted again with a model that has such
+friction with unknown sizes at every joint, and some of them by `select_terms`, which has to find
+it. The script counts how often the 95 % intervals hold
 
 - the base parameters, which are the combinations of inertias that forces depend on,
 - the torques that the true robot needs along another trajectory,
@@ -24,13 +26,16 @@ often `misfit` is raised. At last it takes the time of whole identifications of 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from enum import Enum
 from functools import cache
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -55,9 +60,10 @@ from mjfim.identification.task import FitTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.inertia_distance import barycentric_of, logcholesky_factor
 from mjfim.parallel import cores, one_blas_thread
-from mjfim.records.estimate import Whiteness
+from mjfim.records.estimate import Estimate, Whiteness
 from mjfim.records.intervals import NORMAL_95
 from mjfim.records.recording import Recording
+from mjfim.studies.selection import select_terms_system
 from scripts.benchmarks.arm_models import TIMESTEP, Arm, panda, ur5e
 
 # Samples of the controller per measurement, and the longest delay of the measurements [samples].
@@ -101,6 +107,14 @@ BASE_TOLERANCE = 1e-8
 WANTED_COVERAGE, WANTED_RATIO, WANTED_SECONDS = 0.90, 1.1, 120.0
 
 
+class Fit(Enum):
+    """How a run is identified."""
+
+    STATED = "as stated"
+    RICHER = "with richer friction"
+    SELECTED = "--select"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Job:
     """One run of the study.
@@ -109,7 +123,8 @@ class Job:
         arm: Name of the arm.
         seed: Seed of the study.
         number: Number of the run.
-        lacks: Whether the fitted model lacks friction.
+        lacks: Whether the stated model lacks friction.
+        fit: How it is identified.
         seconds: Duration of the data [s].
         threads: Threads of the engine.
         whole: Whether to make the whole report, of which the time is taken.
@@ -119,6 +134,7 @@ class Job:
     seed: int
     number: int
     lacks: bool
+    fit: Fit
     seconds: float
     threads: int
     whole: bool
@@ -130,7 +146,8 @@ class Outcome:
 
     Attributes:
         arm: Name of the arm.
-        lacks: Whether the fitted model lacks friction.
+        lacks: Whether the stated model lacks friction.
+        fit: How it is identified.
         base: Share of the base parameters inside their intervals.
         base_formal: Share inside the formal intervals.
         base_scaled: Share inside the formal intervals, scaled by the size and the correlation of
@@ -145,10 +162,12 @@ class Outcome:
         seconds: Wall time [s].
         cpu: Time of all processors [s].
         base_count: Number of base parameters.
+        terms: Terms that a selection added, in words.
     """
 
     arm: str
     lacks: bool
+    fit: str
     base: float
     base_formal: float
     base_scaled: float
@@ -162,6 +181,7 @@ class Outcome:
     seconds: float
     cpu: float
     base_count: int
+    terms: tuple[str, ...]
 
 
 # ---- robots and logs
@@ -180,8 +200,15 @@ def arm_of(name: str) -> Arm:
     return arm
 
 
-def stated(arm: Arm, folder: Path) -> mjfim.Experiment:
-    """The experiment as the user states it."""
+def stated(arm: Arm, folder: Path, *, is_richer: bool) -> mjfim.Experiment:
+    """The experiment as the user states it.
+
+    Args:
+        arm: The arm.
+        folder: Where its model is written.
+        is_richer: Whether every joint has Stribeck friction and friction that differs by direction,
+            of unknown size.
+    """
     (folder / "arm.xml").write_text(arm.xml, encoding="utf-8")
     parameters: dict[str, Any] = {link: {"inertial": link} for link in arm.links}
     for joint, typical in zip(arm.joints, arm.friction, strict=True):
@@ -191,6 +218,13 @@ def stated(arm: Arm, folder: Path) -> mjfim.Experiment:
                 "guess": 0.3 * float(typical),
                 "scale": float(typical),
             }
+    terms: dict[str, Any] = {}
+    for joint in arm.joints if is_richer else ():
+        terms[f"stribeck {joint}"] = {"kind": "stribeck", "joint": joint}
+        terms[f"offset {joint}"] = {"kind": "asymmetric_friction", "joint": joint}
+        parameters[f"excess {joint}"] = {"target": f"term/stribeck {joint}:excess"}
+        parameters[f"speed {joint}"] = {"target": f"term/stribeck {joint}:speed"}
+        parameters[f"offset {joint}"] = {"target": f"term/offset {joint}:offset"}
     noise = {f"qpos:{joint}": ANGLE_SIGMA for joint in arm.joints}
     torques = [f"torque_{joint}" for joint in arm.joints]
     noise |= dict(zip(torques, arm.sigma.tolist(), strict=True))
@@ -200,6 +234,7 @@ def stated(arm: Arm, folder: Path) -> mjfim.Experiment:
         measure_rate=1.0 / (STRIDE * TIMESTEP),
         initial={"qpos": arm.home.tolist()},
         parameters=parameters,
+        terms=terms,
         nuisance={"delay": True},
         noise=noise,
         fit={"start": "inverse_dynamics", "segments": 1.0, "bootstrap": 200},
@@ -209,7 +244,14 @@ def stated(arm: Arm, folder: Path) -> mjfim.Experiment:
 
 
 def robot(arm: Arm, system: System, lacks: bool, rng: np.random.Generator) -> tuple[System, Array]:
-    """The true robot: its system, which may have friction that is not stated, and theta: (p,)."""
+    """The true robot: its system, which may have friction that is not stated, and theta: (p,).
+
+    Args:
+        arm: The arm.
+        system: The system as it is stated, without richer friction.
+        lacks: Whether the robot has friction that this system lacks.
+        rng: Source of random numbers.
+    """
     theta = np.array(system.parameters.guess)
     names = list(system.parameters.names)
     for body in LinearCoordinates.of(system.parameters, theta).bodies:
@@ -320,6 +362,7 @@ def inverse_torques(model: mujoco.MjModel, motion: Array) -> Array:
         model: The model; its dry friction is left out.
         motion: (K, 3, n) angles, speeds and accelerations.
     """
+    model = copy.copy(model)
     model.dof_frictionloss[:] = 0.0
     data = mujoco.MjData(model)
     found = np.zeros((len(motion), model.nv))
@@ -374,26 +417,38 @@ def base_parameters(arm: Arm, system: System) -> Array:
     return np.asarray(combined / scale)
 
 
-def torques_along(arm: Arm, system: System, theta: Array, motion: Array) -> Array:
-    """(K, n) torques of the motors by the stated model, with dry friction, along motions."""
-    names = list(system.parameters.names)
-    friction = theta[[names.index(f"frictionloss {joint}") for joint in arm.joints]]
-    smooth = inverse_torques(system.plant.model(theta), motion)
-    return np.asarray(smooth + friction * np.sign(motion[:, 1]))
+def torques_along(system: System, theta: Array, motion: Array) -> Array:
+    """(K, n) torques of the motors by a model, with all friction, along motions.
 
+    Args:
+        system: The system.
+        theta: (p,) its parameters.
+        motion: (K, 3, n) angles, speeds and accelerations.
+    """
+    model = system.plant.model(theta)
+    dry = np.array(model.dof_frictionloss)
+    v = motion[:, 1]
+    found = inverse_torques(model, motion) + dry * np.sign(v)
 
-def missing_torques(arm: Arm, system: System, motion: Array) -> Array:
-    """(K, n) torques by the friction of the robot that the stated model lacks, along motions."""
-    terms = system.source.terms
-    found = np.zeros_like(motion[:, 1])
-    for j, joint in enumerate(arm.joints):
-        if f"stribeck {joint}" not in terms:
-            continue
-        v = motion[:, 1, j]
-        excess = terms[f"stribeck {joint}"].value("excess")
-        found[:, j] = excess * np.exp(-((v / STRIBECK_SPEED) ** 2)) * np.sign(v)
-        found[:, j] -= terms[f"offset {joint}"].value("offset")
-    return found
+    # Friction of the library acts as passive devices, which are no part of the inverse dynamics.
+    targets = [parameter.targets[0].path for parameter in system.parameters.parameters]
+    values = dict(zip(targets, theta.tolist(), strict=True))
+    for name, term in system.source.terms.items():
+        table = system.experiment.terms[name]
+        dof = int(model.joint(table.joint).dofadr[0])
+
+        def value(field: str, name: str = name, term: Any = term) -> float:
+            """Value of a field: that of a parameter, or the stated one."""
+            return float(values.get(f"term/{name}:{field}", term.value(field)))
+
+        if table.kind == "stribeck":
+            falling = np.exp(-((v[:, dof] / value("speed")) ** 2))
+            found[:, dof] += value("excess") * falling * np.sign(v[:, dof])
+        elif table.kind == "asymmetric_friction":
+            found[:, dof] -= value("offset")
+        else:
+            raise ValueError(f"the torque of a term of kind {table.kind!r} is not known here")
+    return np.asarray(found)
 
 
 def motion_of(log: Log, count: int) -> Array:
@@ -413,44 +468,40 @@ class Fitted:
     """Estimate of one fit, with its uncertainty and judgement.
 
     Attributes:
+        system: The fitted system, with the terms that a selection added.
         theta: (p,) estimate.
         formal: (p, p) formal covariance.
         covering: (p, p) covariance that allows for residuals that are not white.
         rms: (n,) residual torques [N m].
-        equations: (p,) the fit to the equation of motion.
+        equations: (p,) the fit to the equation of motion; None where it is not asked for.
         misfit: Whether a misfit is raised.
         success: Whether the search converged.
         inflation: Mean square of the residuals over that of the noise, times the longest
             autocorrelation time of an output [rows].
+        terms: Terms that a selection added, in words.
     """
 
+    system: System
     theta: Array
     formal: Array
     covering: Array
     rms: Array
-    equations: Array
+    equations: Array | None
     misfit: bool
     success: bool
     inflation: float
+    terms: tuple[str, ...] = ()
 
 
 @one_blas_thread()
-def fitted(arm: Arm, system: System, recordings: list[Recording], whole: bool) -> Fitted:
+def fitted(arm: Arm, system: System, recordings: list[Recording], job: Job) -> Fitted:
     """Identify a robot, with the whole report or without the parts that search for more."""
     torques = [f"torque_{joint}" for joint in arm.joints]
-    if whole:
-        estimate = identify_system(system, recordings)
-        assert estimate.robust_uncertainty is not None and estimate.inverse_dynamics is not None
-        return Fitted(
-            theta=estimate.theta,
-            formal=estimate.covariance,
-            covering=estimate.robust_uncertainty.covariance,
-            rms=np.array([estimate.residual_rms[name] for name in torques]),
-            equations=estimate.inverse_dynamics.theta,
-            misfit=estimate.misfit,
-            success=estimate.success,
-            inflation=_inflation(estimate.chi2 / estimate.dof, estimate.whiteness),
-        )
+    if job.fit is Fit.SELECTED:
+        selected = select_terms_system(system, recordings)
+        return _of_estimate(selected.system, selected.estimate, torques)
+    if job.whole:
+        return _of_estimate(system, identify_system(system, recordings), torques)
 
     task = FitTask.of(system, recordings)
     result = fit_task(FitSearch(task=task, budget=Budget(), callback=None))
@@ -458,6 +509,7 @@ def fitted(arm: Arm, system: System, recordings: list[Recording], whole: bool) -
     assert accuracy.robust is not None and result.inverse_dynamics is not None
     reasons = misfit_reasons(quality.chi2, quality.dof, True, quality.whiteness, missing=())
     return Fitted(
+        system=system,
         theta=result.theta,
         formal=accuracy.covariance,
         covering=accuracy.robust.covariance,
@@ -466,6 +518,31 @@ def fitted(arm: Arm, system: System, recordings: list[Recording], whole: bool) -
         misfit=bool(reasons),
         success=result.solution.success,
         inflation=quality.inflation,
+    )
+
+
+def _of_estimate(system: System, estimate: Estimate, torques: Sequence[str]) -> Fitted:
+    """What a whole report says.
+
+    Args:
+        system: The system that was fitted.
+        estimate: The estimate.
+        torques: Names of the measured torques.
+    """
+    assert estimate.robust_uncertainty is not None
+    added = () if estimate.selection is None else estimate.selection.terms
+    by_equation = estimate.inverse_dynamics
+    return Fitted(
+        system=system,
+        theta=estimate.theta,
+        formal=estimate.covariance,
+        covering=estimate.robust_uncertainty.covariance,
+        rms=np.array([estimate.residual_rms[name] for name in torques]),
+        equations=None if by_equation is None else by_equation.theta,
+        misfit=estimate.misfit,
+        success=estimate.success,
+        inflation=_inflation(estimate.chi2 / estimate.dof, estimate.whiteness),
+        terms=tuple(term.description for term in added),
     )
 
 
@@ -479,7 +556,8 @@ def run(job: Job) -> Outcome:
     arm = arm_of(job.arm)
     rng = np.random.default_rng([job.seed, job.number, job.lacks])
     with tempfile.TemporaryDirectory() as folder:
-        system = System.resolve(stated(arm, Path(folder)), threads=job.threads)
+        plain = stated(arm, Path(folder), is_richer=False)
+        system = System.resolve(plain, threads=job.threads)
         true_system, theta = robot(arm, system, job.lacks, rng)
         seconds = job.seconds / RECORDINGS
         logs = [
@@ -488,61 +566,82 @@ def run(job: Job) -> Outcome:
         other = log_of(arm, true_system, theta, HELD_OUT, "held out", rng)
         recordings = [log.recording for log in logs]
 
+        begun = system
+        if job.fit is Fit.RICHER:
+            richer = stated(arm, Path(folder), is_richer=True)
+            begun = System.resolve(richer, threads=job.threads)
         clock, cpu = time.perf_counter(), time.process_time()
-        steps = system.plant.engine_steps
-        found = fitted(arm, system, recordings, job.whole)
+        steps = begun.plant.engine_steps
+        found = fitted(arm, begun, recordings, job)
         seconds, used = time.perf_counter() - clock, time.process_time() - cpu
         samples = sum(len(recording.t) for recording in recordings)
-        passes = (system.plant.engine_steps - steps) / samples
+        passes = (begun.plant.engine_steps - steps) / samples
 
-        # Base parameters do not depend on what the recordings cannot show.
+        # Base parameters do not depend on what the recordings cannot show. Those of a model with
+        # more terms are the same.
+        names, of_found = system.parameters.names, found.system.parameters.names
+        inertial = np.concatenate(
+            [body.columns for body in LinearCoordinates.of(system.parameters, theta).bodies]
+        )
+        places = [of_found.index(names[j]) for j in inertial.tolist()]
+        estimate = np.array(theta)
+        estimate[inertial] = found.theta[places]
         coordinates = LinearCoordinates.of(system.parameters, theta)
         base = base_parameters(arm, system)
-        by_theta = base @ np.linalg.inv(coordinates.derivative(coordinates.linear(found.theta)))
-        error = base @ (coordinates.linear(found.theta) - coordinates.linear(theta))
+        derivative = np.linalg.inv(coordinates.derivative(coordinates.linear(estimate)))
+        by_theta = (base @ derivative)[:, inertial]
+        error = base @ (coordinates.linear(estimate) - coordinates.linear(theta))
+        covering, formal = (
+            matrix[np.ix_(places, places)] for matrix in (found.covering, found.formal)
+        )
 
         # Torques along the motion of the held-out log.
         motion = motion_of(other, len(arm.joints))
-        predicted = torques_along(arm, system, found.theta, motion)
-        true = torques_along(arm, system, theta, motion) + missing_torques(arm, true_system, motion)
-        gradient = torque_gradient(arm, system, found.theta, motion)
+        predicted = torques_along(found.system, found.theta, motion)
+        true = torques_along(true_system, theta, motion)
+        gradient = torque_gradient(found.system, found.theta, motion)
         variance = np.einsum("knp,pq,knq->kn", gradient, found.covering, gradient)
 
         # The measured torques scatter by the residuals as well.
-        residual = held_out_residual(system, other, found.theta)
-        of_equations = held_out_residual(system, other, found.equations)
+        residual = held_out_residual(found.system, other, found.theta)
         count = len(arm.joints)
         of_truth = np.where(np.isnan(residual[:, count:]), np.nan, other.noise)
         scatter = np.sqrt(variance.mean(axis=0) + found.rms**2)
         is_measured = ~np.isnan(residual[:, count:])
         within = np.abs(residual[:, count:]) <= NORMAL_95 * scatter
+        ratio_equations = np.nan
+        if found.equations is not None and len(found.equations) == len(found.theta):
+            of_equations = held_out_residual(found.system, other, found.equations)
+            ratio_equations = _ratio(of_equations[:, count:], of_truth)
         return Outcome(
             arm=job.arm,
             lacks=job.lacks,
-            base=_inside(error, by_theta @ found.covering @ by_theta.T),
-            base_formal=_inside(error, by_theta @ found.formal @ by_theta.T),
-            base_scaled=_inside(error, found.inflation * by_theta @ found.formal @ by_theta.T),
+            fit=job.fit.value,
+            base=_inside(error, by_theta @ covering @ by_theta.T),
+            base_formal=_inside(error, by_theta @ formal @ by_theta.T),
+            base_scaled=_inside(error, found.inflation * by_theta @ formal @ by_theta.T),
             torque=float((np.abs(predicted - true) <= NORMAL_95 * np.sqrt(variance)).mean()),
             measured=float(within[is_measured].mean()),
             ratio=_ratio(residual[:, count:], of_truth),
-            ratio_equations=_ratio(of_equations[:, count:], of_truth),
+            ratio_equations=ratio_equations,
             misfit=found.misfit,
             success=found.success,
             passes=passes,
             seconds=seconds,
             cpu=used,
             base_count=len(base),
+            terms=found.terms,
         )
 
 
-def torque_gradient(arm: Arm, system: System, theta: Array, motion: Array) -> Array:
+def torque_gradient(system: System, theta: Array, motion: Array) -> Array:
     """(K, n, p) derivatives of `torques_along` by the parameters."""
-    at_theta = torques_along(arm, system, theta, motion)
+    at_theta = torques_along(system, theta, motion)
     found = np.zeros((*at_theta.shape, len(theta)))
     for j, size in enumerate(system.parameters.magnitude.tolist()):
         moved = np.array(theta)
         moved[j] += 1e-5 * size
-        found[..., j] = (torques_along(arm, system, moved, motion) - at_theta) / (1e-5 * size)
+        found[..., j] = (torques_along(system, moved, motion) - at_theta) / (1e-5 * size)
     return found
 
 
@@ -576,6 +675,7 @@ def summary(outcomes: list[Outcome]) -> str:
     head = (
         "arm",
         "friction",
+        "fitted",
         "runs",
         "base parameters inside",
         "with formal intervals",
@@ -586,21 +686,25 @@ def summary(outcomes: list[Outcome]) -> str:
         "misfit",
         "converged",
         "passes",
+        "seconds of a processor",
     )
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for name in dict.fromkeys(outcome.arm for outcome in outcomes):
-        for lacks in (False, True):
-            rows = [each for each in outcomes if (each.arm, each.lacks) == (name, lacks)]
+        for lacks, fit in product((False, True), Fit):
+            key = (name, lacks, fit.value)
+            rows = [each for each in outcomes if (each.arm, each.lacks, each.fit) == key]
             if not rows:
                 continue
             cells = (
                 f"{name} ({rows[0].base_count} base parameters)",
-                "partly not in the model" if lacks else "in the model",
+                "partly not in the stated model" if lacks else "in the model",
+                fit.value,
                 str(len(rows)),
                 *(_percent(rows, key) for key in ("base", "base_formal", "torque", "measured")),
                 *(f"{_median(rows, key):.3f}" for key in ("ratio", "ratio_equations")),
                 *(_percent(rows, key) for key in ("misfit", "success")),
                 f"{_median(rows, 'passes'):.0f}",
+                f"{_median(rows, 'cpu'):.0f}",
             )
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -645,6 +749,7 @@ def main() -> int:
     )
     parser.add_argument("--runs", type=int, default=50, help="runs in all")
     parser.add_argument("--seconds", type=float, default=18.0, help="data of a run [s]")
+    parser.add_argument("--selected", type=int, default=4, help="runs by a selection of terms")
     parser.add_argument("--long", type=int, default=1, help="timed fits of each arm")
     parser.add_argument("--processes", type=int, default=cores(), help="runs side by side")
     parser.add_argument("--seed", type=int, default=0)
@@ -663,12 +768,16 @@ def main() -> int:
             seed=args.seed,
             number=number,
             lacks=bool(number // len(arms) % 2),
+            fit=Fit.STATED,
             seconds=args.seconds,
             threads=1,
             whole=False,
         )
         for number in range(args.runs)
     ]
+    lacking = [job for job in jobs if job.lacks]
+    jobs += [replace(job, fit=Fit.RICHER) for job in lacking]
+    jobs += [replace(job, fit=Fit.SELECTED) for job in lacking[: args.selected]]
     outcomes = study(jobs, args.processes, args.output)
     if outcomes:
         console.print(summary(outcomes), soft_wrap=True)
@@ -680,6 +789,7 @@ def main() -> int:
             seed=args.seed,
             number=number,
             lacks=False,
+            fit=Fit.STATED,
             seconds=LONG,
             threads=cores(),
             whole=True,
@@ -699,10 +809,20 @@ def main() -> int:
 
 
 def _is_good(outcomes: list[Outcome], times: list[Outcome]) -> bool:
-    """Whether all wanted numbers are reached."""
+    """Whether all wanted numbers are reached.
+
+    Torques of a model that lacks friction are not those of the robot, which `misfit` says. So they
+    count where the fitted model has the friction of the robot.
+    """
+    groups = [
+        [each for each in outcomes if (each.lacks, each.fit) == (lacks, fit.value)]
+        for lacks, fit in product((False, True), Fit)
+    ]
     covered = all(
-        np.mean([each.base for each in outcomes if each.lacks == lacks]) >= WANTED_COVERAGE
-        for lacks in {each.lacks for each in outcomes}
+        np.mean([each.base for each in group]) >= WANTED_COVERAGE for group in groups if group
     )
-    near = all(each.ratio <= WANTED_RATIO for each in outcomes)
-    return covered and near and all(each.seconds <= WANTED_SECONDS for each in times)
+    whole = [each for each in outcomes if not each.lacks or each.fit != Fit.STATED.value]
+    near = all(each.ratio <= WANTED_RATIO for each in whole)
+    inside = not whole or np.mean([each.torque for each in whole]) >= WANTED_COVERAGE
+    fast = all(each.seconds <= WANTED_SECONDS for each in times)
+    return bool(covered and near and inside and fast)

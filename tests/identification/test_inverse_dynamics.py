@@ -336,3 +336,52 @@ def _without(log: Recording, joint: str) -> Recording:
         outputs=tuple(log.outputs[i] for i in kept),
         name="part",
     )
+
+
+@pytest.mark.parametrize("kind", ["stribeck", "lugre"])
+def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: Path) -> None:
+    text = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+      <body><joint name="j" axis="0 1 0" damping="0.3" frictionloss="0.5"/>
+        <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
+      <actuator><position name="s" joint="j" kp="300" kv="10"/></actuator>
+      <sensor><actuatorfrc name="torque" actuator="s"/></sensor></mujoco>"""
+    (tmp_path / "servo.xml").write_text(text, encoding="utf-8")
+    coulomb = {"stribeck": "joint/j:frictionloss", "lugre": "term/bristle:coulomb"}[kind]
+    parameters = {
+        "damping": {"target": "joint/j:damping", "guess": 0.1},
+        "coulomb": {"target": coulomb, "guess": 0.2},
+        "excess": {"target": "term/bristle:excess"},
+        "speed": {"target": "term/bristle:speed"},
+    }
+    experiment = Experiment(
+        model="servo.xml",
+        directory=tmp_path,
+        source="servo",
+        rate=500.0,
+        parameters=parameters,
+        noise={"qpos:j": 1e-5, "torque": 1e-3},
+        terms={"bristle": {"kind": kind, "joint": "j"}},
+    )
+    system = System.resolve(experiment, threads=1)
+    true = np.array([0.3, 0.5, 0.4, 0.15])
+
+    rng = np.random.default_rng(0)
+    t = np.arange(6001) / 500.0
+    ctrl = 0.6 * multisine(t[:-1], 1, 0.1, 4, rng)
+    y = system.plant.measure(true[None], ctrl)[0][0]
+    y = y + rng.standard_normal(y.shape) * system.noise.sigma
+    log = Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
+
+    # The guess has no excess, so that the rows do not depend on the Stribeck speed there.
+    assert system.parameters.guess[2] == 0.0
+    fit = inverse_dynamics(experiment, [log])
+    damping, coulomb_friction, excess, speed = fit.theta
+    assert damping == pytest.approx(0.3, rel=0.1)
+    assert coulomb_friction == pytest.approx(0.5, rel=0.1)
+    assert 0.5 < excess / 0.4 < 2.0
+    assert 0.5 < speed / 0.15 < 2.0
+
+    # The Stribeck speed is chosen from a few values, and its accuracy is not stated.
+    assert "speed" in fit.undetermined
+    assert "speed" not in fit.absent
+    assert np.isinf(fit.std[3])

@@ -189,12 +189,21 @@ def test_a_complete_model_with_terms_lacks_none(tmp_path: Path) -> None:
 
 def test_a_term_with_several_numbers_has_one_test() -> None:
     """The probability of the chi-squared value is that of the normal variable."""
-    for explained, count in ((3.0, 1), (9.0, 2), (30.0, 3), (4000.0, 3)):
+    for explained, count in ((3.0, 1), (9.0, 2), (30.0, 3), (1400.0, 3)):
         sigmas = equivalent_sigmas(explained, count)
         expected = scipy.stats.chi2.logsf(explained, count)
         assert scipy.special.log_ndtr(-sigmas) + np.log(2.0) == pytest.approx(expected, rel=1e-9)
     assert equivalent_sigmas(25.0, 1) == 5.0
     assert equivalent_sigmas(25.0, 3) < 5.0
+
+
+def test_the_significance_of_several_numbers_is_finite_far_out() -> None:
+    """The probability of these values is smaller than the smallest number."""
+    values = [equivalent_sigmas(explained, 6) for explained in (1450.0, 1480.0, 1520.0, 1e6)]
+    assert np.isfinite(values).all()
+    assert (np.diff(values) > 0.0).all()
+    assert np.diff(values[:3]) == pytest.approx(np.diff(np.sqrt([1450, 1480, 1520])), rel=0.02)
+    assert values[-1] == pytest.approx(1000.0, rel=1e-4)
 
 
 @pytest.mark.slow

@@ -1,0 +1,171 @@
+"""Terms of one kind that several joints lack are tested and added together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.experiment.system import System
+from mjfim.identification.candidates import Candidate, CandidateParameter
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.missing_terms import MAX_TESTED, find_missing_terms, in_groups
+from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
+from mjfim.records.missing_term import MissingTerm
+from mjfim.records.recording import Recording
+from mjfim.signals import multisine
+from mjfim.studies.selected_models import selected_term
+from tests.support.numerics import Array
+
+JOINTS = ("pan", "lift", "roll")
+EXCESS = (0.5, 0.4, 0.1)
+SPEED = 0.15
+RATE = 200.0
+
+ARM = """<mujoco><option timestep="0.005" integrator="implicitfast" gravity="0 0 -9.81"/>
+<worldbody>
+  <body><joint name="pan" axis="0 0 1" armature="0.05" frictionloss="0.6"/>
+    <inertial pos="0 0 0.1" mass="3" diaginertia="0.02 0.02 0.02"/>
+    <body pos="0 0 0.2"><joint name="lift" axis="0 1 0" armature="0.05" frictionloss="0.5"/>
+      <inertial pos="0 0 0.15" mass="2" diaginertia="0.02 0.02 0.01"/>
+      <body pos="0 0 0.3"><joint name="roll" axis="1 0 0" armature="0.01" frictionloss="0.15"/>
+        <inertial pos="0 0.02 0.1" mass="0.6" diaginertia="0.004 0.004 0.002"/>
+      </body></body></body>
+</worldbody><actuator>
+  <position name="pan" joint="pan" kp="300" kv="12"/>
+  <position name="lift" joint="lift" kp="300" kv="12"/>
+  <position name="roll" joint="roll" kp="60" kv="2"/>
+</actuator><sensor>
+  <actuatorfrc name="t_pan" actuator="pan"/>
+  <actuatorfrc name="t_lift" actuator="lift"/>
+  <actuatorfrc name="t_roll" actuator="roll"/>
+</sensor></mujoco>"""
+
+
+def stated(folder: Path) -> mjfim.Experiment:
+    """The arm with unknown friction."""
+    (folder / "arm.xml").write_text(ARM, encoding="utf-8")
+    parameters: dict[str, Any] = {}
+    for joint in JOINTS:
+        parameters[f"friction {joint}"] = {"target": f"joint/{joint}:frictionloss"}
+        parameters[f"damping {joint}"] = {"target": f"joint/{joint}:damping", "scale": 0.5}
+    noise = {f"qpos:{joint}": 1e-4 for joint in JOINTS} | {f"t_{joint}": 0.03 for joint in JOINTS}
+    return mjfim.Experiment(
+        model="arm.xml",
+        directory=folder,
+        source="arm.toml",
+        rate=RATE,
+        parameters=parameters,
+        noise=noise,
+        fit={"bootstrap": 0},
+    )
+
+
+def with_stribeck(experiment: mjfim.Experiment, joints: tuple[str, ...]) -> mjfim.Experiment:
+    """The arm with Stribeck friction at some joints."""
+    terms = {
+        f"s_{joint}": {
+            "kind": "stribeck",
+            "joint": joint,
+            "values": {"excess": EXCESS[JOINTS.index(joint)], "speed": SPEED},
+        }
+        for joint in joints
+    }
+    return experiment.replace(terms=terms)
+
+
+def log_of(experiment: mjfim.Experiment, seed: int, seconds: float = 3.0) -> Recording:
+    """A recording with noise under a slow multisine."""
+    system = System.resolve(experiment, threads=1)
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(RATE * seconds)) / RATE
+    control: Array = 0.4 * multisine(t, 3, 0.3, 4, rng)
+    theta = np.array(system.parameters.guess)
+    y = system.plant.measure(theta[None], control)[0][0]
+    y = y + rng.standard_normal(y.shape) * system.noise.sigma
+    times = np.arange(len(y)) / RATE
+    return Recording(t=times, ctrl=control, y=y, outputs=system.outputs.names, name=f"log {seed}")
+
+
+def terms_of(experiment: mjfim.Experiment, log: Recording) -> tuple[MissingTerm, ...]:
+    """Terms that the stated model lacks."""
+    system = System.resolve(experiment, threads=1)
+    problem = FitProblem.of(system, [log])
+    begin = problem.begin(np.array(system.parameters.guess))
+    at = minimise(problem, begin, SearchSettings(max_iterations=6))
+    assert at is not None
+    return find_missing_terms(problem, [log], at.unknowns).terms
+
+
+def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: Path) -> None:
+    experiment = stated(tmp_path)
+    log = log_of(with_stribeck(experiment, JOINTS), 0)
+    first = terms_of(experiment, log)[0]
+    assert first.description == "Stribeck friction at 3 joints"
+    assert set(first.joints) == set(JOINTS)
+    assert len(first.more_added) == 2
+    assert np.isfinite(first.sigmas)
+
+    # The test estimates the size at every joint.
+    values = {first.path: first.value} | {each.path: each.value for each in first.further}
+    for joint, excess in zip(JOINTS, EXCESS, strict=True):
+        assert 0.3 < values[f"term/{joint}_stribeck:excess"] / excess < 3.0
+
+    # The recipe names what to add at the first joint, and the others.
+    leader, *others = first.joints
+    assert f'target = "term/{leader}_stribeck:speed"' in first.recipe
+    assert first.recipe.endswith(f"the same for {', '.join(others)}")
+    assert f"{others[0]}_stribeck" not in first.recipe
+
+    # What the term needs can be added as one.
+    term = selected_term(first, ())
+    extended = System.resolve(experiment.replace(parameters=term.parameters, terms=term.terms))
+    assert len(term.parameters) == 6
+    assert set(term.parameters) < set(extended.parameters.names)
+    assert len(first.summary()["terms"]) == 3
+
+
+def test_friction_that_one_joint_lacks_is_a_term_of_this_joint(tmp_path: Path) -> None:
+    experiment = stated(tmp_path)
+    first = terms_of(experiment, log_of(with_stribeck(experiment, ("lift",)), 0))[0]
+    assert first.path == "term/lift_stribeck:excess"
+    assert first.joints == ()
+    assert first.more_added == ()
+
+
+@pytest.mark.slow
+def test_a_selection_adds_the_friction_of_all_joints_in_one_step(tmp_path: Path) -> None:
+    experiment = stated(tmp_path)
+    robot = with_stribeck(experiment, JOINTS)
+    logs = [log_of(robot, seed) for seed in range(3)]
+    found = mjfim.select_terms(experiment, logs, threads=1, progress=False)
+    assert found.selection is not None
+    assert found.selection.terms[0].description == "Stribeck friction at 3 joints"
+    assert not found.misfit
+
+    values = dict(zip(found.parameters, found.theta, strict=True))
+    names = {
+        str(table["target"]): name for name, table in found.selection.terms[0].parameters.items()
+    }
+    for joint, excess in zip(JOINTS, EXCESS, strict=True):
+        assert values[names[f"term/{joint}_stribeck:excess"]] == pytest.approx(excess, rel=0.2)
+
+
+def test_terms_of_joints_that_follow_each_other_are_in_one_group() -> None:
+    def candidate(kind: str) -> Candidate:
+        number = CandidateParameter(
+            path="p", unit="", positive=False, value=0.0, linearised_at=0.0, size=1.0
+        )
+        return Candidate(description=kind, tested=(number,), kind=kind, joint=kind and "j")
+
+    # By their number alone, the second group would begin within the terms of the joints.
+    plain, of_joint = candidate(""), candidate("damping")
+    candidates = [plain] * 60 + [of_joint] * 80
+    assert [len(group) for group in in_groups(candidates)] == [60, 80]
+    assert [len(group) for group in in_groups([plain] * 140)] == [70, 70]
+
+    # More of them than one linearisation tests are divided.
+    assert max(len(group) for group in in_groups([of_joint] * 250)) <= MAX_TESTED
