@@ -2,14 +2,17 @@
 
 A block that cannot run here carries the comment `<!-- not run: reason -->` on a line above it.
 Python blocks stand alone. Commands of one file run one after another in one folder that holds a
-copy of models/. A TOML block with the key `model` is an experiment beside models/; the TOML blocks
-after it extend it.
+copy of models/. Those of README.md are typed into a shell; other documents show the same verbs,
+which run in the test process, because a new process takes two seconds to import everything. A TOML
+block with the key `model` is an experiment beside models/; the TOML blocks after it extend it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -23,14 +26,21 @@ import mjfim
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment import System
+from tests.support import cli
 from tests.support.markdown import CodeBlock, code_blocks, linked_files
 from tests.support.paths import MODELS, ROOT
 
 # All documents of the repository.
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
+# The document whose commands are typed into a shell.
+TYPED = ROOT / "README.md"
+
 # Experiment that TOML blocks extend in a file that states no complete experiment before them.
 DEFAULT_EXPERIMENT = MODELS / "cart_pendulum.toml"
+
+# Signs that the shell would replace or obey in the words of a command.
+SHELL_SIGNS = re.compile(r"[|&;<>()$`*?\[{~!]")
 
 # One or two names in backquotes, the word `in`, and a file of the package in backquotes.
 NAMED_CODE = re.compile(r"`([\w.]+)`(?: and `([\w.]+)`)? in `(mjfim/[\w/]+\.py)`")
@@ -118,6 +128,26 @@ def run(command: list[str], folder: Path, code: int = 0) -> None:
     assert done.returncode == code, done.stdout + done.stderr
 
 
+def run_line(line: str, folder: Path, code: int = 0) -> None:
+    """Run a line of a shell block; assert its exit code.
+
+    `mjfim` runs in this process if the line is nothing but its words.
+
+    Args:
+        line: The line.
+        folder: Working directory.
+        code: Expected exit code.
+    """
+    program, *words = shlex.split(line, comments=True)
+    if program != "mjfim" or SHELL_SIGNS.search(" ".join(words)):
+        run(["bash", "-c", line], folder, code)
+        return
+
+    with contextlib.chdir(folder):
+        done = cli.run(*words)
+    assert done.exit_code == code, f"{done.output}{done.exception!r}"
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A folder with copies of models/ and scripts/, where results may be written."""
@@ -143,7 +173,10 @@ def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
 def test_shell_blocks_run(path: Path, checkout: Path) -> None:
     for block in runnable(path, "sh"):
         for line, code in commands(block):
-            run(["bash", "-c", line], checkout, code)
+            if path == TYPED:
+                run(["bash", "-c", line], checkout, code)
+            else:
+                run_line(line, checkout, code)
 
 
 @pytest.mark.parametrize(
@@ -231,3 +264,11 @@ def test_a_failing_block_is_noticed(tmp_path: Path) -> None:
     run(["bash", "-c", "false"], tmp_path, code=1)
     with pytest.raises(AssertionError, match="ZeroDivisionError"):
         run(["bash", "-c", "python -c '1 / 0'"], tmp_path)
+
+
+@pytest.mark.parametrize("line", ["mjfim check gone.toml", "mjfim check gone.toml > out.txt"])
+def test_a_failing_command_is_noticed(line: str, tmp_path: Path) -> None:
+    """It is so in this process and in a shell."""
+    run_line(f"{line}  # exits with 2", tmp_path, code=2)
+    with pytest.raises(AssertionError, match=r"gone\.toml|returncode"):
+        run_line(line, tmp_path)

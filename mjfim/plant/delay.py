@@ -5,7 +5,9 @@ It is interpolation between samples, written as a linear operator, with its deri
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,13 +27,38 @@ class OutputDelay:
     value is held, after the last sample the last one.
 
     Attributes:
-        weights: (M, N+1) sparse interpolation weights; M = N+1 if values are wanted at the samples
-            themselves.
-        weight_slopes: (M, N+1) sparse derivative of the weights by d [1/s].
+        nodes: (M, n) ascending indices of the samples that each value is made of; M = N+1 if values
+            are wanted at the samples themselves.
+        node_weights: (M, n) interpolation weights of these samples.
+        node_slopes: (M, n) derivative of the weights by d [1/s].
+        samples: Number of samples N+1.
     """
 
-    weights: Any
-    weight_slopes: Any
+    nodes: np.ndarray
+    node_weights: Array
+    node_slopes: Array
+    samples: int
+
+    @cached_property
+    def weights(self) -> Any:
+        """(M, N+1) sparse interpolation weights."""
+        return self._sparse(self.node_weights)
+
+    @cached_property
+    def weight_slopes(self) -> Any:
+        """(M, N+1) sparse derivative of the weights by d [1/s]."""
+        return self._sparse(self.node_slopes)
+
+    def _sparse(self, of_nodes: Array) -> Any:
+        """(M, N+1) sparse operator with these numbers at the nodes: (M, n).
+
+        All rows have the same number of nodes, so that the operator needs no sorting.
+        """
+        rows, count = of_nodes.shape
+        row_starts = np.arange(rows + 1) * count
+        return scipy.sparse.csr_array(
+            (of_nodes.ravel(), self.nodes.ravel(), row_starts), shape=(rows, self.samples)
+        )
 
     @staticmethod
     def on_grid(samples: int, delay: float, dt: float) -> OutputDelay:
@@ -74,13 +101,7 @@ class OutputDelay:
         inside = (wanted >= 0.0) & (wanted <= samples - 1.0)
         slope *= np.where(inside, -1.0 / dt, 0.0)[:, None]
 
-        rows = np.repeat(np.arange(len(wanted)), count)
-        places = (rows, nodes.ravel())
-        shape = (len(wanted), samples)
-        return OutputDelay(
-            weights=scipy.sparse.csr_array((value.ravel(), places), shape=shape),
-            weight_slopes=scipy.sparse.csr_array((slope.ravel(), places), shape=shape),
-        )
+        return OutputDelay(nodes=nodes, node_weights=value, node_slopes=slope, samples=samples)
 
     def apply(self, values: Array) -> Array:
         """Delayed values.
@@ -146,15 +167,17 @@ def _lagrange(s: Array, count: int) -> tuple[Array, Array]:
     Returns:
         (n, count) weights, and (n, count) their derivatives by s.
     """
-    value = np.ones((len(s), count))
-    slope = np.zeros((len(s), count))
+    # Values of all nodes are contiguous here, because NumPy is slow along short rows.
+    value = np.ones((count, len(s)))
+    slope = np.zeros((count, len(s)))
     for i in range(count):
         others = [j for j in range(count) if j != i]
-        scale = np.prod([i - j for j in others])
-        factors = np.concatenate([s - j for j in others], axis=1)
-        value[:, i] = factors.prod(axis=1) / scale
+        scale = math.prod(i - j for j in others)
+        factors = [s[:, 0] - j for j in others]
+        value[i] = math.prod(factors, start=value[i]) / scale
 
         # The product rule: a sum of products, each without one of the factors.
-        products = [np.delete(factors, k, axis=1).prod(axis=1) for k in range(count - 1)]
-        slope[:, i] = sum(products) / scale
-    return value, slope
+        for k in range(count - 1):
+            slope[i] += math.prod(factors[:k] + factors[k + 1 :])
+        slope[i] /= scale
+    return value.T, slope.T
