@@ -640,7 +640,21 @@ def _save(
     figure: Figure, target: Path | io.BytesIO, format_name: str, dpi: float | None = None
 ) -> None:
     """Draw a figure. Files of equal figures are equal: they do not hold the present time."""
+    resolution = dpi or STYLE_SHEET["savefig.dpi"]
+    if format_name == "png":
+        _save_png(figure, target, resolution)
+        return
+
     metadata = DATELESS.get(format_name)
-    figure.savefig(
-        target, format=format_name, dpi=dpi or STYLE_SHEET["savefig.dpi"], metadata=metadata
-    )
+    figure.savefig(target, format=format_name, dpi=resolution, metadata=metadata)
+
+
+def _save_png(figure: Figure, target: Path | io.BytesIO, dpi: float) -> None:
+    """Draw a figure once; `savefig` would draw it twice, the first time for the layout alone."""
+    canvas = FigureCanvasAgg(figure)
+    usual = figure.dpi
+    figure.dpi = dpi
+    try:
+        canvas.print_png(target)
+    finally:
+        figure.dpi = usual
