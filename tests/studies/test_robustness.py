@@ -22,6 +22,7 @@ from mjfim.errors import (
 from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import control_of_earlier_design
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
 from mjfim.model.coordinates import tangent_names
 from mjfim.optimize.lq import regulator
 from mjfim.output import archive
@@ -29,6 +30,7 @@ from mjfim.output.playback import design_columns, reference_columns, simulate_pl
 from mjfim.output.summaries.robustness import robustness_sentences
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
+from mjfim.records.recording import Recording
 from mjfim.records.robustness import RobotConditions, Robustness
 from mjfim.studies import robot_bench
 from mjfim.studies.robot_bench import RobotBench
@@ -512,6 +514,28 @@ def test_without_noise_the_true_values_are_found(
 RUNS, FEW = 30, 6
 
 
+@pytest.fixture(scope="module")
+def fits() -> dict[tuple[str, bytes, bytes], Any]:
+    """Fits by the experiment without its limits and by what was recorded."""
+    return {}
+
+
+@pytest.fixture
+def fitted_once(fits: dict[tuple[str, bytes, bytes], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit equal recordings of experiments that differ in their limits alone only once."""
+    identified = RobotBench._identified
+
+    def fitted(bench: RobotBench, recording: Recording, system: System) -> Any:
+        """The fit of a robot, made where no equal recording was fitted."""
+        stated = system.experiment.model_dump_json(exclude={"limits"})
+        key = (stated, recording.y.tobytes(), recording.ctrl.tobytes())
+        if key not in fits:
+            fits[key] = identified(bench, recording, system)
+        return fits[key]
+
+    monkeypatch.setattr(RobotBench, "_identified", fitted)
+
+
 def judged(
     cart: tuple[mjfim.Experiment, Path],
     runs: int = RUNS,
@@ -522,6 +546,7 @@ def judged(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fitted_once")
 @pytest.mark.parametrize("feedback", [False, True])
 def test_intervals_hold_the_true_values(
     cart: tuple[mjfim.Experiment, Path], feedback: bool
@@ -568,10 +593,14 @@ def test_the_check_can_fail(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fitted_once")
 def test_limits_without_margin_in_the_plan_are_violated(
-    cart: tuple[mjfim.Experiment, Path],
+    cart: tuple[mjfim.Experiment, Path], fits: dict[tuple[str, bytes, bytes], Any]
 ) -> None:
-    """The conclusions name the violation, and the margin that would have been sufficient."""
+    """The conclusions name the violation, and the margin that would have been sufficient.
+
+    Limits change neither the recordings nor the fits.
+    """
     experiment, path = cart
     plenty = bench_of(cart)
     planned = dict(zip([(i.kind, i.name) for i in plenty.limits], plenty.planned(), strict=True))
@@ -590,7 +619,9 @@ def test_limits_without_margin_in_the_plan_are_violated(
         experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": fastest / (1.0 - share)}}),
         path,
     )
+    known = len(fits)
     assert judged(roomy).all_kept == RUNS
+    assert len(fits) == known
 
 
 def test_an_experiment_that_begins_in_motion_allows_no_latency(tmp_path: Path) -> None:
