@@ -167,10 +167,12 @@ def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
 @pytest.mark.parametrize(
     "path", [path for path in DOCUMENTS if runnable(path, "sh")], ids=lambda path: path.name
 )
 def test_shell_blocks_run(path: Path, checkout: Path) -> None:
+    """Pictures are made; those of README.md alone are rendered, too."""
     for block in runnable(path, "sh"):
         for line, code in commands(block):
             if path == TYPED:

@@ -55,6 +55,7 @@ def test_a_closed_loop_is_simulated(stated: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
 def test_an_estimate_says_which_laws_were_in_the_loop(stated: Path, tmp_path: Path) -> None:
     log, folder = tmp_path / "recording.csv", tmp_path / "out"
     assert run("simulate", stated).exit_code == 0

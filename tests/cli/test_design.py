@@ -48,6 +48,7 @@ def test_design_json_is_the_file(home: Path, designed: Result) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
 def test_second_run_into_the_same_folder(
     home: Path, study: Path, archived: Path, tmp_path: Path
 ) -> None:

@@ -100,6 +100,7 @@ def test_bad_recordings(study: Path, recorded: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
 def test_stale_pictures_of_an_older_estimate_are_removed(
     study: Path, archived: Path, recorded: Path, tmp_path: Path
 ) -> None:

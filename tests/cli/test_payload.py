@@ -23,6 +23,7 @@ true = 0.3
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("empty_figures")
 def test_a_payload_is_said_and_written(tmp_path: Path) -> None:
     robot = write_experiment(tmp_path)
     loaded = tmp_path / "loaded.toml"
