@@ -30,12 +30,12 @@ class DesignTables:
 # Additions to the experiments that state none.
 DESIGN_TABLES = {
     "dfki_simple_pendulum": DesignTables(
-        horizon=4.0,
+        horizon=2.0,
         control='{ kind = "chirp", amplitude = 1.2, frequency = 0.4, frequency_end = 1.5 }',
         tables="[cost]\ncontrol = 1e-3\n\n[descent]\ntolerance = 1e-2\n",
     ),
     "dfki_double_pendulum": DesignTables(
-        horizon=5.0,
+        horizon=2.5,
         control='{ kind = "chirp", amplitude = { shoulder = 0.6, elbow = 0.4 }, '
         "frequency = 0.4, frequency_end = 2.0 }",
     ),
