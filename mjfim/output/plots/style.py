@@ -651,10 +651,11 @@ def _save(
 
 def _save_png(figure: Figure, target: Path | io.BytesIO, dpi: float) -> None:
     """Draw a figure once; `savefig` would draw it twice, the first time for the layout alone."""
-    canvas = FigureCanvasAgg(figure)
-    usual = figure.dpi
+    usual_canvas, usual_dpi = figure.canvas, figure.dpi
+    canvas: Any = FigureCanvasAgg(figure)
     figure.dpi = dpi
     try:
         canvas.print_png(target)
     finally:
-        figure.dpi = usual
+        figure.dpi = usual_dpi
+        figure.set_canvas(usual_canvas)
