@@ -15,8 +15,12 @@ from dataclasses import dataclass, replace
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality, fit_quality
-from mjfim.identification.residual_tests import misfit_reasons
-from mjfim.identification.searches import FitSearch
+from mjfim.identification.residual_tests import is_larger_than_noise, misfit_reasons
+from mjfim.identification.searches import (
+    CLEAR_ROUGH_SHARE,
+    JUDGED_ROUGH_SHARE,
+    FitSearch,
+)
 from mjfim.identification.segment_fits import SegmentFits, start_from_segments
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
@@ -31,6 +35,10 @@ RESTART_ITERATIONS = 25
 # Difference of two costs that is not relevant. A step to the minimum that is 0.14 standard
 # deviations long lowers the cost by this much.
 SAME_COST = 1e-2
+
+# Share by which the squared residuals of a fit near its minimum may still fall: twice the largest
+# decrease that its last step was predicted to bring.
+LEFT_SHARE = 2.0 * CLEAR_ROUGH_SHARE
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,9 +104,15 @@ def _better_of_two(
 ) -> WholeFit:
     """The first fit, or its repetition from fits over segments if that costs less."""
     task = search.task
-    begun = WholeFit(problem=first[0], solution=first[1], quality=fit_quality(*first))
+    begun = _assessed(*first)
     stated = task.settings.segment_length is not None or task.method == "newton"
-    if stated or search.interrupted() or not is_doubtful(task, begun):
+    if stated or search.interrupted():
+        return begun
+
+    # A fit that is near its minimum is enough where it clearly misses the data.
+    if begun.solution.rough and not _clearly_misses(task, begun):
+        begun = _assessed(*search.nearer(begun.problem, begun.solution))
+    if search.interrupted() or not is_doubtful(task, begun):
         return begun
 
     segments = start_from_segments(search, problem, null_space)
@@ -111,8 +125,10 @@ def _better_of_two(
         return kept
     spread = start_from_segments(search, problem, null_space, spread=True)
     other = _with_restart(search, problem, kept, spread)
-    if other.restart is None or other.solution is kept.solution:
+    if other.restart is None:
         return kept
+    if other.restart.cost == other.restart.cost_before:
+        return replace(other, restart=kept.restart, inverse_dynamics=kept.inverse_dynamics)
     cost_before = begun.solution.cost
     return replace(other, restart=replace(other.restart, cost_before=cost_before))
 
@@ -123,7 +139,33 @@ def _with_restart(
     """The better one of a fit and its repetition from fits over segments."""
     start = segments.start
     again = None if start is None else _repeated(search, problem, start, first)
+
+    if again is not None:
+        first = _as_near_as_needed(search, first, again)
     return _better(first, again, segments)
+
+
+def _as_near_as_needed(search: FitSearch, first: WholeFit, again: WholeFit) -> WholeFit:
+    """The first fit, so near to its minimum that another fit costs clearly less, or does not."""
+    cost = _cost(first, again.solution)
+    nearer = ((CLEAR_ROUGH_SHARE, search.nearer), (JUDGED_ROUGH_SHARE, search.converged))
+    for share, go_on in nearer:
+        # The next decrease of a search near its minimum is smaller than the last one.
+        least = (1.0 - share) * first.solution.cost
+        if first.solution.rough and least < cost < first.solution.cost:
+            first = _assessed(*go_on(first.problem, first.solution))
+    return first
+
+
+def _assessed(problem: FitProblem, solution: Solution) -> WholeFit:
+    """A fit over whole recordings, with the quality of its residuals."""
+    return WholeFit(problem=problem, solution=solution, quality=fit_quality(problem, solution))
+
+
+def _clearly_misses(task: FitTask, fit: WholeFit) -> bool:
+    """Whether residuals are larger than the stated noise, also at the minimum near the fit."""
+    left = (1.0 - LEFT_SHARE) * fit.quality.chi2
+    return task.noise_is_stated and is_larger_than_noise(left, fit.quality.dof)
 
 
 def is_doubtful(task: FitTask, fit: WholeFit) -> bool:
@@ -160,7 +202,7 @@ def _repeated(
         if begin is None:
             return None
 
-        placed = search.with_initial_states(problem, begin)
+        placed = search.with_begun_states(problem, begin)
         found = search.solve(
             problem,
             placed,

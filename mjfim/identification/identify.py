@@ -311,13 +311,24 @@ def _not_over_length(result: FitResult, choice: HorizonChoice, reason: str) -> F
     return replace(result, horizons=replace(choice.study, why_not_used=reason))
 
 
-def refit_task(search: FitSearch, near: FitResult, workers: FitWorkers | None = None) -> FitResult:
+def refit_task(
+    search: FitSearch,
+    near: FitResult,
+    workers: FitWorkers | None = None,
+    *,
+    is_rough: bool = True,
+    other_start: Array | None = None,
+) -> FitResult:
     """Search for the parameters of a task near its start, where a similar fit has ended.
 
     Args:
         search: The task, whose start is near the solution, and the budget of its search.
-        near: The similar fit, whose initial states of the segments are used.
+        near: The similar fit to the same recordings, whose initial states of the segments and
+            values of single recordings are used.
         workers: Workers that simulate parts of the data; None for this process.
+        is_rough: True for a fit whose predictions alone count (`FitSearch.solve`).
+        other_start: (p,) parameters where the search begins instead if the recordings cost less
+            there [theta-unit]; None for none.
 
     Returns:
         The fit, whose accuracy is not yet assessed.
@@ -331,14 +342,14 @@ def refit_task(search: FitSearch, near: FitResult, workers: FitWorkers | None = 
     null_space = completed(partial(_unseen_directions, task, problem.of_segments(subset)))
     problem = problem.pinned(task.start, null_space)
 
-    # With a delay among the parameters, segments begin earlier, and their initial states are
-    # others.
-    begin = problem.begin(task.start)
-    begins = [segment.begin for segment in near.problem.segments]
-    if begins == [segment.begin for segment in problem.segments]:
-        begin = replace(begin, private=near.solution.unknowns.private)
-
-    weighted, solution = search.solve(problem, begin, "near a similar fit", is_rough=True)
+    begin = _begin_near(problem, problem.begin(task.start), near)
+    if other_start is not None:
+        other = _begin_near(problem, problem.begin(other_start), near)
+        begin = min(begin, other, key=problem.cost)
+    nearby = replace(search, begins_near=True)
+    weighted, solution = nearby.solve(problem, begin, "near a similar fit", is_rough=is_rough)
+    if not is_rough:
+        weighted, solution = nearby.over_roughness(weighted, solution)
     return FitResult(
         task=task,
         problem=weighted,
@@ -349,6 +360,32 @@ def refit_task(search: FitSearch, near: FitResult, workers: FitWorkers | None = 
         subset=subset,
         restart=None,
     )
+
+
+def _begin_near(problem: FitProblem, begin: UnknownValues, near: FitResult) -> UnknownValues:
+    """The unknowns at the begin of a search, those besides theta as a similar fit has found them.
+
+    Args:
+        problem: The problem.
+        begin: Its unknowns at the parameters where the search begins.
+        near: The similar fit to the same recordings.
+    """
+    found, layout = near.solution.unknowns, near.problem.layout
+
+    # With a delay among the parameters, segments begin earlier, and their initial states are
+    # others.
+    begins = [segment.begin for segment in near.problem.segments]
+    if begins == [segment.begin for segment in problem.segments]:
+        begin = replace(begin, private=found.private)
+
+    # A parameter with a value for each recording keeps these values.
+    names, known = problem.system.parameters.names, near.problem.system.parameters.names
+    columns = {known[j]: column for column, j in enumerate(layout.per_recording.tolist())}
+    per_recording = np.array(begin.per_recording)
+    for place, j in enumerate(problem.layout.per_recording.tolist()):
+        if names[j] in columns:
+            per_recording[:, place] = found.per_recording[:, columns[names[j]]]
+    return replace(begin, per_recording=per_recording)
 
 
 def _problems(task: FitTask, workers: FitWorkers | None) -> tuple[FitProblem, FitProblem | None]:

@@ -151,7 +151,12 @@ class _Findings:
     flipped: tuple[str, ...]
 
 
-def estimate_from(result: FitResult, budget: Budget, refuted: Collection[str] = ()) -> Estimate:
+def estimate_from(
+    result: FitResult,
+    budget: Budget,
+    refuted: Collection[str] = (),
+    tests: TermTests | None = None,
+) -> Estimate:
     """Assess a fit and make the estimate.
 
     After a request to stop, missing terms and predictions are left out; the rest of the estimate is
@@ -162,6 +167,7 @@ def estimate_from(result: FitResult, budget: Budget, refuted: Collection[str] = 
         budget: Budget with the stop token.
         refuted: Paths of terms with which left-out data are predicted no better. They are not
             named as missing terms, and are no reason for a misfit.
+        tests: Tests of terms that this model may lack, where they are known; None to make them.
 
     Returns:
         The estimate, without its time and engine steps.
@@ -172,8 +178,10 @@ def estimate_from(result: FitResult, budget: Budget, refuted: Collection[str] = 
     task, quality = result.task, result.quality
 
     # Optional parts, each of which takes about as long as a search.
-    begin_stage("looking for terms that the model lacks")
-    tests = _term_tests(result, quality, budget).without(refuted)
+    if tests is None:
+        begin_stage("looking for terms that the model lacks")
+        tests = _term_tests(result, quality, budget)
+    tests = tests.without(refuted)
     predictions = _predictions(result, budget)
 
     reasons = misfit_reasons(

@@ -78,7 +78,9 @@ ROUGH_SHARE = 0.1
 IMPROVED_ROUGH_SHARE = 1e-2
 
 # Decrease of the cost, as a share of it, that a last step may bring in a fit to much data that is
-# judged before it goes on: another start may lead to a lower minimum.
+# judged before it goes on: another start may lead to a lower minimum. The first share shows whether
+# a fit clearly misses the data, the second one whether it misses them at all.
+CLEAR_ROUGH_SHARE = 2e-2
 JUDGED_ROUGH_SHARE = 1e-3
 
 # Decrease of the cost, as a share of it, that a last step may bring in a fit that is only compared
@@ -191,8 +193,7 @@ class FitSearch:
         private = np.array(begin.private)
         private[subset] = best.private
         whole = replace(best, private=private)
-        first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
-        found_of_all = self.with_initial_states(first_parts, whole, INITIAL_STATE_ITERATIONS)
+        found_of_all = self.with_begun_states(problem, whole)
         if self.interrupted():
             return whole
 
@@ -203,7 +204,7 @@ class FitSearch:
             return whole
         if is_better:
             return found_of_all
-        return self.with_initial_states(first_parts, begin, INITIAL_STATE_ITERATIONS)
+        return self.with_begun_states(problem, begin)
 
     def improved_on_part(
         self, problem: FitProblem, begin: UnknownValues, beaten: UnknownValues
@@ -278,8 +279,8 @@ class FitSearch:
             max_iterations: Largest number of iterations, if it is below that of the settings.
             is_rough: True for a fit whose predictions alone count, which hardly change any more
                 long before the search converges.
-            is_judged: True for a fit that is judged before it converges (`converged`). With much
-                data, it ends near the minimum.
+            is_judged: True for a fit that is judged before it converges (`nearer`, `converged`).
+                With much data, it ends near the minimum.
             cost_to_beat: Cost with the stated noise above which a minimum is of no use, so that
                 the search for it ends early.
 
@@ -297,7 +298,7 @@ class FitSearch:
         if self.task.noise_is_stated:
             settings = replace(settings, cost_to_beat=cost_to_beat)
             if is_judged and self._is_much(problem):
-                settings = replace(settings, rough_share=JUDGED_ROUGH_SHARE)
+                settings = replace(settings, rough_share=CLEAR_ROUGH_SHARE)
             return problem, self._minimise(problem, begin, settings, phase)
         if self.task.settings.loss != "linear":
             return self._solve_in_turn_with_noise(problem, begin, max_iterations, phase)
@@ -330,6 +331,18 @@ class FitSearch:
         cost = completed(partial(likelihood.cost_of_squares, weighted.noise, found.unknowns))
         return weighted, replace(_after(first, found), cost=cost)
 
+    def nearer(self, problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
+        """Continue a search that ended near the minimum until its residuals can be tested.
+
+        Args:
+            problem: Problem of all segments.
+            solution: Where the search ended.
+
+        Returns:
+            The problem and its solution, unchanged after a search that ended otherwise.
+        """
+        return self._continued(problem, solution, JUDGED_ROUGH_SHARE)
+
     def converged(self, problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
         """Continue a search that ended near the minimum because it was judged first.
 
@@ -340,12 +353,19 @@ class FitSearch:
         Returns:
             The problem and its solution, unchanged after a search that ended otherwise.
         """
+        return self._continued(problem, solution, 0.0)
+
+    def _continued(
+        self, problem: FitProblem, solution: Solution, rough_share: float
+    ) -> tuple[FitProblem, Solution]:
+        """Continue a search that ended near the minimum, to a `SearchSettings.rough_share`."""
         if not solution.rough:
             return problem, solution
         if self.interrupted():
             return problem, _interrupted(solution)
 
-        settings = replace(self._final_settings(problem), begins_near=True)
+        settings = self._final_settings(problem)
+        settings = replace(settings, begins_near=True, rough_share=rough_share)
         try:
             found = self._minimise(problem, solution.unknowns, settings, "all data")
         except InterruptedPassError:
@@ -492,6 +512,16 @@ class FitSearch:
         except InterruptedPassError:
             return begin
         return begin if found is None else found.unknowns
+
+    def with_begun_states(self, problem: FitProblem, begin: UnknownValues) -> UnknownValues:
+        """Unknowns with measured initial states improved by the first part of every segment.
+
+        Args:
+            problem: The problem.
+            begin: The unknowns.
+        """
+        first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
+        return self.with_initial_states(first_parts, begin, INITIAL_STATE_ITERATIONS)
 
     def _from_random_starts(self, problem: FitProblem, starts: int) -> list[Solution]:
         """Results of short searches from random parameters; those that diverge are left out."""

@@ -539,12 +539,12 @@ class _Search:
         # A search that converges slowly, but as predicted, goes on, unless what it can gain is far
         # below the true accuracy.
         most = MAX_STAGNANT_ITERATIONS
-        if self.unit > 1.0:
-            negligible *= self.unit**2
+        if not self.settings.relinearise_at_end:
+            # Long iterations are not worth a small share of the true standard deviations.
+            negligible = absolute * self.unit**2
             most = MAX_ROUGH_ITERATIONS
-        elif not self.settings.relinearise_at_end:
-            # Long iterations are not worth a small share of the standard deviations.
-            negligible = absolute
+        elif self.unit > 1.0:
+            negligible *= self.unit**2
             most = MAX_ROUGH_ITERATIONS
         else:
             negligible = min(negligible, PREDICTED_STAGNATION * predicted.predicted_decrease)

@@ -15,6 +15,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction
 from mjfim.identification.honest_covariance import with_honest_covariance
 from mjfim.identification.jackknife import student_quantile
+from mjfim.identification.missing_terms import TermTests
 from mjfim.identification.report import FitResult
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate
@@ -50,6 +51,7 @@ class FittedModel:
         terms: The terms that were added to the stated model.
         pooled: Parameters in place of several stated ones.
         held: Names of stated parameters that keep their guess.
+        tests: Tests of the terms that the model still lacks; None where they were not made.
     """
 
     result: FitResult
@@ -58,6 +60,7 @@ class FittedModel:
     terms: tuple[SelectedTerm, ...]
     pooled: tuple[PooledParameter, ...] = ()
     held: tuple[str, ...] = ()
+    tests: TermTests | None = None
 
     @property
     def is_changed(self) -> bool:

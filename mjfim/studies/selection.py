@@ -10,11 +10,12 @@ test of the result.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
@@ -28,6 +29,7 @@ from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import FitSearch
 from mjfim.identification.task import FitTask
+from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.records.estimate import Estimate
@@ -73,6 +75,9 @@ WORSE_ERROR_RATIO = 1.02
 # Difference of the costs of two fits (half of the sum of squared residuals in standard deviations)
 # below which both explain the data equally well: by one standard deviation at most.
 EQUAL_COST = 0.5
+
+# Share of the estimated size of a new term at which it has hardly any effect.
+SMALL_EFFECT = 0.01
 
 
 def select_terms(
@@ -225,7 +230,8 @@ class _Selector:
             pooled=model.pooled,
             held=model.held,
         )
-        estimate = estimate_from(result, self.budget, selection.refuted)
+        tests = self._tests_of(model, result, first)
+        estimate = estimate_from(result, self.budget, selection.refuted, tests)
         if selection.is_changed:
             settings = result.task.settings
             selection = replace(
@@ -290,6 +296,11 @@ class _Selector:
         final = replace(result.task, start=result.theta, held_out=self.held_out)
         if is_free:
             final = with_length(final, None)
+
+        # Over segments of a stated length, a search from one start is all that there is.
+        settings = final.settings
+        if settings.segment_length is not None and settings.starts == 1 and not is_free:
+            return refit_task(self._search(final), result, self.workers, is_rough=False)
         return fit_task(self._search(final), self.workers)
 
     # ---- steps
@@ -368,6 +379,7 @@ class _Selector:
         while len(model.terms) < self.max_terms:
             begin_stage(f"looking for term {len(model.terms) + 1} that the model lacks")
             tests = self._term_tests(model)
+            model = replace(model, tests=tests)
             candidates = tests.terms
             if self._is_stopped():
                 return model, "The selection was interrupted."
@@ -566,6 +578,7 @@ class _Selector:
             (*model.terms, term),
             values,
             {term.name: candidate.value, **starts},
+            main=term.name,
         )
 
     def _without(
@@ -591,6 +604,7 @@ class _Selector:
         terms: tuple[SelectedTerm, ...],
         values: dict[str, float],
         changes: dict[str, float],
+        main: str = "",
     ) -> FittedModel | None:
         """Fit the stated model with some terms, beginning at the fit of a similar model.
 
@@ -603,6 +617,7 @@ class _Selector:
             values: Values of the parameters where the search begins [theta-unit].
             changes: Values of new parameters: what numbers of the model gain, and values of fields
                 of the library of terms [theta-unit].
+            main: Name of the parameter without which a new term has no effect; empty without one.
         """
         stated = first.result.task.system
         selection = Selection(
@@ -613,20 +628,21 @@ class _Selector:
             threads=stated.threads,
             source=stated.source,
         )
-        parameters = system.parameters
-        start = np.array(parameters.guess)
         values = {**values, **pooled_values(model.pooled, values)}
-        for i, parameter in enumerate(parameters.parameters):
-            if parameter.name in model.held:
-                continue
-            change = changes.get(parameter.name, 0.0)
-            is_field = parameter.name in changes and parameter.targets[0].term is not None
-            start[i] = change if is_field else values.get(parameter.name, start[i]) + change
-        start = np.clip(start, parameters.lower, parameters.upper)
+        start = _start_of(system.parameters, model.held, values, changes)
+
+        # A new term may have its size only together with other values of the other parameters.
+        # With hardly any of it, the first step of the search moves all of them.
+        other_start = None
+        if main:
+            fewer = {**changes, main: SMALL_EFFECT * changes[main]}
+            other_start = _start_of(system.parameters, model.held, values, fewer)
 
         task = FitTask.of(system, first.result.task.recordings, start=start)
         try:
-            result = refit_task(self._search(task), model.result, self.workers)
+            result = refit_task(
+                self._search(task), model.result, self.workers, other_start=other_start
+            )
         except (InterruptedPassError, SimulationDivergedError):
             return None
         return self._assessed(replace(model, terms=terms), first, result)
@@ -647,7 +663,34 @@ class _Selector:
             cost = weighted.cost(result.solution.unknowns)
         except InterruptedPassError:
             return None
-        return None if losses is None else replace(model, result=result, losses=losses, cost=cost)
+        if losses is None:
+            return None
+        return replace(model, result=result, losses=losses, cost=cost, tests=None)
+
+    def _tests_of(
+        self, model: FittedModel, result: FitResult, first: FittedModel
+    ) -> TermTests | None:
+        """Tests of terms that the chosen model lacks, if they hold at its final fit; or None.
+
+        They do where the final fit explains the data as well as the fit at which they were made.
+
+        Args:
+            model: The chosen model.
+            result: Its final fit.
+            first: The stated model, whose noise weights the cost.
+        """
+        if model.tests is None or self._is_stopped() or result.quality.unexplained:
+            return None
+        if result.solution is model.result.solution:
+            return model.tests
+        if len(result.problem.segments) != len(model.result.problem.segments):
+            return None
+        try:
+            weighted = result.problem.with_noise(first.result.problem.noise)
+            change = weighted.cost(result.solution.unknowns) - model.cost
+        except InterruptedPassError:
+            return None
+        return model.tests if abs(change) <= EQUAL_COST else None
 
     def _term_tests(self, model: FittedModel) -> TermTests:
         """Significant terms that the model lacks, the most promising one first."""
@@ -674,6 +717,30 @@ class _Selector:
     def _is_stopped(self) -> bool:
         """True after a request to stop."""
         return self.budget.stop.requested
+
+
+def _start_of(
+    parameters: ParameterSet,
+    held: Collection[str],
+    values: dict[str, float],
+    changes: dict[str, float],
+) -> Array:
+    """(p,) start of the fit of a model, beginning at the fit of a similar one [theta-unit].
+
+    Args:
+        parameters: The parameters of the model.
+        held: Names of those that keep their guess.
+        values: Values of those of the similar model.
+        changes: What numbers of the model gain, and values of fields of the library of terms.
+    """
+    start = np.array(parameters.guess)
+    for i, parameter in enumerate(parameters.parameters):
+        if parameter.name in held:
+            continue
+        change = changes.get(parameter.name, 0.0)
+        is_field = parameter.name in changes and parameter.targets[0].term is not None
+        start[i] = change if is_field else values.get(parameter.name, start[i]) + change
+    return np.clip(start, parameters.lower, parameters.upper)
 
 
 def _reported(result: FitResult, is_free: bool) -> FitResult:

@@ -150,7 +150,7 @@ def test_a_selection_that_cannot_predict_left_out_data_says_so(
 def test_a_term_with_which_the_simulation_diverges_is_not_added(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def diverge(*args: object) -> None:
+    def diverge(*args: object, **options: object) -> None:
         """Fail as a fit does whose start cannot be simulated."""
         raise SimulationDivergedError("the simulation diverges at the start")
 

@@ -1,0 +1,80 @@
+"""Searches near a similar fit begin with all that it has found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.budget import Budget
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import fit_task, refit_task
+from mjfim.identification.missing_terms import TermTests
+from mjfim.identification.report import FitResult, estimate_from
+from mjfim.identification.searches import FitSearch
+from mjfim.identification.task import FitTask
+from mjfim.records.events import FitEvent
+from mjfim.records.recording import Recording
+from tests.support.paths import ROOT
+
+# Zeros of the angle in two recordings [rad], which are 20 standard deviations of its noise apart.
+BIASES = (0.5, -0.5)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> FitResult:
+    """A fit to two short recordings whose zeros of the angle differ."""
+    experiment = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(
+        horizon=1.0,
+        fit={"bootstrap": 0, "segments": "whole"},
+        nuisance={"bias": {"qpos:hinge": True}, "per_recording": True},
+    )
+    task = DesignTask.resolve(experiment, threads=1)
+    recordings = []
+    for seed, bias in enumerate(BIASES):
+        clean = simulate_system(task.system, task.initial, seed)
+        shift = bias * (np.arange(len(clean.outputs)) == clean.outputs.index("qpos:hinge"))
+        recordings.append(
+            Recording(t=clean.t, ctrl=clean.ctrl, y=clean.y + shift, outputs=clean.outputs)
+        )
+    return fit_task(searched(FitTask.of(task.system, recordings)))
+
+
+def searched(task: FitTask, events: list[FitEvent] | None = None) -> FitSearch:
+    """Searches of a task."""
+    return FitSearch(task=task, budget=Budget(), callback=None if events is None else events.append)
+
+
+def test_values_of_single_recordings_are_kept(fitted: FitResult) -> None:
+    events: list[FitEvent] = []
+    again = refit_task(searched(replace(fitted.task, start=fitted.theta), events), fitted)
+
+    # Without them, the second recording would begin 20 standard deviations away.
+    assert events[0].cost == pytest.approx(fitted.solution.cost, rel=1e-3)
+    found = again.solution.iterates[0].per_recording
+    np.testing.assert_array_equal(found, fitted.solution.unknowns.per_recording)
+    assert np.ptp(found) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_cheaper_one_of_two_starts_is_taken(fitted: FitResult) -> None:
+    far = fitted.theta * 1.2
+    task = replace(fitted.task, start=far)
+    for other, expected in ((None, far), (fitted.theta, fitted.theta), (1.5 * far, far)):
+        again = refit_task(searched(task), fitted, other_start=other)
+        np.testing.assert_array_equal(again.solution.iterates[0].theta[:3], expected[:3])
+
+
+def test_known_tests_of_terms_are_not_repeated(
+    fitted: FitResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: object) -> TermTests:
+        """Fail where terms are tested."""
+        raise AssertionError("terms were tested again")
+
+    monkeypatch.setattr("mjfim.identification.report.find_missing_terms", fail)
+    assert estimate_from(fitted, Budget(), tests=TermTests()).missing_terms == ()
+    with pytest.raises(AssertionError, match="again"):
+        estimate_from(fitted, Budget())
