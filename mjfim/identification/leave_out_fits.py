@@ -150,8 +150,7 @@ def predicted_part(
         budget: Ends the search for initial states early.
     """
     if not fit.has_initial_states:
-        at = fit.unknowns
-        return with_initial_states(problem, at.theta, masks, budget, near=at)
+        return with_initial_states(problem, fit.unknowns.theta, masks, budget)
 
     segments = problem.masked(masks).segments_with_values
     return problem.of_segments(segments), _of_segments(fit.unknowns, segments)
