@@ -126,11 +126,8 @@ def fit_to_others(problem: FitProblem, step: LeaveOutStep, budget: Budget) -> Ot
     if missed <= allowed and cost_at_end <= cost_at_guess:
         return OtherFit(unknowns=step.end, has_initial_states=not len(problem.layout.per_recording))
 
-    # A search near the fit to all data needs hardly any damping.
     starts = [(cost_at_end, end), (cost, begin), (cost_at_guess, guess)]
-    start = min(starts, key=lambda start: start[0])[1]
-    settings = replace(SEARCH, begins_near=start is not guess)
-    found = minimise(others, start, settings, budget)
+    found = minimise(others, min(starts, key=lambda start: start[0])[1], SEARCH, budget)
     if found is None or budget.exhausted is not None:
         return None
     return OtherFit(
@@ -150,8 +147,7 @@ def predicted_part(
         budget: Ends the search for initial states early.
     """
     if not fit.has_initial_states:
-        at = fit.unknowns
-        return with_initial_states(problem, at.theta, masks, budget, near=at)
+        return with_initial_states(problem, fit.unknowns.theta, masks, budget)
 
     segments = problem.masked(masks).segments_with_values
     return problem.of_segments(segments), _of_segments(fit.unknowns, segments)

@@ -119,27 +119,14 @@ def affordable_part(problem: FitProblem, solution: Solution) -> tuple[FitProblem
 
 
 def with_initial_states(
-    problem: FitProblem,
-    theta: Array,
-    masks: Sequence[np.ndarray],
-    budget: Budget,
-    near: UnknownValues | None = None,
+    problem: FitProblem, theta: Array, masks: Sequence[np.ndarray], budget: Budget
 ) -> tuple[FitProblem, UnknownValues]:
     """The segments with values in some masks: (M, ny) for every recording, and their unknowns.
 
-    Unknown initial states, and values of single recordings, are estimated from the other values of
-    a segment, or from the predicted ones where it has no others.
-
-    Args:
-        problem: Problem of all segments.
-        theta: (p,) parameters [theta-unit].
-        masks: (M, ny) for every recording, True for the predicted values.
-        budget: Ends the search for initial states early.
-        near: Unknowns of all segments at similar parameters, where the search begins; None to
-            begin at the measured initial states.
+    Unknown initial states are estimated from the other values of a segment, or from the predicted
+    ones where it has no others. theta: (p,).
     """
-    segments = problem.masked(masks).segments_with_values
-    problem = problem.of_segments(segments)
+    problem = problem.of_segments(problem.masked(masks).segments_with_values)
     at = problem.begin(theta)
     if problem.unknown_count <= len(problem.layout.shared):
         return problem, at
@@ -152,8 +139,6 @@ def with_initial_states(
 
     known = problem.masked(_masks_for_initial_states(problem, masks))
     begin = replace(at, private=private)
-    if near is not None:
-        begin = replace(at, private=near.private[segments], per_recording=near.per_recording)
     found = minimise(known.with_shared_held(), begin, SEARCH, budget)
     return problem, at if found is None else found.unknowns
 
