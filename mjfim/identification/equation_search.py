@@ -50,6 +50,10 @@ LARGEST_FACTOR = 10.0
 USUAL_LINEARISATIONS = 8
 MOST_EVALUATIONS = 3_000_000
 
+# Other starts end where this number of searches has led to costs that differ by this share.
+AGREEING_STARTS = 4
+AGREEING_SHARE = 0.1
+
 # Difference of the rows from those of the linearisation, relative to the residuals and to the
 # forces, below which the search has ended.
 LINEAR = 0.01
@@ -224,14 +228,17 @@ class EquationSearch:
         if best.success and best.count == 1:
             return best
 
-        cost = self._relative_cost(best)
+        # Where several starts have led to nearly the lowest cost, the model itself is poor, and
+        # further starts would hardly lead to another one.
+        costs = [self._relative_cost(best)]
         for start in self._other_starts():
-            if cost < POOR_COST * len(self.of_row):
+            agreeing = sum(cost <= (1.0 + AGREEING_SHARE) * min(costs) for cost in costs)
+            if min(costs) < POOR_COST * len(self.of_row) or agreeing >= AGREEING_STARTS:
                 break
             found = self._searched(start, self._rows(start))
-            found_cost = self._relative_cost(found)
-            if found_cost < cost:
-                best, cost = found, found_cost
+            costs.append(self._relative_cost(found))
+            if costs[-1] == min(costs):
+                best = found
         return best
 
     def _with_stribeck_speeds(self) -> Array:
