@@ -105,8 +105,7 @@ def _better_of_two(
     """The first fit, or its repetition from fits over segments if that costs less."""
     task = search.task
     begun = _assessed(*first)
-    stated = task.settings.segment_length is not None or task.method == "newton"
-    if stated or search.interrupted():
+    if not may_be_repeated(task) or search.interrupted():
         return begun
 
     # A fit that is near its minimum is enough where it clearly misses the data.
@@ -166,6 +165,15 @@ def _clearly_misses(task: FitTask, fit: WholeFit) -> bool:
     """Whether residuals are larger than the stated noise, also at the minimum near the fit."""
     left = (1.0 - LEFT_SHARE) * fit.quality.chi2
     return task.noise_is_stated and is_larger_than_noise(left, fit.quality.dof)
+
+
+def may_be_repeated(task: FitTask) -> bool:
+    """Whether a doubtful fit is repeated: by Gauss-Newton steps over whole recordings.
+
+    Args:
+        task: The task of the fit.
+    """
+    return task.settings.segment_length is None and task.method != "newton"
 
 
 def is_doubtful(task: FitTask, fit: WholeFit) -> bool:

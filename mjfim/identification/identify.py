@@ -20,7 +20,12 @@ from mjfim.errors import SimulationDivergedError, explain_renamed_arguments
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.cad_prior import CadPrior
-from mjfim.identification.continuation import WholeFit, continued_fit, is_doubtful
+from mjfim.identification.continuation import (
+    WholeFit,
+    continued_fit,
+    is_doubtful,
+    may_be_repeated,
+)
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.fit_start import begin_fit
@@ -467,7 +472,8 @@ def _first_fit(
     try:
         begin = search.best_start(problem, begin)
         if not search.interrupted() or len(searched) == count:
-            return problem, subset, search.solve(problem, begin, is_judged=True)
+            is_judged = may_be_repeated(search.task)
+            return problem, subset, search.solve(problem, begin, is_judged=is_judged)
     except InterruptedPassError:
         pass
 
