@@ -447,7 +447,13 @@ def _score_test(
 
     main, *others_tested = candidate.tested
     tested_too = tuple(
-        TermParameter(path=each.path, value=float(value), unit=each.unit, scale=_scale(value, each))
+        TermParameter(
+            path=each.path,
+            value=float(value),
+            unit=each.unit,
+            scale=_scale(value, each),
+            is_size=True,
+        )
         for each, value in zip(others_tested, found.values[1:], strict=True)
     )
     return MissingTerm(
@@ -501,7 +507,11 @@ def _joint_score_test(
         number = each.candidate.tested[0]
         further.append(
             TermParameter(
-                path=number.path, value=value, unit=number.unit, scale=_scale(value, number)
+                path=number.path,
+                value=value,
+                unit=number.unit,
+                scale=_scale(value, number),
+                is_size=True,
             )
         )
         further += each.candidate.further

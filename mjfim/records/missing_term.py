@@ -18,12 +18,14 @@ class TermParameter:
         value: Value where a search begins [unit].
         unit: Its unit; may be empty.
         scale: Size of the parameter, larger than 0 [unit].
+        is_size: Whether it is one of the sizes of the term that its test has estimated.
     """
 
     path: str
     value: float
     unit: str
     scale: float
+    is_size: bool = False
 
     @property
     def table(self) -> dict[str, object]:

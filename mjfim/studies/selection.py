@@ -297,11 +297,16 @@ class _Selector:
         if is_free:
             final = with_length(final, None)
 
-        # Over segments of a stated length, a search from one start is all that there is.
+        # Over segments of a stated length, a search from one start is all that there is, unless it
+        # begins at the equation of motion.
         settings = final.settings
-        if settings.segment_length is not None and settings.starts == 1 and not is_free:
+        begins_at_guess = settings.starts == 1 and settings.start != "inverse_dynamics"
+        if settings.segment_length is None or not begins_at_guess or is_free:
+            return fit_task(self._search(final), self.workers)
+        try:
             return refit_task(self._search(final), result, self.workers, is_rough=False)
-        return fit_task(self._search(final), self.workers)
+        except InterruptedPassError:
+            return result
 
     # ---- steps
 
@@ -322,9 +327,12 @@ class _Selector:
         model = self._pruned(model, first, steps)
         simpler = self._simplified(model, first, steps)
 
-        # Terms may have stood in for parameters that are held or pooled now.
+        # Terms may have stood in for parameters that are held or pooled now. Without them, others
+        # may be significant that were not tried before.
         if simpler is not model:
             simpler = self._pruned(simpler, first, steps, tests_last=True)
+            tried = Selection(terms=(), steps=tuple(steps), ending="").refuted
+            simpler, ending = self._grown(simpler, first, steps, tried)
         return simpler, ending
 
     def _over_length(
@@ -350,7 +358,7 @@ class _Selector:
         length = result.task.settings.segment_length
         cut = self._assessed(model, first, result)
         if cut is None or length is None:
-            return replace(model, result=result), ending
+            return replace(model, result=result, tests=None), ending
 
         steps.append(
             SelectionStep(
@@ -364,7 +372,11 @@ class _Selector:
         return self._chosen(cut, replace(first, result=stated), steps)
 
     def _grown(
-        self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
+        self,
+        model: FittedModel,
+        first: FittedModel,
+        steps: list[SelectionStep],
+        refuted: Collection[str] = (),
     ) -> tuple[FittedModel, str]:
         """Add terms while they improve the prediction of left-out data.
 
@@ -372,6 +384,7 @@ class _Selector:
             model: Where to begin.
             first: The stated model.
             steps: Receives the steps.
+            refuted: Terms that are not tried again (`Selection.refuted`).
 
         Returns:
             The extended model, and why no more terms were added.
@@ -380,7 +393,7 @@ class _Selector:
             begin_stage(f"looking for term {len(model.terms) + 1} that the model lacks")
             tests = self._term_tests(model)
             model = replace(model, tests=tests)
-            candidates = tests.terms
+            candidates = tests.without(refuted).terms
             if self._is_stopped():
                 return model, "The selection was interrupted."
             if not candidates:
@@ -578,7 +591,7 @@ class _Selector:
             (*model.terms, term),
             values,
             {term.name: candidate.value, **starts},
-            main=term.name,
+            sizes=_sizes_of(term),
         )
 
     def _without(
@@ -604,7 +617,7 @@ class _Selector:
         terms: tuple[SelectedTerm, ...],
         values: dict[str, float],
         changes: dict[str, float],
-        main: str = "",
+        sizes: Collection[str] = (),
     ) -> FittedModel | None:
         """Fit the stated model with some terms, beginning at the fit of a similar model.
 
@@ -617,7 +630,8 @@ class _Selector:
             values: Values of the parameters where the search begins [theta-unit].
             changes: Values of new parameters: what numbers of the model gain, and values of fields
                 of the library of terms [theta-unit].
-            main: Name of the parameter without which a new term has no effect; empty without one.
+            sizes: Names of the parameters that are sizes of a new term, without which it has no
+                effect; none without a new term.
         """
         stated = first.result.task.system
         selection = Selection(
@@ -634,8 +648,11 @@ class _Selector:
         # A new term may have its size only together with other values of the other parameters.
         # With hardly any of it, the first step of the search moves all of them.
         other_start = None
-        if main:
-            fewer = {**changes, main: SMALL_EFFECT * changes[main]}
+        if sizes:
+            fewer = {
+                name: SMALL_EFFECT * value if name in sizes else value
+                for name, value in changes.items()
+            }
             other_start = _start_of(system.parameters, model.held, values, fewer)
 
         task = FitTask.of(system, first.result.task.recordings, start=start)
@@ -717,6 +734,15 @@ class _Selector:
     def _is_stopped(self) -> bool:
         """True after a request to stop."""
         return self.budget.stop.requested
+
+
+def _sizes_of(term: SelectedTerm) -> set[str]:
+    """Names of the parameters of a term that its test has estimated, which are its sizes.
+
+    The others, such as a Stribeck speed, have no effect without them.
+    """
+    further = {name for name, parameter in term.further.items() if parameter.is_size}
+    return {term.name, *further}
 
 
 def _start_of(
