@@ -11,6 +11,7 @@ recordings, which is the most accurate one.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.fit_problem import FitProblem
@@ -24,7 +25,12 @@ from mjfim.identification.searches import (
 from mjfim.identification.segment_fits import SegmentFits, start_from_segments
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
-from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution, UnknownValues
+from mjfim.optimize.levenberg_marquardt import (
+    InterruptedPassError,
+    Solution,
+    UnknownValues,
+    completed,
+)
 from mjfim.records.estimate import Restart
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 
@@ -93,7 +99,36 @@ def continued_fit(
     found = search.over_roughness(*found)
     if found[1] is kept.solution:
         return kept
-    return replace(kept, problem=found[0], solution=found[1], quality=fit_quality(*found))
+    restart = kept.restart
+    if restart is not None:
+        restart = _gone_on(restart, first[0], *found)
+    quality = fit_quality(*found)
+    return replace(kept, problem=found[0], solution=found[1], quality=quality, restart=restart)
+
+
+def _gone_on(
+    restart: Restart, first: FitProblem, problem: FitProblem, solution: Solution
+) -> Restart:
+    """The costs of a restart after the search for the kept fit went on.
+
+    Args:
+        restart: The restart with the costs of the compared fits.
+        first: The problem with the noise of the first fit.
+        problem: The problem of the kept fit.
+        solution: Where its search ended.
+    """
+    cost = _cost_with_noise_of(first, problem, solution)
+
+    # Where the first fit stands, it is this one that went on.
+    stands = not restart.cost < restart.cost_before
+    return replace(restart, cost=cost, cost_before=cost if stands else restart.cost_before)
+
+
+def _cost_with_noise_of(first: FitProblem, problem: FitProblem, solution: Solution) -> float:
+    """Cost of the solution of a problem, with the noise of the first fit."""
+    if problem.noise is first.noise:
+        return solution.cost
+    return completed(partial(first.cost, solution.unknowns))
 
 
 def _better_of_two(
@@ -124,12 +159,18 @@ def _better_of_two(
         return kept
     spread = start_from_segments(search, problem, null_space, spread=True)
     other = _with_restart(search, problem, kept, spread)
-    if other.restart is None:
+    if kept.restart is None or other.restart is None:
         return kept
     if other.restart.cost == other.restart.cost_before:
-        return replace(other, restart=kept.restart, inverse_dynamics=kept.inverse_dynamics)
-    cost_before = begun.solution.cost
-    return replace(other, restart=replace(other.restart, cost_before=cost_before))
+        restart = kept.restart
+        if other.solution is not kept.solution:
+            restart = _gone_on(restart, begun.problem, other.problem, other.solution)
+        return replace(other, restart=restart, inverse_dynamics=kept.inverse_dynamics)
+
+    # The first fit counts as it was compared with the first repetition.
+    cost = _cost_with_noise_of(begun.problem, other.problem, other.solution)
+    costs = replace(other.restart, cost_before=kept.restart.cost_before, cost=cost)
+    return replace(other, restart=costs)
 
 
 def _with_restart(

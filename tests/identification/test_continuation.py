@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import StopToken
+from mjfim.budget import Budget, StopToken
 from mjfim.experiment.system import System
+from mjfim.identification import continuation
+from mjfim.identification.continuation import WholeFit, continued_fit
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.identify import identify_system
-from mjfim.identification.segment_fits import MIN_ROWS, problem_of_segments, segment_lengths
+from mjfim.identification.searches import FitSearch
+from mjfim.identification.segment_fits import (
+    MIN_ROWS,
+    SegmentFits,
+    problem_of_segments,
+    segment_lengths,
+)
 from mjfim.identification.task import FitTask
-from mjfim.records.estimate import Estimate
+from mjfim.information.null_space import NullSpace
+from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
+from mjfim.plant.noise import Noise
+from mjfim.records.estimate import Estimate, Restart
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
 
@@ -182,3 +195,96 @@ def test_segments_are_shares_of_the_recording_with_enough_rows(tmp_path: Path) -
     assert lengths[0] * RATE >= MIN_ROWS
     assert list(lengths) == sorted(set(lengths))
     assert lengths[-1] <= 6.0
+
+
+class Descent:
+    """A fit whose search was stopped at several points on its way to the minimum."""
+
+    def __init__(self, folder: Path) -> None:
+        system = pendulum(folder, 4.0)
+        task = FitTask.resolve(system.experiment, [swings(system, 4.0)], threads=1)
+        p = len(system.parameters)
+        self.problem = task.problem()
+        self.search = FitSearch(task=task, budget=Budget(), callback=None)
+        self.null_space = NullSpace(
+            directions=np.zeros((p, 0)), silent=(), basis=np.eye(p), smallest=1.0
+        )
+        begin = self.problem.begin(1.1 * system.parameters.true)
+        self.solutions = []
+        for count in (1, 2, 3):
+            found = minimise(self.problem, begin, SearchSettings(max_iterations=count))
+            assert found is not None
+            self.solutions.append(found)
+
+    def fit(self, place: int, restart: Restart | None = None, *, rough: bool = False) -> WholeFit:
+        """The fit at one of the points."""
+        solution = replace(self.solutions[place], rough=rough)
+        quality = replace(fit_quality(self.problem, solution), unexplained=("angle",))
+        return WholeFit(problem=self.problem, solution=solution, quality=quality, restart=restart)
+
+    def restart(self, before: int, after: int, starts: int = 1) -> Restart:
+        """A restart from the cost at one of the points to that at another one."""
+        costs = [self.solutions[place].cost for place in (before, after)]
+        return Restart(lengths=(1.0,), cost_before=costs[0], cost=costs[1], starts=starts)
+
+    def continued(self) -> WholeFit:
+        """What a restart makes of the first of these fits."""
+        first = self.problem, self.solutions[0]
+        return continued_fit(self.search, self.problem, first, self.null_space)
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_restart_says_the_cost_of_the_converged_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_first: bool
+) -> None:
+    descent = Descent(tmp_path)
+    restart = descent.restart(1, 1) if is_first else descent.restart(0, 1)
+    kept = descent.fit(1, restart, rough=True)
+    monkeypatch.setattr(continuation, "_better_of_two", lambda *_: kept)
+
+    found = descent.continued()
+    assert found.restart is not None
+    assert found.solution.cost < 0.9 * kept.solution.cost
+    assert found.restart.cost == found.solution.cost
+
+    # A first fit that stands has not become better by the restart.
+    before = found.solution.cost if is_first else restart.cost_before
+    assert found.restart.cost_before == before
+    assert ("found nothing better" in str(found.restart)) == is_first
+
+
+@pytest.mark.parametrize("is_better", [True, False])
+def test_the_cost_before_spread_starts_is_that_of_the_compared_first_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_better: bool
+) -> None:
+    """The first fit may go on before it is compared with a repetition."""
+    descent = Descent(tmp_path)
+    kept = descent.fit(1, descent.restart(1, 1))
+    other = descent.fit(2, descent.restart(1 if is_better else 2, 2, starts=32))
+    fits = iter([kept, other])
+    segments = SegmentFits(start=None, lengths=(1.0,))
+    monkeypatch.setattr(continuation, "is_doubtful", lambda *_: True)
+    monkeypatch.setattr(continuation, "start_from_segments", lambda *_, **__: segments)
+    monkeypatch.setattr(continuation, "_with_restart", lambda *_: next(fits))
+
+    restart = descent.continued().restart
+    assert restart is not None
+    assert restart.cost == descent.solutions[2].cost
+    assert restart.cost_before == descent.solutions[1 if is_better else 2].cost
+    assert restart.starts == (32 if is_better else 1)
+
+
+def test_the_cost_of_a_fit_with_other_noise_is_compared_with_the_noise_of_the_first_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    descent = Descent(tmp_path)
+    noise = descent.problem.noise
+    wider = descent.problem.with_noise(
+        Noise(covariance=4.0 * noise.covariance, strides=noise.strides)
+    )
+    begun = replace(descent.fit(1, descent.restart(0, 1), rough=True), problem=wider)
+    monkeypatch.setattr(continuation, "_better_of_two", lambda *_: begun)
+    found = descent.continued()
+    assert found.restart is not None
+    assert found.restart.cost == pytest.approx(descent.problem.cost(found.solution.unknowns))
+    assert found.restart.cost > 2.0 * found.solution.cost
