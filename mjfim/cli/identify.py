@@ -200,7 +200,8 @@ def _with_draws(
     found: list[ParameterDraws] = []
     rng = np.random.default_rng(seed)
     try:
-        run_optional(lambda: found.append(draw_parameters_system(system, result, count, rng)))
+        with progress("drawing robots"):
+            run_optional(lambda: found.append(draw_parameters_system(system, result, count, rng)))
     except ExperimentError as error:
         return result, (f"--samples: no robots were drawn: {error}",)
     if not found:

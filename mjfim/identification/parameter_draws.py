@@ -32,6 +32,7 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.model.targets import ModelField
 from mjfim.records.estimate import Estimate
 from mjfim.records.parameter_draws import ParameterDraws
+from mjfim.records.progress import begin_stage
 
 # Number of times that draws with an unphysical inertia are replaced before the search for physical
 # ones is given up.
@@ -233,6 +234,8 @@ def _physical_draws(
         # Most inertias are known well, so that hardly any draw is unphysical. Only where one is,
         # draws are made inside the physical region, which takes longer.
         matrices = physical if attempt else []
+        if matrices:
+            begin_stage("drawing robots inside the physical inertias")
         tried = draw_truncated_normal(
             centre, covariance, lower, upper, len(missing), rng, matrices=matrices
         )
