@@ -50,7 +50,7 @@ MIN_EXPLAINED_SHARE = 2e-3
 # Largest number of numbers that one linearisation tests; more of them are tested in groups.
 MAX_TESTED = 100
 
-# Largest number of terms that are reported.
+# Largest number of terms that an estimate names.
 MAX_NAMED_TERMS = 4
 
 # Terms whose significances differ by less than this share explain the residuals equally well. They
@@ -134,17 +134,30 @@ class _ScoreTest:
 class TermTests:
     """Result of the tests of all terms that a model may lack.
 
+    A term at several joints and those of its single joints explain the same residuals. An estimate
+    names only the more significant one (`named`). A selection of terms may try all of `terms`:
+    where left-out data refute the term at all joints, that of one joint may still be missing.
+
     Attributes:
-        terms: The significant terms, most significant first.
+        terms: The significant terms, most significant first: the first `MAX_NAMED_TERMS` of all,
+            and those that are named.
         data: The data on which they were tested; None where no test was possible.
     """
 
     terms: tuple[MissingTerm, ...] = ()
     data: TermTestData | None = None
 
-    def without(self, paths: Collection[str]) -> TermTests:
-        """The tests without the terms that have some paths."""
-        return replace(self, terms=tuple(term for term in self.terms if term.path not in paths))
+    @property
+    def named(self) -> tuple[MissingTerm, ...]:
+        """The terms that an estimate names: at most `MAX_NAMED_TERMS`, most significant first.
+
+        The terms of single joints of a more significant term at several joints are left out.
+        """
+        return _without_members(self.terms)[:MAX_NAMED_TERMS]
+
+    def without(self, keys: Collection[str]) -> TermTests:
+        """The tests without the terms that have some keys (`MissingTerm.key`)."""
+        return replace(self, terms=tuple(term for term in self.terms if term.key not in keys))
 
     @property
     def remark(self) -> str:
@@ -184,7 +197,7 @@ def find_missing_terms(
 
     wanted = [term for term in found if term.share > MIN_EXPLAINED_SHARE]
     return TermTests(
-        terms=tuple(_by_significance(wanted)[:MAX_NAMED_TERMS]),
+        terms=first_terms(_by_significance(wanted)),
         data=TermTestData(
             share=part.share,
             recordings=part.recording_count,
@@ -192,6 +205,32 @@ def find_missing_terms(
             untested=tuple(dict.fromkeys(untested)),
         ),
     )
+
+
+def first_terms(ordered: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
+    """Of all significant terms, those that a selection tries or an estimate names.
+
+    The terms of the single joints of one at several joints take no place of others.
+
+    Args:
+        ordered: The terms, most significant first.
+
+    Returns:
+        In the same order, the first `MAX_NAMED_TERMS` of all, and as many that are no terms of
+        single joints of one before them.
+    """
+    first = (*ordered[:MAX_NAMED_TERMS], *_without_members(ordered)[:MAX_NAMED_TERMS])
+    keys = {term.key for term in first}
+    return tuple(term for term in ordered if term.key in keys)
+
+
+def _without_members(ordered: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
+    """The terms in their order, without those that an earlier one at several joints contains."""
+    kept: list[MissingTerm] = []
+    for term in ordered:
+        if not any(earlier.contains(term) for earlier in kept):
+            kept.append(term)
+    return tuple(kept)
 
 
 def _affordable_samples(problem: FitProblem, groups: Sequence[Sequence[Candidate]]) -> float:
@@ -303,7 +342,9 @@ def _linearised_halves(
 def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
     """Divide candidates into groups that are linearised one after the other.
 
-    They are about equally large, because the largest one decides how many data all are tested on.
+    The largest group decides on how much data all of them are tested, so that they are about
+    equally large. A group with the terms of joints that follow each other may be larger than the
+    others: that these can be tested together is worth more than the data that this costs.
 
     Args:
         candidates: The candidates.
@@ -313,8 +354,8 @@ def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
         terms of the joints that follow each other are in one group where that is possible.
     """
     total = sum(len(candidate.tested) for candidate in candidates)
-    count = max(-(-total // MAX_TESTED), 1)
-    most = -(-total // count)
+    group_count = max(-(-total // MAX_TESTED), 1)
+    most = -(-total // group_count)
 
     # Terms of the joints stay together as far as possible, so that those of one kind can be tested
     # together.
@@ -322,9 +363,9 @@ def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
     size = most
     for _, neighbours in itertools.groupby(candidates, key=lambda candidate: bool(candidate.kind)):
         block = list(neighbours)
-        count = sum(len(candidate.tested) for candidate in block)
-        is_whole = block[0].kind != "" and count <= MAX_TESTED
-        if is_whole and size + count > most:
+        of_block = sum(len(candidate.tested) for candidate in block)
+        is_whole = block[0].kind != "" and of_block <= MAX_TESTED
+        if is_whole and size + of_block > most:
             size = most
         for place, candidate in enumerate(block):
             size += len(candidate.tested)

@@ -165,8 +165,8 @@ def estimate_from(
     Args:
         result: The fit.
         budget: Budget with the stop token.
-        refuted: Paths of terms with which left-out data are predicted no better. They are not
-            named as missing terms, and are no reason for a misfit.
+        refuted: Keys of terms (`MissingTerm.key`) with which left-out data are predicted no better.
+            They are not named as missing terms, and are no reason for a misfit.
         tests: Tests of terms that this model may lack, where they are known; None to make them.
 
     Returns:
@@ -185,7 +185,7 @@ def estimate_from(
     predictions = _predictions(result, budget)
 
     reasons = misfit_reasons(
-        quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, tests.terms
+        quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, tests.named
     )
     begin_stage("computing the intervals")
     accuracy = result.accuracy
@@ -342,7 +342,7 @@ def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estim
         reasons=findings.reasons,
         whiteness=quality.whiteness,
         sloppy=tuple(name for name, _ in accuracy.poorly_known),
-        missing_terms=findings.tests.terms,
+        missing_terms=findings.tests.named,
         tested_data=findings.tests.data,
         per_recording=per_recording,
         worst_residual=quality.worst_residual if findings.reasons else None,
@@ -440,7 +440,7 @@ def _warnings(findings: _Findings) -> Iterator[str]:
         yield str(findings.quality.worst_residual)
     if findings.reasons:
         yield from _warnings_of_rate(result)
-    for term in findings.tests.terms:
+    for term in findings.tests.named:
         yield f"the model may lack {term}"
     if findings.tests.data is not None and findings.tests.data.untested:
         yield f"terms that the model may lack: {findings.tests.data.untested_sentence}"

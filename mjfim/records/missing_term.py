@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -93,6 +93,20 @@ class MissingTerm:
     source: str = ""
 
     @property
+    def key(self) -> str:
+        """What identifies the term; see `key_of_term`."""
+        return key_of_term(self.path, self.description, self.joints)
+
+    def contains(self, other: MissingTerm) -> bool:
+        """Whether this is a term at several joints, and another one is that of one of them.
+
+        Args:
+            other: The other term.
+        """
+        sizes = {self.path, *(each.path for each in self.further if each.is_size)}
+        return bool(self.joints) and not other.joints and other.path in sizes
+
+    @property
     def recipe(self) -> str:
         """Lines of TOML to add to the experiment file, with a semicolon between them.
 
@@ -126,6 +140,8 @@ class MissingTerm:
         if self.added is not None:
             tables = (self.added, *self.more_added)
             found["terms"] = {table.name: table.table for table in tables}
+        if self.joints:
+            found["joints"] = list(self.joints)
         return found
 
 
@@ -186,6 +202,23 @@ class TermTestData:
             "words": str(self),
             "untested": list(self.untested),
         }
+
+
+def key_of_term(path: str, description: str, joints: Sequence[str]) -> str:
+    """What identifies a term among those of one model.
+
+    A term at several joints has the path of the term of its first joint, so that its path alone
+    does not identify it. Which joint is the first one depends on the data.
+
+    Args:
+        path: Target of the main parameter.
+        description: The term in words.
+        joints: Names of the joints of one kind of term at several joints; empty for a single term.
+
+    Returns:
+        The path of a single term; the kind and all joints of one at several joints.
+    """
+    return f"{description}: {', '.join(sorted(joints))}" if joints else path
 
 
 def _toml_line(section: str, added: AddedTerm) -> str:

@@ -9,7 +9,7 @@ from math import isfinite, isnan
 from typing import Any
 
 from mjfim.arrays import Array, freeze
-from mjfim.records.missing_term import AddedTerm, TermParameter
+from mjfim.records.missing_term import AddedTerm, TermParameter, key_of_term
 
 
 class Decision(Enum):
@@ -38,6 +38,7 @@ class SelectedTerm:
         further: Its further parameters by name.
         added: Table of the library of terms that it needs; None for a number of the model.
         more_added: The tables of further joints, where it is one kind of term at several joints.
+        joints: Names of these joints, that of the main parameter first; empty for a single term.
         source: Publication that describes the term; may be empty.
     """
 
@@ -49,6 +50,7 @@ class SelectedTerm:
     further: dict[str, TermParameter] = field(default_factory=dict)
     added: AddedTerm | None = None
     more_added: tuple[AddedTerm, ...] = ()
+    joints: tuple[str, ...] = ()
     source: str = ""
 
     @property
@@ -141,6 +143,8 @@ class SelectionStep:
         share: Share of the sum of squared residuals that the score test promised, 0 to 1.
         alternatives: Other terms with which the prediction is as good: by at most one standard
             error worse.
+        joints: Names of the joints of one kind of term at several joints, that of the target first;
+            empty for a single term.
     """
 
     decision: Decision
@@ -153,6 +157,12 @@ class SelectionStep:
     sigmas: float = 0.0
     share: float = 0.0
     alternatives: tuple[AlternativeTerm, ...] = ()
+    joints: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """What identifies the term; see `key_of_term`."""
+        return key_of_term(self.path, self.description, self.joints)
 
     @property
     def is_kept(self) -> bool:
@@ -219,12 +229,15 @@ class Selection:
 
     @property
     def refuted(self) -> frozenset[str]:
-        """Paths of terms with which left-out data are predicted no better, by the last attempt.
+        """Keys of terms with which left-out data are predicted no better, by the last attempt.
 
         They explain residuals of the data to which they are fitted, but not those of other data.
+        See `key_of_term` for the keys.
         """
-        last = {step.path: step for step in self.steps if step.path}
-        return frozenset(path for path, step in last.items() if step.is_refuted)
+        # Only steps that tried to add a term are attempts.
+        attempts = (Decision.ADDED, Decision.REJECTED)
+        last = {step.key: step for step in self.steps if step.path and step.decision in attempts}
+        return frozenset(key for key, step in last.items() if step.is_refuted)
 
     @property
     def parameters(self) -> dict[str, dict[str, object]]:

@@ -94,6 +94,7 @@ def selected_term(candidate: MissingTerm, taken: Iterable[str]) -> SelectedTerm:
         further=further,
         added=candidate.added,
         more_added=candidate.more_added,
+        joints=candidate.joints,
         source=candidate.source,
     )
 
@@ -234,6 +235,7 @@ def tried_step(candidate: MissingTerm, model: FittedModel, reduction: Reduction)
         standard_error=reduction.standard_error,
         sigmas=candidate.sigmas,
         share=candidate.share,
+        joints=candidate.joints,
     )
 
 

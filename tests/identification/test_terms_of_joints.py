@@ -12,9 +12,16 @@ import mjfim
 from mjfim.experiment.system import System
 from mjfim.identification.candidates import Candidate, CandidateParameter
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.missing_terms import MAX_TESTED, find_missing_terms, in_groups
+from mjfim.identification.missing_terms import (
+    MAX_NAMED_TERMS,
+    MAX_TESTED,
+    TermTests,
+    find_missing_terms,
+    first_terms,
+    in_groups,
+)
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
-from mjfim.records.missing_term import MissingTerm
+from mjfim.records.missing_term import MissingTerm, TermParameter
 from mjfim.records.recording import Recording
 from mjfim.signals import multisine
 from mjfim.studies.selected_models import selected_term
@@ -90,20 +97,21 @@ def log_of(experiment: mjfim.Experiment, seed: int, seconds: float = 3.0) -> Rec
     return Recording(t=times, ctrl=control, y=y, outputs=system.outputs.names, name=f"log {seed}")
 
 
-def terms_of(experiment: mjfim.Experiment, log: Recording) -> tuple[MissingTerm, ...]:
-    """Terms that the stated model lacks."""
+def term_tests(experiment: mjfim.Experiment, log: Recording) -> TermTests:
+    """Tests of the terms that the stated model lacks."""
     system = System.resolve(experiment, threads=1)
     problem = FitProblem.of(system, [log])
     begin = problem.begin(np.array(system.parameters.guess))
     at = minimise(problem, begin, SearchSettings(max_iterations=6))
     assert at is not None
-    return find_missing_terms(problem, [log], at.unknowns).terms
+    return find_missing_terms(problem, [log], at.unknowns)
 
 
 def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
     log = log_of(with_stribeck(experiment, JOINTS), 0)
-    first = terms_of(experiment, log)[0]
+    tests = term_tests(experiment, log)
+    first = tests.terms[0]
     assert first.description == "Stribeck friction at 3 joints"
     assert set(first.joints) == set(JOINTS)
     assert len(first.more_added) == 2
@@ -126,11 +134,22 @@ def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: 
     assert len(term.parameters) == 6
     assert set(term.parameters) < set(extended.parameters.names)
     assert len(first.summary()["terms"]) == 3
+    assert first.summary()["joints"] == list(first.joints)
+
+    # An estimate names other effects in place of those of its single joints, which a selection
+    # tries where this term is refuted.
+    members = [term for term in tests.terms if first.contains(term)]
+    assert members and not any(term in tests.named for term in members)
+    assert len(tests.named) > len(tests.terms[:MAX_NAMED_TERMS]) - len(members)
+    left = tests.without({first.key})
+    assert members[0] in left.named
 
 
 def test_friction_that_one_joint_lacks_is_a_term_of_this_joint(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
-    first = terms_of(experiment, log_of(with_stribeck(experiment, ("lift",)), 0))[0]
+    tests = term_tests(experiment, log_of(with_stribeck(experiment, ("lift",)), 0))
+    first = tests.named[0]
+    assert first == tests.terms[0]
     assert first.path == "term/lift_stribeck:excess"
     assert first.joints == ()
     assert first.more_added == ()
@@ -169,3 +188,36 @@ def test_terms_of_joints_that_follow_each_other_are_in_one_group() -> None:
 
     # More of them than one linearisation tests are divided.
     assert max(len(group) for group in in_groups([of_joint] * 250)) <= MAX_TESTED
+
+
+def missing(path: str, *, sigmas: float, joints: tuple[str, ...] = ()) -> MissingTerm:
+    """A significant term; one at several joints contains damping at them."""
+    paths = [f"joint/{joint}:damping" for joint in joints[1:]]
+    return MissingTerm(
+        description=f"damping at {len(joints)} joints" if joints else path,
+        path=path,
+        value=1.0,
+        unit="",
+        sigmas=sigmas,
+        share=0.1,
+        further=tuple(
+            TermParameter(path=each, value=1.0, unit="", scale=1.0, is_size=True) for each in paths
+        ),
+        joints=joints,
+    )
+
+
+def test_terms_of_single_joints_take_no_place_of_other_terms() -> None:
+    of_joints = missing("joint/pan:damping", sigmas=90.0, joints=JOINTS)
+    singles = [missing(f"joint/{joint}:damping", sigmas=80.0 - i) for i, joint in enumerate(JOINTS)]
+    others = [missing(f"other {i}", sigmas=20.0 - i) for i in range(5)]
+
+    # A selection may try them all; an estimate names other effects.
+    tests = TermTests(terms=first_terms([of_joints, *singles, *others]))
+    assert tests.terms == (of_joints, *singles, *others[:3])
+    assert tests.named == (of_joints, *others[:3])
+    assert tests.without({of_joints.key}).named == (*singles, others[0])
+
+    # A more significant term of one joint is named besides.
+    tests = TermTests(terms=first_terms([singles[0], of_joints, *singles[1:], *others]))
+    assert tests.named == (singles[0], of_joints, *others[:2])

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import html
+import json
 import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
 
 import mjfim
 from mjfim.experiment.system import System
+from mjfim.identification.missing_terms import TermTests
 from mjfim.output import html as page
 from mjfim.output.rerun import text
 from mjfim.output.summaries.selection import describe_selection
@@ -150,10 +157,17 @@ def test_the_verdict_names_the_added_terms() -> None:
     assert verdict.text.startswith("With dry friction of slide added, the model explains")
 
 
-def tried(path: str, decision: Decision, reduction: float) -> SelectionStep:
+def tried(
+    path: str, decision: Decision, reduction: float, joints: tuple[str, ...] = ()
+) -> SelectionStep:
     """A step that tried a term."""
     return SelectionStep(
-        decision=decision, description=path, path=path, error=1.0, reduction=reduction
+        decision=decision,
+        description="damping at 3 joints" if joints else path,
+        path=path,
+        error=1.0,
+        reduction=reduction,
+        joints=joints,
     )
 
 
@@ -169,3 +183,61 @@ def test_terms_that_left_out_data_refute_are_those_of_the_last_attempt() -> None
     )
     selection = Selection(terms=(), steps=steps, ending="No further term.")
     assert selection.refuted == {"worse", "worse later"}
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("is_joint_refuted", [True, False])
+def test_a_term_at_several_joints_is_refuted_apart_from_that_of_its_first_joint(
+    order: int, is_joint_refuted: bool
+) -> None:
+    """Both have the same path."""
+    joints = ("pan", "lift", "roll")
+    reduction = 0.1 if is_joint_refuted else -0.1
+    steps = (
+        tried("joint/pan:damping", Decision.REJECTED, reduction),
+        tried("joint/pan:damping", Decision.REJECTED, -reduction, joints),
+    )
+    selection = Selection(terms=(), steps=(BEGUN, *steps[::order]), ending="No further term.")
+    single = replace(results.missing_term(), path="joint/pan:damping")
+    of_joints = replace(single, description="damping at 3 joints", joints=joints)
+    left = TermTests(terms=(of_joints, single)).without(selection.refuted)
+    assert left.terms == ((single,) if is_joint_refuted else (of_joints,))
+
+    # The same joints in another order are the same term.
+    again = replace(of_joints, path="joint/roll:damping", joints=joints[::-1])
+    assert (again.key in selection.refuted) == is_joint_refuted
+
+
+def test_the_removal_of_a_term_is_no_attempt_at_another_one() -> None:
+    """A step that removes a term at several joints has the path of its first joint."""
+    steps = (
+        BEGUN,
+        tried("joint/pan:damping", Decision.REJECTED, -0.1),
+        tried("joint/pan:damping", Decision.ADDED, 0.2, ("pan", "lift", "roll")),
+        tried("joint/pan:damping", Decision.REMOVED, 0.0),
+    )
+    selection = Selection(terms=(), steps=steps, ending="No further term.")
+    assert selection.refuted == {"joint/pan:damping"}
+
+
+def test_a_saved_selection_keeps_the_joints_and_older_files_without_them_are_loaded(
+    tmp_path: Path,
+) -> None:
+    step = tried("joint/pan:damping", Decision.REJECTED, -0.1, ("pan", "lift", "roll"))
+    selection = Selection(terms=(SLIDE_FRICTION,), steps=(BEGUN, step), ending="No further term.")
+    estimate = results.estimate(selection=selection)
+    estimate.save(tmp_path)
+    found = mjfim.Estimate.load(tmp_path).selection
+    assert found is not None and found.steps == (BEGUN, step)
+    assert selection.summary()["steps"][1]["joints"] == ("pan", "lift", "roll")
+
+    with np.load(tmp_path / "estimate.npz") as stored:
+        arrays = dict(stored)
+    record = json.loads(str(arrays["record"]))
+    old = record["fields"]["selection"]
+    for table in (*old["steps"], *old["terms"]):
+        del table["joints"]
+    arrays["record"] = np.array(json.dumps(record))
+    np.savez(tmp_path / "estimate.npz", **arrays)
+    found = mjfim.Estimate.load(tmp_path).selection
+    assert found is not None and found.steps[1].joints == ()
