@@ -24,6 +24,7 @@ from mjfim.identification.parameter_draws import (
     draw_parameters_system,
 )
 from mjfim.model.inertia_distance import barycentric_of, logcholesky_derivatives
+from mjfim.records.progress import stages_observed_by
 from tests.support.hinged_arm import arm_experiment
 from tests.support.numerics import Array
 from tests.support.paths import MODELS
@@ -300,7 +301,10 @@ def test_a_wide_prior_on_a_whole_inertia_gives_physical_robots(
     """Nearly all draws of the normal distribution are no bodies, so that replacing them failed."""
     known = KnownMoment.of(tmp_path, cad_prior=False, prior=prior)
     system, estimate, body = known.system, known.estimate, known.body
-    draws = draw_parameters_system(system, estimate, 50, np.random.default_rng(7))
+    stages: list[str] = []
+    with stages_observed_by(lambda name, *_: stages.append(name)):
+        draws = draw_parameters_system(system, estimate, 50, np.random.default_rng(7))
+    assert set(stages) == {"drawing robots inside the physical inertias"}
     linear = np.array([body.linear(robot[body.columns]) for robot in draws.values])
     assert all(body.is_physical(each) for each in linear)
     for values_of_robot in draws.values[:5]:
