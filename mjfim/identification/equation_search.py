@@ -29,8 +29,10 @@ from mjfim.optimize.condensed_least_squares import bounded_least_squares, triang
 INERTIA_STEP = 0.1
 OTHER_STEP = 1e-4
 
-# Stribeck speeds that are tried, over the root mean square of the speed of the joint.
+# Stribeck speeds that are tried, over the root mean square of the speed of the joint, and their
+# ratio.
 STRIBECK_SHARES = tuple(np.geomspace(0.03, 0.5, 8).tolist())
+STRIBECK_RATIO = STRIBECK_SHARES[1] / STRIBECK_SHARES[0]
 
 # Stribeck speeds explain rows equally well where the sums of squares differ by no more than the
 # square of this number of standard deviations.
@@ -124,6 +126,7 @@ class FoundEquations:
         weights: (R,) weights of the rows.
         count: Number of linearisations.
         success: True where the last step changed nothing.
+        speed_sigma: (k,) standard deviations of the Stribeck speeds, which are not searched.
     """
 
     linearisation: Linearisation
@@ -131,6 +134,7 @@ class FoundEquations:
     weights: Array
     count: int
     success: bool
+    speed_sigma: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,7 +199,7 @@ class EquationSearch:
         contained &= ~np.isin(parameters.names, system.experiment.fit.hold)
         stribeck = tuple(
             each
-            for each in stribeck_parameters(system.model, parameters)
+            for each in stribeck_parameters(system)
             if contained[[each.excess, each.speed]].all()
         )
         contained[[each.speed for each in stribeck]] = False
@@ -222,27 +226,27 @@ class EquationSearch:
 
         Only where the equations are not linear, another start can lead to another result.
         """
-        start = self._with_stribeck_speeds()
+        start, speed_sigma = self._with_stribeck_speeds()
         moved = not np.array_equal(start, self.start)
         best = self._searched(start, self._rows(start) if moved else self.rows_at_start)
         if best.success and best.count == 1:
-            return best
+            return replace(best, speed_sigma=speed_sigma)
 
         # Where several starts have led to nearly the lowest cost, the model itself is poor, and
         # further starts would hardly lead to another one.
         costs = [self._relative_cost(best)]
-        for start in self._other_starts():
+        for other in self._other_starts(start):
             agreeing = sum(cost <= (1.0 + AGREEING_SHARE) * min(costs) for cost in costs)
             if min(costs) < POOR_COST * len(self.of_row) or agreeing >= AGREEING_STARTS:
                 break
-            found = self._searched(start, self._rows(start))
+            found = self._searched(other, self._rows(other))
             costs.append(self._relative_cost(found))
             if costs[-1] == min(costs):
                 best = found
-        return best
+        return replace(best, speed_sigma=speed_sigma)
 
-    def _with_stribeck_speeds(self) -> Array:
-        """(p,) the start with those of some Stribeck speeds that explain the rows best.
+    def _with_stribeck_speeds(self) -> tuple[Array, Array]:
+        """The start with those of some Stribeck speeds that explain the rows best.
 
         Without an excess of the static friction, the rows do not depend on the Stribeck speed, and
         at a wrong speed the best excess may be none. Then a search would stay there. With an
@@ -250,16 +254,19 @@ class EquationSearch:
         large speed. So speeds are chosen from a few values that do not lead to extreme ones.
         Bristles of different joints hardly act on each other's rows, so that each value is tried
         at all joints together.
+
+        Returns:
+            (p,) the start, and (k,) standard deviations of the speeds.
         """
         if not self.stribeck:
-            return self.start
+            return self.start, np.zeros(0)
 
         # The linearisation without excess is that at every Stribeck speed, but for the columns of
         # the excess.
         columns = np.array([each.excess for each in self.stribeck])
         speeds = np.array([each.speed for each in self.stribeck])
         x = np.array(self.start)
-        x[columns] = self.coordinates.lower[columns]
+        x[columns] = 0.0
         at = self._linearised(x, self._rows(x))
         weights = 1.0 / self.forces[self.of_row]
 
@@ -281,21 +288,31 @@ class EquationSearch:
         counts = np.array([np.sum(own == dof) for dof in dofs]) / PER_WINDOW
         most = np.min([squares for _, squares in points], axis=0)
         most = most * (1.0 + EQUAL_SIGMAS**2 / np.maximum(counts, 1.0))
-        best = np.array(self.start)
+        best, sigma = np.array(self.start), np.zeros(len(self.stribeck))
         for k, each in enumerate(self.stribeck):
             equal = [moved for moved, squares in points if squares[k] <= most[k]]
-            chosen = max(equal, key=lambda moved: float(moved[each.speed]))
-            best[each.speed], best[each.excess] = chosen[each.speed], chosen[each.excess]
-        return best
+            ordered = sorted(equal, key=lambda moved: float(moved[each.speed]))
+            slowest, fastest = ordered[0], ordered[-1]
+            best[each.speed], best[each.excess] = fastest[each.speed], fastest[each.excess]
+
+            # The true speed may be anywhere between those that are tried besides them.
+            half_step = np.sqrt(STRIBECK_RATIO)
+            width = fastest[each.speed] * half_step - slowest[each.speed] / half_step
+            sigma[k] = width / np.sqrt(12.0)
+        return best, sigma
 
     def _usual_speeds(self) -> Array:
         """(nv,) root mean square of the measured speeds [m/s or rad/s]."""
         qvel = np.concatenate([each.motion.qvel for each in self.equations.recorded])
         return np.asarray(np.sqrt(np.mean(qvel**2, axis=0)))
 
-    def _other_starts(self) -> Iterator[Array]:
-        """Starts with other values of the parameters that are no inertias of whole bodies."""
-        plain = np.isin(np.arange(len(self.start)), self.active)
+    def _other_starts(self, first: Array) -> Iterator[Array]:
+        """Starts with other values of the parameters that are no inertias of whole bodies.
+
+        Args:
+            first: (p,) linear coordinates of the first start.
+        """
+        plain = np.isin(np.arange(len(first)), self.active)
         for body in self.coordinates.bodies:
             plain[body.columns] = False
 
@@ -304,7 +321,7 @@ class EquationSearch:
         evaluations = points * (len(self.active) + 1) * USUAL_LINEARISATIONS
         for _ in range(int(min(OTHER_STARTS, MOST_EVALUATIONS / evaluations))):
             factor = LARGEST_FACTOR ** rng.uniform(-1.0, 1.0, int(plain.sum()))
-            start = np.array(self.start)
+            start = np.array(first)
             start[plain] *= factor
             yield np.clip(start, self.coordinates.lower, self.coordinates.upper)
 
@@ -372,6 +389,7 @@ class EquationSearch:
             weights=weights,
             count=count,
             success=success,
+            speed_sigma=np.zeros(len(self.stribeck)),
         )
 
     # ---- rows
@@ -533,19 +551,23 @@ class EquationSearch:
         """
         x = found.linearisation.x
         weights = found.weights / np.sqrt(correlation)[self.of_row]
-        J = weights[:, None] * found.linearisation.slopes
         D = self.coordinates.derivative(x)
+        J = weights[:, None] * found.linearisation.slopes
         of_data = J.T @ J
         stated, weak = self.priors.stated(x)[1], self.priors.weak(x)[1]
         held = weak.T @ weak
+        with_priors = of_data + held + stated.T @ stated
 
         # A parameter is determined where the recordings narrow the weak prior.
-        with_data = D @ _inverse(of_data + held, self.active) @ D.T
+        by_speeds = self._error_by_speeds(found, J, weights, with_priors)
+        with_data = D @ (_inverse(of_data + held, self.active) + by_speeds) @ D.T
         without = D @ _inverse(held, self.active) @ D.T
         sizes = self.parameters.magnitude
         std, prior = np.sqrt(np.diag(with_data)), np.sqrt(np.diag(without))
         is_wide = (std > DETERMINED_SIGMA * sizes) | (std > DETERMINED_SHARE * prior)
-        covariance = D @ _inverse(of_data + held + stated.T @ stated, self.active) @ D.T
+        is_wide &= np.isin(np.arange(len(x)), self.active)
+        is_wide[[each.speed for each in self.stribeck]] = True
+        covariance = D @ (_inverse(with_priors, self.active) + by_speeds) @ D.T
 
         relative = of_data * np.outer(self.coordinates.sizes, self.coordinates.sizes)
         known = int(np.sum(np.linalg.eigvalsh(relative) >= DETERMINED_SIGMA**-2))
@@ -554,13 +576,36 @@ class EquationSearch:
         least = max(float(singular[max(known, 1) - 1]), np.finfo(float).tiny)
         return EquationAccuracy(
             covariance=covariance,
-            undetermined=np.union1d(
-                np.intersect1d(np.flatnonzero(is_wide), self.active),
-                [each.speed for each in self.stribeck],
-            ).astype(np.intp),
+            undetermined=np.flatnonzero(is_wide),
             determined=known,
             condition=float(singular[0]) / least,
         )
+
+    def _error_by_speeds(
+        self, found: FoundEquations, J: Array, weights: Array, information: Array
+    ) -> Array:
+        """(p, p) covariance by the errors of Stribeck speeds, which are not searched.
+
+        Args:
+            found: The solution.
+            J: (R, p) weighted slopes by the linear coordinates.
+            weights: (R,) weights of the rows.
+            information: (p, p) information about the linear coordinates.
+        """
+        covariance = np.zeros_like(information)
+        if not self.stribeck:
+            return covariance
+
+        at = found.linearisation
+        speeds = np.array([each.speed for each in self.stribeck])
+        by_speed = self._linearised(at.x, at.rows, speeds).slopes[:, speeds]
+        sigma = found.speed_sigma
+
+        # The least-squares solution moves so that it makes up for an error of a speed.
+        moves = -_inverse(information, self.active) @ J.T @ (weights[:, None] * by_speed * sigma)
+        covariance += moves @ moves.T
+        covariance[speeds, speeds] += sigma**2
+        return covariance
 
 
 def _inverse(information: Array, active: np.ndarray) -> Array:

@@ -14,14 +14,12 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.model.parameters import ParameterSet
+from mjfim.experiment.system import System
 from mjfim.model.servos import actuator_gear
 from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN
-from mjfim.model.targets import ModelField, TermField
 
 # Columns of the friction of a `dcmotor` in its bias: Coulomb, static, Stribeck speed.
 FRICTION_COLUMNS = slice(3, 6)
-STATIC_COLUMN, SPEED_COLUMN = 4, 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,55 +64,6 @@ class Bristle:
         return np.asarray(direction * force / stiffness)
 
 
-@dataclass(frozen=True, kw_only=True)
-class StribeckParameters:
-    """Unknowns of the Stribeck effect of one bristle.
-
-    Attributes:
-        dof: Degree of freedom of its joint.
-        excess: Index of the parameter that sets the static friction.
-        speed: Index of the parameter that sets the Stribeck speed.
-    """
-
-    dof: int
-    excess: int
-    speed: int
-
-
-def stribeck_parameters(model: Any, parameters: ParameterSet) -> tuple[StribeckParameters, ...]:
-    """Bristles whose static friction and Stribeck speed are both parameters.
-
-    Args:
-        model: The compiled model (`mujoco.MjModel`).
-        parameters: The parameters.
-    """
-    found = []
-    for bristle in bristles_of(model):
-        name = str(model.actuator(bristle.actuator).name)
-        excess = _index_of(parameters, bristle, name, "excess", STATIC_COLUMN)
-        speed = _index_of(parameters, bristle, name, "speed", SPEED_COLUMN)
-        if excess is not None and speed is not None:
-            found.append(StribeckParameters(dof=bristle.dof, excess=excess, speed=speed))
-    return tuple(found)
-
-
-def _index_of(
-    parameters: ParameterSet, bristle: Bristle, name: str, field: str, column: int
-) -> int | None:
-    """Index of the parameter that sets a number of the friction of a bristle alone."""
-    number = ("actuator_biasprm", bristle.actuator, column)
-    for j, parameter in enumerate(parameters.parameters):
-        target = parameter.targets[0].field
-        is_number = isinstance(target, ModelField) and target.numbers == {number}
-        is_field = isinstance(target, TermField) and (target.term.name, target.field) == (
-            name,
-            field,
-        )
-        if len(parameter.targets) == 1 and (is_number or is_field):
-            return j
-    return None
-
-
 def bristles_of(model: Any) -> tuple[Bristle, ...]:
     """Bristles of the passive devices of a model at slides and hinges.
 
@@ -137,4 +86,48 @@ def bristles_of(model: Any) -> tuple[Bristle, ...]:
                     dof=int(model.jnt_dofadr[joint]),
                 )
             )
+    return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StribeckParameters:
+    """Unknowns of the Stribeck effect of one joint.
+
+    Attributes:
+        dof: Degree of freedom of the joint.
+        excess: Index of the parameter that is the excess of the static friction.
+        speed: Index of the parameter that is the Stribeck speed.
+    """
+
+    dof: int
+    excess: int
+    speed: int
+
+
+def stribeck_parameters(system: System) -> tuple[StribeckParameters, ...]:
+    """Physical terms whose excess and Stribeck speed are both unknown.
+
+    Only parameters count that are the numbers themselves, where the excess may be zero, and where
+    no prior says what the speed is.
+
+    Args:
+        system: The system.
+    """
+    parameters = system.parameters.parameters
+    place: dict[str, int] = {}
+    for j, parameter in enumerate(parameters):
+        target = parameter.targets[0]
+        if len(parameter.targets) == 1 and (target.scale, target.offset) == (1.0, 0.0):
+            place[target.path] = j
+
+    found = []
+    for name in system.source.terms:
+        excess, speed = (place.get(f"term/{name}:{field}") for field in ("excess", "speed"))
+        if excess is None or speed is None:
+            continue
+        lower, upper = parameters[excess].bounds
+        if lower <= 0.0 <= upper and parameters[speed].prior is None:
+            joint = system.experiment.terms[name].joint
+            dof = int(system.model.joint(joint).dofadr[0])
+            found.append(StribeckParameters(dof=dof, excess=excess, speed=speed))
     return tuple(found)

@@ -218,10 +218,20 @@ class _Selector:
         result = self._final(model.result, is_free, is_changed=model.is_changed)
 
         # Over segments, the data may show other terms.
+        stated = first
         if result.task.settings.segment_length is not None and is_free:
             model, ending = self._over_length(model, first, result, steps, ending)
             if model.result is not result:
                 result = self._final(model.result, is_free=False, is_changed=model.is_changed)
+            length = result.task.settings.segment_length
+            of_length = with_length(first.result.task, length)
+            stated = replace(first, result=replace(first.result, task=of_length))
+
+        # The final fit may show terms that were not significant before.
+        model, ending = self._completed(model, stated, result, steps, ending)
+        if model.result is not result:
+            is_whole = is_free and stated is first
+            result = self._final(model.result, is_whole, is_changed=model.is_changed)
         result = _reported(result, is_free)
         selection = Selection(
             terms=tuple(as_recorded(term) for term in model.terms),
@@ -310,6 +320,31 @@ class _Selector:
 
     # ---- steps
 
+    def _completed(
+        self,
+        model: FittedModel,
+        first: FittedModel,
+        result: FitResult,
+        steps: list[SelectionStep],
+        ending: str,
+    ) -> tuple[FittedModel, str]:
+        """Try terms that only the final fit of a changed model shows to be significant.
+
+        Args:
+            model: The chosen model, with an earlier fit.
+            first: The stated model.
+            result: The final fit of the chosen model.
+            steps: Receives the steps.
+            ending: Why no more terms were added before.
+
+        Returns:
+            The model with the final fit or with further terms, and why no more terms were added.
+        """
+        final = replace(model, result=result, tests=self._tests_of(model, result, first))
+        if self._is_stopped() or not model.is_changed or final.tests is not None:
+            return final, ending
+        return self._grown(final, first, steps, _refuted(steps))
+
     def _chosen(
         self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
     ) -> tuple[FittedModel, str]:
@@ -331,8 +366,7 @@ class _Selector:
         # may be significant that were not tried before.
         if simpler is not model:
             simpler = self._pruned(simpler, first, steps, tests_last=True)
-            tried = Selection(terms=(), steps=tuple(steps), ending="").refuted
-            simpler, ending = self._grown(simpler, first, steps, tried)
+            simpler, ending = self._grown(simpler, first, steps, _refuted(steps))
         return simpler, ending
 
     def _over_length(
@@ -734,6 +768,11 @@ class _Selector:
     def _is_stopped(self) -> bool:
         """True after a request to stop."""
         return self.budget.stop.requested
+
+
+def _refuted(steps: Sequence[SelectionStep]) -> Collection[str]:
+    """Terms that some steps have refuted (`Selection.refuted`)."""
+    return Selection(terms=(), steps=tuple(steps), ending="").refuted
 
 
 def _sizes_of(term: SelectedTerm) -> set[str]:

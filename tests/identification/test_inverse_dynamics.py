@@ -381,7 +381,83 @@ def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: P
     assert 0.5 < excess / 0.4 < 2.0
     assert 0.5 < speed / 0.15 < 2.0
 
+    # The accuracy of the others contains that the Stribeck speed is hardly known.
+    error = np.abs(fit.theta - true)[:3]
+    assert (error < 3.0 * fit.std[:3]).all()
+    assert (error > 0.01 * fit.std[:3]).all()
+
     # The Stribeck speed is chosen from a few values, and its accuracy is not stated.
     assert "speed" in fit.undetermined
     assert "speed" not in fit.absent
     assert np.isinf(fit.std[3])
+
+
+def stribeck_servo(folder: Path, **of_friction: dict[str, Any]) -> tuple[Experiment, Recording]:
+    """A servo with Stribeck friction of unknown size and a log of it.
+
+    Args:
+        folder: Where its model is written.
+        of_friction: Tables of the excess and the speed that differ from the usual ones.
+    """
+    text = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+      <body><joint name="j" axis="0 1 0" damping="0.3" frictionloss="0.5"/>
+        <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
+      <actuator><position name="s" joint="j" kp="300" kv="10"/></actuator>
+      <sensor><actuatorfrc name="torque" actuator="s"/></sensor></mujoco>"""
+    (folder / "servo.xml").write_text(text, encoding="utf-8")
+    experiment = Experiment(
+        model="servo.xml",
+        directory=folder,
+        source="servo",
+        rate=500.0,
+        parameters={
+            "excess": of_friction.get("excess", {"target": "term/bristle:excess"}),
+            "speed": of_friction.get("speed", {"target": "term/bristle:speed"}),
+        },
+        noise={"qpos:j": 1e-5, "torque": 1e-3},
+        terms={"bristle": {"kind": "stribeck", "joint": "j"}},
+    )
+    true = {"kind": "stribeck", "joint": "j", "values": {"excess": 0.4, "speed": 0.15}}
+    damping = {"damping": {"target": "joint/j:damping"}}
+    stated = experiment.model_dump(exclude_unset=True)
+    robot = experiment.restated({**stated, "parameters": damping, "terms": {"bristle": true}})
+    system = System.resolve(robot, threads=1)
+    rng = np.random.default_rng(0)
+    t = np.arange(4001) / 500.0
+    ctrl = 0.6 * multisine(t[:-1], 1, 0.1, 4, rng)
+    y = system.plant.measure(system.parameters.guess[None], ctrl)[0][0]
+    y = y + rng.standard_normal(y.shape) * system.noise.sigma
+    return experiment, Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log")
+
+
+EXCESS, SPEED = {"target": "term/bristle:excess"}, {"target": "term/bristle:speed"}
+
+
+@pytest.mark.parametrize(
+    "of_friction",
+    [
+        {},
+        {
+            "excess": {**EXCESS, "guess": 0.3, "bounds": [0.1, 5.0]},
+            "speed": {**SPEED, "guess": 0.2},
+        },
+        {"excess": {**EXCESS, "guess": 0.3}, "speed": {**SPEED, "guess": 0.2, "prior": 0.05}},
+        {
+            "excess": {**EXCESS, "guess": 0.3},
+            "speed": {"targets": [{"path": "term/bristle:speed", "scale": 0.01}], "guess": 20.0},
+        },
+    ],
+    ids=["free", "bounds", "prior", "factor"],
+)
+def test_stated_bounds_priors_and_factors_of_stribeck_friction_hold(
+    of_friction: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    experiment, log = stribeck_servo(tmp_path, **of_friction)
+    fit = inverse_dynamics(experiment, [log])
+    factor = 0.01 if "targets" in of_friction.get("speed", {}) else 1.0
+    assert fit.theta[0] == pytest.approx(0.4, rel=0.2)
+    assert factor * fit.theta[1] == pytest.approx(0.15, rel=0.2)
+
+    # Only a speed that is chosen from a few values has no stated accuracy.
+    assert np.isinf(fit.std[1]) == (not of_friction)
+    assert fit.std[1] > 0.0
