@@ -533,6 +533,7 @@ class _Selector:
                     decision=Decision.REMOVED,
                     description=term.description,
                     path=term.path,
+                    joints=term.joints,
                     count=len(model.terms),
                     error=model.losses.error,
                     reduction=reduction.mean,
