@@ -34,6 +34,9 @@ LAST_SECONDS = 5.0
 # Time after which an error is raised once more that came during a callback [s].
 AGAIN_SECONDS = 0.05
 
+# Time for which the end of the context waits for the thread that announces presses [s].
+WATCHER_SECONDS = 1.0
+
 # Exit code of an interrupted program.
 INTERRUPTED_CODE = 1
 
@@ -93,6 +96,8 @@ class Interruption:
         self._again: threading.Timer | None = None
         self._hook_before = sys.unraisablehook
 
+        self._watcher: threading.Thread | None = None
+
         # A queue of this kind may be used in a signal handler; None ends the thread that watches.
         self._pressed: SimpleQueue[int | None] = SimpleQueue()
 
@@ -105,7 +110,8 @@ class Interruption:
         global _current
         _current = self
         self._before = {number: signal.getsignal(number) for number in SIGNALS}
-        threading.Thread(target=self._watch, name="mjfim-interruption", daemon=True).start()
+        self._watcher = threading.Thread(target=self._watch, name="mjfim-interruption", daemon=True)
+        self._watcher.start()
         for number in SIGNALS:
             signal.signal(number, self)
         self._hook_before, sys.unraisablehook = sys.unraisablehook, self._raise_again
@@ -131,6 +137,10 @@ class Interruption:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         sys.unraisablehook = self._hook_before
         self._pressed.put(None)
+
+        # What the other thread still says belongs to this context, and not to what follows.
+        if self._watcher is not None:
+            self._watcher.join(timeout=WATCHER_SECONDS)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """React to a press.

@@ -154,6 +154,20 @@ def test_no_press_follows_by_itself_after_the_end() -> None:
     assert not seen
 
 
+def test_what_a_press_says_is_said_before_the_end_of_the_context() -> None:
+    """The thread that says it may be late; the sentence would stand among later ones."""
+    said: list[str] = []
+
+    def say_late(sentence: str) -> None:
+        time.sleep(0.1)
+        said.append(sentence)
+
+    with Interruption(say_late) as handler:
+        handler.keep()
+        signal.raise_signal(signal.SIGINT)
+    assert said == [module.FIRST_SENTENCE]
+
+
 def test_a_press_during_a_callback_is_not_lost(
     interruption: Interruption, capfd: pytest.CaptureFixture[str]
 ) -> None:
