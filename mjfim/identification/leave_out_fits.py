@@ -25,6 +25,27 @@ from mjfim.optimize.levenberg_marquardt import WEAK_DAMPING, Solution, UnknownVa
 # errors of predictions hardly change with what is left of it.
 ALLOWED_SHARE = 0.1
 
+# Dampings of the steps that are tried in turn. A step without damping is long in directions that
+# the data hardly determine, in which the linearisation does not hold so far.
+DAMPINGS = (WEAK_DAMPING, 1e-4, 1e-3, 1e-2)
+
+# Share of the decrease by the step without damping that a damped one has to predict.
+ENOUGH_SHARE = 0.7
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PredictedEnd:
+    """End of a step.
+
+    Attributes:
+        unknowns: Unknowns of all segments. Initial states of segments in the part are those that
+            fit the part best at the new theta.
+        decrease: Decrease of the cost of the other data that the linearisation predicts.
+    """
+
+    unknowns: UnknownValues
+    decrease: float
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LeaveOutStep:
@@ -33,17 +54,14 @@ class LeaveOutStep:
     Attributes:
         part: The part.
         begin: Unknowns of all segments at the fit to all data.
-        end: Unknowns of all segments at the end of the step. Initial states of segments in the part
-            are those that fit the part best at the new theta.
-        predicted_decrease: Decrease of the cost of the other data that the linearisation predicts.
+        ends: Ends of steps with more and more damping.
         cost: Cost of the other data at the begin; None where it has to be simulated.
         cost_at_guess: Cost of the other data at the guess; None where it has to be simulated.
     """
 
     part: LeftOutPart
     begin: UnknownValues
-    end: UnknownValues
-    predicted_decrease: float
+    ends: tuple[PredictedEnd, ...]
     cost: float | None = None
     cost_at_guess: float | None = None
 
@@ -109,24 +127,30 @@ def fit_to_others(problem: FitProblem, step: LeaveOutStep, budget: Budget) -> Ot
         return None
 
     others = others.of_segments(segments)
-    begin, end = _of_segments(step.begin, segments), _of_segments(step.end, segments)
+    begin = _of_segments(step.begin, segments)
     cost = others.cost(begin) if step.cost is None else step.cost
-    cost_at_end = others.cost(end)
-    if budget.exhausted is not None:
-        return None
 
     # The data that are left out may have led the estimate to a minimum that the others lack. The
     # fit to the others then begins at the guess.
     guess = others.begin(problem.system.parameters.guess)
     cost_at_guess = others.cost(guess) if step.cost_at_guess is None else step.cost_at_guess
 
-    # The step is the fit if it lowers the cost nearly as far as the linearisation predicts.
-    missed = cost_at_end - (cost - step.predicted_decrease)
-    allowed = max(ALLOWED_SHARE * step.predicted_decrease, SEARCH.rough_share * cost)
-    if missed <= allowed and cost_at_end <= cost_at_guess:
-        return OtherFit(unknowns=step.end, has_initial_states=not len(problem.layout.per_recording))
+    # A step is the fit if it lowers the cost nearly as far as the linearisation predicts.
+    starts = [(cost, begin), (cost_at_guess, guess)]
+    for predicted in step.ends:
+        if predicted.decrease < ENOUGH_SHARE * step.ends[0].decrease:
+            break
+        end = _of_segments(predicted.unknowns, segments)
+        cost_at_end = others.cost(end)
+        if budget.exhausted is not None:
+            return None
+        missed = cost_at_end - (cost - predicted.decrease)
+        allowed = max(ALLOWED_SHARE * predicted.decrease, SEARCH.rough_share * cost)
+        if missed <= allowed and cost_at_end <= cost_at_guess:
+            has_states = not len(problem.layout.per_recording)
+            return OtherFit(unknowns=predicted.unknowns, has_initial_states=has_states)
+        starts.append((cost_at_end, end))
 
-    starts = [(cost_at_end, end), (cost, begin), (cost_at_guess, guess)]
     found = minimise(others, min(starts, key=lambda start: start[0])[1], SEARCH, budget)
     if found is None or budget.exhausted is not None:
         return None
@@ -167,20 +191,18 @@ def _step_without(problem: FitProblem, solution: Solution, part: LeftOutPart) ->
 
     # Bounds hold as in every step of the search.
     values = problem.common_values(at)
-    step = others.step(
-        WEAK_DAMPING, condensed.column_norms, problem.lower - values, problem.upper - values
-    )
+    lower, upper = problem.lower - values, problem.upper - values
     is_left_out = ~np.isin(
         np.arange(len(problem.segments)),
         problem.masked([~mask for mask in masks]).segments_with_values,
     )
-    end = problem.moved(at, step, 1.0)
-    return LeaveOutStep(
-        part=part,
-        begin=at,
-        end=_with_states_of_part(at, end, condensed, step.common, is_left_out),
-        predicted_decrease=step.predicted_decrease,
-    )
+    ends = []
+    for damping in DAMPINGS:
+        step = others.step(damping, condensed.column_norms, lower, upper)
+        end = problem.moved(at, step, 1.0)
+        unknowns = _with_states_of_part(at, end, condensed, step.common, is_left_out)
+        ends.append(PredictedEnd(unknowns=unknowns, decrease=step.predicted_decrease))
+    return LeaveOutStep(part=part, begin=at, ends=tuple(ends))
 
 
 def _with_states_of_part(

@@ -62,10 +62,12 @@ def test_initial_states_of_the_part_are_those_that_fit_it_best() -> None:
     masks = step.part.masks(problem)
     part, at = predicted_part(problem, found, masks, Budget())
 
-    # A search for the initial states of the part, at the same theta, finds no lower cost.
+    # A search for the initial states of the part, at the same theta, lowers the cost by less than
+    # the error of one of them by one standard deviation (1/2) does.
+    assert found.has_initial_states
     searched = replace(found, has_initial_states=False)
     again, best = predicted_part(problem, searched, masks, Budget())
-    assert part.cost(at) == pytest.approx(again.cost(best), rel=1e-4)
+    assert part.cost(at) == pytest.approx(again.cost(best), abs=0.2)
 
 
 def test_a_step_that_misses_the_predicted_decrease_is_followed_by_a_search() -> None:
@@ -76,11 +78,27 @@ def test_a_step_that_misses_the_predicted_decrease_is_followed_by_a_search() -> 
 
     # A wrong linearisation is noticed by the simulation of the others.
     begin = step.begin
-    wrong = replace(step, end=replace(begin, theta=begin.theta * 1.05))
-    found = fit_to_others(problem, wrong, Budget())
+    away = replace(begin, theta=begin.theta * 1.05)
+    ends = tuple(replace(end, unknowns=away) for end in step.ends)
+    found = fit_to_others(problem, replace(step, ends=ends), Budget())
     assert found is not None and not found.has_initial_states
     sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
     assert np.linalg.norm((found.unknowns.theta - good.unknowns.theta) / sigma) < 0.1
+
+
+def test_a_damped_step_is_enough_where_the_one_without_damping_goes_too_far() -> None:
+    problem, solution = fitted({}, 2)
+    (step, _) = leave_out_steps(problem, solution, list(left_out_parts(problem)))
+    begin, (first, second, *_) = step.begin, step.ends
+    away = replace(first, unknowns=replace(begin, theta=begin.theta * 1.05))
+    found = fit_to_others(problem, replace(step, ends=(away, second)), Budget())
+    assert found is not None and found.has_initial_states
+    np.testing.assert_array_equal(found.unknowns.theta, second.unknowns.theta)
+
+    # A step that promises much less is none: the search goes on.
+    little = replace(second, decrease=0.5 * first.decrease)
+    found = fit_to_others(problem, replace(step, ends=(away, little)), Budget())
+    assert found is not None and not found.has_initial_states
 
 
 def test_the_search_begins_at_the_guess_where_the_others_cost_less_there() -> None:
@@ -100,7 +118,7 @@ def test_the_search_begins_at_the_guess_where_the_others_cost_less_there() -> No
     good = leave_out_steps(problem, solution, list(left_out_parts(problem)))[0]
     sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
     assert found is not None
-    assert np.linalg.norm((found.unknowns.theta - good.end.theta) / sigma) < 0.3
+    assert np.linalg.norm((found.unknowns.theta - good.ends[0].unknowns.theta) / sigma) < 0.3
 
 
 def test_nothing_is_left_of_a_problem_with_one_part_only() -> None:
