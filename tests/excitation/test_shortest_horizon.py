@@ -239,8 +239,8 @@ def test_the_command_line(tmp_path: Path) -> None:
     kept = json.loads((folder / "shortest.json").read_text(encoding="utf-8"))
     assert kept["closed"] and kept["horizon"] < 1.0
     assert f"shortest horizon: {kept['horizon']:g} s" in done.output
-    arrays = np.load(folder / "design.npz", allow_pickle=False)
-    assert arrays["t"][-1] == pytest.approx(kept["horizon"])
+    with np.load(folder / "design.npz", allow_pickle=False) as arrays:
+        assert arrays["t"][-1] == pytest.approx(kept["horizon"])
     study.write_text(text.replace("wanted = 0.03", "wanted = 1e-9"), encoding="utf-8")
     done = run("design", study, "-o", folder, "--shortest")
     assert done.exit_code == 1

@@ -209,9 +209,9 @@ def test_a_design_is_loaded_as_it_was(design: Design, tmp_path: Path) -> None:
 def test_a_design_that_ends_where_it_began_has_all_arrays(design: Design, tmp_path: Path) -> None:
     unchanged = dataclasses.replace(design, final=design.initial)
     unchanged.save(tmp_path)
-    arrays = np.load(tmp_path / "design.npz")
-    for name in ("t", "qpos", "qvel", "act", "ctrl", "gain", "sensitivity"):
-        assert np.array_equal(arrays[name], arrays[f"initial_{name}"])
+    with np.load(tmp_path / "design.npz") as arrays:
+        for name in ("t", "qpos", "qvel", "act", "ctrl", "gain", "sensitivity"):
+            assert np.array_equal(arrays[name], arrays[f"initial_{name}"])
 
 
 def test_the_files_of_the_design_verb_are_loaded(
