@@ -274,7 +274,5 @@ def _between_parts(without_parts: Array) -> Array:
     Args:
         without_parts: (K, p) estimates without each of K parts of the data [theta-unit].
     """
-    K = len(without_parts)
-    if K < 2:
-        return np.zeros_like(without_parts)
-    return student_quantile(K, LEVEL) / NORMAL_95 * jackknife_deviations(without_parts)
+    deviations, K = jackknife_deviations(without_parts), len(without_parts)
+    return student_quantile(K, LEVEL) / NORMAL_95 * deviations if K > 1 else deviations

@@ -208,7 +208,7 @@ def find_missing_terms(
 
 
 def first_terms(ordered: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
-    """Of all significant terms, those that a selection tries or an estimate names.
+    """Select the terms that a selection tries or an estimate names from all significant ones.
 
     The terms of the single joints of one at several joints take no place of others.
 

@@ -136,34 +136,34 @@ class EquationModel:
             return [np.zeros((len(motion.t), 0))]
 
         # The joints are held in the simulation, so that bristles follow from the measured velocity.
-        bristles = bristles_of(models[0])
-        same = all(
-            np.array_equal(model.actuator_dynprm, models[0].actuator_dynprm)
-            and all(each.friction(model) == each.friction(models[0]) for each in bristles)
-            for model in models
+        bristles, first = bristles_of(models[0]), models[0]
+        move_alike = all(
+            np.array_equal(each.actuator_dynprm, first.actuator_dynprm) for each in models
         )
-        chosen = models[:1] if same else models
-        found = self._simulated(models, motion)
-        acts = [np.array(found[min(k, len(found) - 1)]) for k in range(len(chosen))]
+        are_equal = move_alike and all(
+            bristle.friction(each) == bristle.friction(first)
+            for bristle in bristles
+            for each in models
+        )
+        found = self._simulated(models[:1] if move_alike else models, motion)
+        chosen = models[:1] if are_equal else models
+        acts = [np.array(found[0 if move_alike else k]) for k in range(len(chosen))]
+
+        directions = self.equation.directions(motion.qvel)
         for act, model in zip(acts, chosen, strict=True):
             for bristle in bristles:
-                share = motion.qvel[:, bristle.dof] / self.friction_speeds[bristle.dof]
                 speed = bristle.speed(model, motion.qvel)
-                direction = np.sign(speed) * np.minimum(np.abs(share), 1.0)
+                direction = np.sign(speed) * np.abs(directions[:, bristle.dof])
                 act[:, bristle.address] = bristle.deflection(model, speed, direction)
         return acts
 
     def _simulated(self, models: Sequence[Any], motion: MeasuredMotion) -> list[Array]:
-        """(n, na) activations at joints that are held, for each model or for all together."""
-        system = self.system
-        same = all(
-            np.array_equal(model.actuator_dynprm, models[0].actuator_dynprm) for model in models
-        )
+        """(n, na) activations along a motion for each model, at joints that are held."""
         recording = motion.recording
         found = simulated_activations(
-            system.plant.simulator,
-            models[:1] if same else models,
-            system.nominal_initial_state,
+            self.system.plant.simulator,
+            models,
+            self.system.nominal_initial_state,
             recording.ctrl,
         )
         samples = recording.dt * np.arange(found.shape[1])

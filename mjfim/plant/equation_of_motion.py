@@ -180,11 +180,22 @@ class EquationOfMotion:
             slope += (power + 2) * polynomial[:, power] * speed ** (power + 1)
         return timestep * slope * points.acceleration
 
+    def directions(self, speed: Array) -> Array:
+        """Directions of dry friction along a motion.
+
+        Args:
+            speed: (n, nv) velocities [m/s or rad/s].
+
+        Returns:
+            (n, nv) the signs of the velocities, and numbers between -1 and 1 near rest.
+        """
+        share = speed / np.maximum(self.friction_speeds, np.finfo(float).tiny)
+        return np.asarray(np.clip(share, -1.0, 1.0))
+
     def _friction(self, model: Any, points: MotionPoints) -> Array:
         """(n, nv) forces of dry friction of joints and tendons."""
         speed = self.simulator.space.split(points.states)[1]
-        share = np.clip(speed / np.maximum(self.friction_speeds, np.finfo(float).tiny), -1.0, 1.0)
-        friction = -model.dof_frictionloss * share
+        friction = -model.dof_frictionloss * self.directions(speed)
         if not model.tendon_frictionloss.any():
             return np.asarray(friction)
 

@@ -94,7 +94,7 @@ class MissingTerm:
 
     @property
     def key(self) -> str:
-        """What identifies the term; see `key_of_term`."""
+        """Key of the term; see `key_of_term`."""
         return key_of_term(self.path, self.description, self.joints)
 
     def contains(self, other: MissingTerm) -> bool:
@@ -205,7 +205,7 @@ class TermTestData:
 
 
 def key_of_term(path: str, description: str, joints: Sequence[str]) -> str:
-    """What identifies a term among those of one model.
+    """Key that identifies a term among those of one model.
 
     A term at several joints has the path of the term of its first joint, so that its path alone
     does not identify it. Which joint is the first one depends on the data.

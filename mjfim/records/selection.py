@@ -161,7 +161,7 @@ class SelectionStep:
 
     @property
     def key(self) -> str:
-        """What identifies the term; see `key_of_term`."""
+        """Key of the term; see `key_of_term`."""
         return key_of_term(self.path, self.description, self.joints)
 
     @property

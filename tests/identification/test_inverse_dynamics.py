@@ -338,14 +338,43 @@ def _without(log: Recording, joint: str) -> Recording:
     )
 
 
-@pytest.mark.parametrize("kind", ["stribeck", "lugre"])
-def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: Path) -> None:
+def slow_servo(folder: Path, kind: str, parameters: dict[str, Any]) -> Experiment:
+    """A servo with friction that has a bristle of some kind.
+
+    Args:
+        folder: Where its model is written.
+        kind: Kind of the friction in the library of terms.
+        parameters: Tables of the unknowns.
+    """
     text = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
       <body><joint name="j" axis="0 1 0" damping="0.3" frictionloss="0.5"/>
         <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
       <actuator><position name="s" joint="j" kp="300" kv="10"/></actuator>
       <sensor><actuatorfrc name="torque" actuator="s"/></sensor></mujoco>"""
-    (tmp_path / "servo.xml").write_text(text, encoding="utf-8")
+    (folder / "servo.xml").write_text(text, encoding="utf-8")
+    return Experiment(
+        model="servo.xml",
+        directory=folder,
+        source="servo",
+        rate=500.0,
+        parameters=parameters,
+        noise={"qpos:j": 1e-5, "torque": 1e-3},
+        terms={"bristle": {"kind": kind, "joint": "j"}},
+    )
+
+
+def slow_log(system: System, theta: Array, seconds: float) -> Recording:
+    """A log of the servo at theta under a slow multisine."""
+    rng = np.random.default_rng(0)
+    t = np.arange(round(500.0 * seconds) + 1) / 500.0
+    ctrl = 0.6 * multisine(t[:-1], 1, 0.1, 4, rng)
+    y = system.plant.measure(theta[None], ctrl)[0][0]
+    y = y + rng.standard_normal(y.shape) * system.noise.sigma
+    return Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
+
+
+@pytest.mark.parametrize("kind", ["stribeck", "lugre"])
+def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: Path) -> None:
     coulomb = {"stribeck": "joint/j:frictionloss", "lugre": "term/bristle:coulomb"}[kind]
     parameters = {
         "damping": {"target": "joint/j:damping", "guess": 0.1},
@@ -353,24 +382,11 @@ def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: P
         "excess": {"target": "term/bristle:excess"},
         "speed": {"target": "term/bristle:speed"},
     }
-    experiment = Experiment(
-        model="servo.xml",
-        directory=tmp_path,
-        source="servo",
-        rate=500.0,
-        parameters=parameters,
-        noise={"qpos:j": 1e-5, "torque": 1e-3},
-        terms={"bristle": {"kind": kind, "joint": "j"}},
-    )
+    experiment = slow_servo(tmp_path, kind, parameters)
     system = System.resolve(experiment, threads=1)
     true = np.array([0.3, 0.5, 0.4, 0.15])
 
-    rng = np.random.default_rng(0)
-    t = np.arange(6001) / 500.0
-    ctrl = 0.6 * multisine(t[:-1], 1, 0.1, 4, rng)
-    y = system.plant.measure(true[None], ctrl)[0][0]
-    y = y + rng.standard_normal(y.shape) * system.noise.sigma
-    log = Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log.csv")
+    log = slow_log(system, true, 12.0)
 
     # The guess has no excess, so that the rows do not depend on the Stribeck speed there.
     assert system.parameters.guess[2] == 0.0
@@ -399,35 +415,17 @@ def stribeck_servo(folder: Path, **of_friction: dict[str, Any]) -> tuple[Experim
         folder: Where its model is written.
         of_friction: Tables of the excess and the speed that differ from the usual ones.
     """
-    text = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
-      <body><joint name="j" axis="0 1 0" damping="0.3" frictionloss="0.5"/>
-        <inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody>
-      <actuator><position name="s" joint="j" kp="300" kv="10"/></actuator>
-      <sensor><actuatorfrc name="torque" actuator="s"/></sensor></mujoco>"""
-    (folder / "servo.xml").write_text(text, encoding="utf-8")
-    experiment = Experiment(
-        model="servo.xml",
-        directory=folder,
-        source="servo",
-        rate=500.0,
-        parameters={
-            "excess": of_friction.get("excess", {"target": "term/bristle:excess"}),
-            "speed": of_friction.get("speed", {"target": "term/bristle:speed"}),
-        },
-        noise={"qpos:j": 1e-5, "torque": 1e-3},
-        terms={"bristle": {"kind": "stribeck", "joint": "j"}},
-    )
+    parameters = {
+        "excess": of_friction.get("excess", {"target": "term/bristle:excess"}),
+        "speed": of_friction.get("speed", {"target": "term/bristle:speed"}),
+    }
+    experiment = slow_servo(folder, "stribeck", parameters)
     true = {"kind": "stribeck", "joint": "j", "values": {"excess": 0.4, "speed": 0.15}}
     damping = {"damping": {"target": "joint/j:damping"}}
     stated = experiment.model_dump(exclude_unset=True)
     robot = experiment.restated({**stated, "parameters": damping, "terms": {"bristle": true}})
     system = System.resolve(robot, threads=1)
-    rng = np.random.default_rng(0)
-    t = np.arange(4001) / 500.0
-    ctrl = 0.6 * multisine(t[:-1], 1, 0.1, 4, rng)
-    y = system.plant.measure(system.parameters.guess[None], ctrl)[0][0]
-    y = y + rng.standard_normal(y.shape) * system.noise.sigma
-    return experiment, Recording(t=t, ctrl=ctrl, y=y, outputs=system.outputs.names, name="log")
+    return experiment, slow_log(system, system.parameters.guess, 8.0)
 
 
 EXCESS, SPEED = {"target": "term/bristle:excess"}, {"target": "term/bristle:speed"}
