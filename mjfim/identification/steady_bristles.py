@@ -16,7 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.model.servos import actuator_gear
-from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN
+from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN, bristle_actuators
 
 # Columns of the friction of a `dcmotor` in its bias: Coulomb, static, Stribeck speed.
 FRICTION_COLUMNS = slice(3, 6)
@@ -70,13 +70,11 @@ def bristles_of(model: Any) -> tuple[Bristle, ...]:
     Args:
         model: The compiled model (`mujoco.MjModel`).
     """
-    is_device = model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_DCMOTOR)
-    is_device = is_device & (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
-    is_device &= (model.actuator_ctrlnum == 0) & (model.actuator_actnum == 1)
-    is_device &= model.actuator_dynprm[:, BRISTLE_STIFFNESS_COLUMN] > 0.0
     scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
     found = []
-    for actuator in np.flatnonzero(is_device).tolist():
+    for actuator in bristle_actuators(model):
+        if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+            continue
         joint = int(model.actuator_trnid[actuator, 0])
         if int(model.jnt_type[joint]) in scalar:
             found.append(

@@ -136,6 +136,18 @@ def actuator_force_sizes(model: Any, time: float) -> Array:
     return sizes
 
 
+def bristle_actuators(model: Any) -> list[int]:
+    """Numbers of the `dcmotor` actuators without control whose only activation is a bristle.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
+    has_bristle = model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_DCMOTOR)
+    has_bristle = has_bristle & (model.actuator_dynprm[:, BRISTLE_STIFFNESS_COLUMN] > 0.0)
+    has_bristle &= (model.actuator_ctrlnum == 0) & (model.actuator_actnum == 1)
+    return [int(actuator) for actuator in np.flatnonzero(has_bristle)]
+
+
 def bristle_sizes(model: Any, time: float) -> dict[int, float]:
     """Natural deflections of the bristles of friction in `dcmotor` actuators without control.
 
@@ -148,15 +160,12 @@ def bristle_sizes(model: Any, time: float) -> dict[int, float]:
     Returns:
         The larger of both deflections, by its address in the activations [m or rad].
     """
-    dcmotor = int(mujoco.mjtDyn.mjDYN_DCMOTOR)
     found = {}
-    for actuator in np.flatnonzero(model.actuator_dyntype == dcmotor).tolist():
+    for actuator in bristle_actuators(model):
         stiffness = float(model.actuator_dynprm[actuator, BRISTLE_STIFFNESS_COLUMN])
-        has_control = bool(model.actuator_ctrlnum[actuator])
-        if stiffness > 0.0 and not has_control and int(model.actuator_actnum[actuator]) == 1:
-            under_force = _actuator_force_size(model, actuator, time) / stiffness
-            way = _transmission_size(model, actuator) / time * float(model.opt.timestep)
-            found[int(model.actuator_actadr[actuator])] = max(under_force, way)
+        under_force = _actuator_force_size(model, actuator, time) / stiffness
+        way = _transmission_size(model, actuator) / time * float(model.opt.timestep)
+        found[int(model.actuator_actadr[actuator])] = max(under_force, way)
     return found
 
 
