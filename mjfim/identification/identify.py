@@ -57,9 +57,9 @@ from mjfim.records.events import FitEvent
 from mjfim.records.progress import begin_stage, shown_progress
 from mjfim.records.recording import Recording
 
-# Shares of the segments, or of each one of few, on which combinations without effect are searched
-# for before all of them.
-SHARES_THAT_DETERMINE = (0.2, 0.5)
+# Shares of the segments, or of each one of few, on which one difference step is tried before two of
+# them on all data.
+SHARES_THAT_DETERMINE = (0.2, 0.5, 1.0)
 
 # A smaller share that is tried first where it has enough segments.
 SMALL_SHARE = 0.05
@@ -378,9 +378,10 @@ def _begin_near(problem: FitProblem, begin: UnknownValues, near: FitResult) -> U
     found, layout = near.solution.unknowns, near.problem.layout
 
     # With a delay among the parameters, segments begin earlier, and their initial states are
-    # others.
+    # others. A joint or an actuator more has further states.
     begins = [segment.begin for segment in near.problem.segments]
-    if begins == [segment.begin for segment in problem.segments]:
+    is_same_begin = begins == [segment.begin for segment in problem.segments]
+    if is_same_begin and begin.private.shape == found.private.shape:
         begin = replace(begin, private=found.private)
 
     # A parameter with a value for each recording keeps these values.

@@ -459,6 +459,7 @@ class FitSearch:
             curved_rows=problem.curved_rows,
             begins_near=self.begins_near,
             in_true_deviations=True,
+            lengthens=self.task.settings.loss != "linear",
         )
         if not self._is_much(problem):
             return settings

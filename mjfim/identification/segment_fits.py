@@ -260,16 +260,24 @@ def problem_of_segments(
     """
     fit = system.experiment.fit.model_copy(update={"segments": length})
     experiment = system.experiment.model_copy(update={"fit": fit})
+    cut = replace(system, experiment=experiment)
+    is_same_model = system is task.system
     try:
-        part = FitProblem.of(replace(system, experiment=experiment), task.recordings)
+        part = FitProblem.of(cut, task.recordings, calibrated=not is_same_model)
+        if part.system.dt != problem.system.dt:
+            return FitProblem.of(cut, task.recordings) if is_same_model else part
     except RecordingError:
         return None
 
     # Workers then receive no recording twice.
     part = replace(part, workers=problem.workers)
-    if part.system.dt != problem.system.dt:
-        return part
-    return replace(part, simulation=replace(part.simulation, recordings=problem.recordings))
+    simulation = replace(part.simulation, recordings=problem.recordings)
+
+    # The difference steps of the whole recordings suit the same model over segments.
+    if is_same_model:
+        plant = problem.system.plant
+        simulation = replace(simulation, system=replace(simulation.system, plant=plant))
+    return replace(part, simulation=simulation)
 
 
 def _pinned(
@@ -323,6 +331,8 @@ def _fit_segments(
         tolerance=SEGMENT_TOLERANCE,
         relinearise_at_end=False,
         rough_share=SEGMENT_ROUGH_SHARE,
+        stagnant_share=SEGMENT_ROUGH_SHARE,
+        lengthens=search.task.settings.loss != "linear",
     )
     phase = f"segments of {length:.2g} s"
     try:

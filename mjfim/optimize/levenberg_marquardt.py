@@ -80,6 +80,14 @@ ASSUMED_LENGTH = 1.0
 # A step is complete if the predicted step is shorter than this multiple of it.
 COMPLETE_STEP = 1.1
 
+# A step is as long as a rejected one, and not simulated, if it is at least this share of it.
+SAME_LENGTH = 0.99
+
+# Ratio of the actual to the predicted decrease above which a step is lengthened, and the largest
+# factor by which it is.
+MIN_RATIO_TO_LENGTHEN = 1.2
+MAX_LENGTHENING = 3.0
+
 # Difference of the ratio of the actual to the predicted decrease from 1, below which the cost falls
 # as the linearisation predicts.
 LINEAR_RATIO_TOLERANCE = 0.1
@@ -265,6 +273,11 @@ class SearchSettings:
             searched for. False for formal standard deviations.
         cost_to_beat: Cost above which a minimum is of no use. The search ends where its linearised
             cost stays clearly above it.
+        lengthens: Whether a step is lengthened where the cost falls by more than predicted. Robust
+            losses are linearised by weights that make the linearised cost too steep, so that steps
+            are too short.
+        stagnant_share: Decrease of the cost, as a share of it, below which an iteration counts as
+            stagnant. It serves searches that need not converge; 0 for the others.
     """
 
     max_iterations: int = 60
@@ -277,6 +290,8 @@ class SearchSettings:
     begins_near: bool = False
     in_true_deviations: bool = False
     cost_to_beat: float = np.inf
+    lengthens: bool = False
+    stagnant_share: float = 0.0
 
 
 Callback = Callable[[IterationReport], None]
@@ -403,6 +418,7 @@ class _Search:
         self.iteration += 1
         self.scale = np.maximum(self.scale, self.condensed.column_norms)
 
+        begin = self.unknowns
         trial = self._accepted_trial()
         if isinstance(trial, Solution):
             return trial
@@ -440,7 +456,30 @@ class _Search:
             )
 
         self._relax_damping(trial.ratio)
+        if self.settings.lengthens:
+            self._lengthen(begin, trial)
         return self._linearise()
+
+    def _lengthen(self, begin: UnknownValues, trial: _Trial) -> None:
+        """Go further along a step along which the cost fell by more than predicted, if it falls.
+
+        A parabola through both costs, with the slope of the linearisation, has its minimum at
+        `1 / (2 - ratio)` of the step.
+
+        Args:
+            begin: Unknowns at the begin of the step.
+            trial: The accepted step.
+        """
+        if trial.ratio < MIN_RATIO_TO_LENGTHEN or self.budget.exhausted is not None:
+            return
+        factor = MAX_LENGTHENING
+        if trial.ratio < 2.0:
+            factor = min(1.0 / (2.0 - trial.ratio), MAX_LENGTHENING)
+        further = self.problem.moved(begin, trial.step, factor * trial.fraction)
+        cost = self.problem.cost(further)
+        if cost < self.cost:
+            self.unknowns, self.cost = further, cost
+            self.iterates[-1] = replace(further, private=further.private[:1])
 
     def _accepted_trial(self) -> _Trial | Solution:
         """Raise the damping until a step lowers the cost.
@@ -459,11 +498,23 @@ class _Search:
             if small or self.damping > MAX_DAMPING or not self.settings.damped:
                 return self._without_progress(self._predicted_step())
 
-            self.damping = max(self.damping, MIN_RAISED_DAMPING) * self.damping_growth
-            self.damping_growth *= 2.0
+            self._raise_damping(trial.step)
 
             if (reason := self.budget.exhausted) is not None:
                 return self._stopped(reason)
+
+    def _raise_damping(self, rejected: Step) -> None:
+        """Raise the damping until the step is shorter than a rejected one.
+
+        Weak damping hardly changes a step, so that the simulation at its end would tell nothing.
+        """
+        while self.damping <= MAX_DAMPING:
+            self.damping = max(self.damping, MIN_RAISED_DAMPING) * self.damping_growth
+            self.damping_growth *= 2.0
+            step = self._step(self.damping)
+            is_shorter = step.common_length < SAME_LENGTH * rejected.common_length
+            if is_shorter or step.private_length < SAME_LENGTH * rejected.private_length:
+                break
 
     def _trial(self) -> _Trial:
         """Evaluate a step with the current damping.
@@ -540,20 +591,23 @@ class _Search:
         # below the true accuracy.
         most = MAX_STAGNANT_ITERATIONS
         if not self.settings.relinearise_at_end:
-            # Long iterations are not worth a small share of the true standard deviations.
+            # Long iterations are not worth a small share of the true standard deviations. Where
+            # the linearisation predicts no more either, a single one is enough.
             negligible = absolute * self.unit**2
-            most = MAX_ROUGH_ITERATIONS
+            is_predicted = predicted.predicted_decrease <= negligible
+            most = 1 if self.unit > 1.0 and is_predicted else MAX_ROUGH_ITERATIONS
         elif self.unit > 1.0:
             negligible *= self.unit**2
             most = MAX_ROUGH_ITERATIONS
         else:
             negligible = min(negligible, PREDICTED_STAGNATION * predicted.predicted_decrease)
+        negligible = max(negligible, self.settings.stagnant_share * self.cost)
         if self.cost - trial.cost <= negligible:
             self.stagnant_iterations += 1
         else:
             self.stagnant_iterations = 0
 
-        return self.stagnant_iterations == most
+        return self.stagnant_iterations >= most
 
     def _converged(self, trial: _Trial, predicted: Step) -> bool:
         """Whether the step that was taken is the last one."""

@@ -187,6 +187,15 @@ def test_segments_share_the_recordings_of_the_whole_problem(tmp_path: Path) -> N
     assert len(part.segments) == 4
     assert all(a is b for a, b in zip(part.recordings, problem.recordings, strict=True))
 
+    # The steps of the differences suit both, and are calibrated once. Another model has its own.
+    assert part.system.plant is problem.system.plant
+    assert part.system.experiment.fit.segments == 1.0
+    other = problem_of_segments(problem, task, replace(task.system), 1.0)
+    assert other is not None
+    steps, calibrated = (each.system.plant.derivatives.parameter_scale for each in (part, other))
+    assert other.system.plant is not problem.system.plant
+    np.testing.assert_allclose(steps, calibrated, rtol=1e-12)
+
 
 def test_segments_are_shares_of_the_recording_with_enough_rows(tmp_path: Path) -> None:
     system = pendulum(tmp_path, 12.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import mjfim
 from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
 from mjfim.identification.identify import fit_task, refit_task
 from mjfim.identification.missing_terms import TermTests
 from mjfim.identification.report import FitResult, estimate_from
@@ -19,6 +21,7 @@ from mjfim.identification.task import FitTask
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
 from tests.support.paths import ROOT
+from tests.support.terms import experiment_of, motor_torque, recorded
 
 # Zeros of the angle in two recordings [rad], which are 20 standard deviations of its noise apart.
 BIASES = (0.5, -0.5)
@@ -65,6 +68,27 @@ def test_the_cheaper_one_of_two_starts_is_taken(fitted: FitResult) -> None:
     for other, expected in ((None, far), (fitted.theta, fitted.theta), (1.5 * far, far)):
         again = refit_task(searched(task), fitted, other_start=other)
         np.testing.assert_array_equal(again.solution.iterates[0].theta[:3], expected[:3])
+
+
+def test_a_model_with_more_states_begins_at_its_own_initial_states(tmp_path: Path) -> None:
+    """Backlash adds a joint, whose initial states a fit without it does not have."""
+    segments = {"segments": 0.5, "start": "measured", "bootstrap": 0}
+    known = {"damping": {"target": "joint/pivot:damping", "true": 0.01, "guess": 0.01}}
+    plain = experiment_of(tmp_path, "tilt", parameters=known, terms={}, fit=segments)
+    richer = experiment_of(
+        tmp_path,
+        "backlash",
+        fit=segments,
+        parameters={**known, "gap": {"target": "term/extra:gap", "true": 0.06, "guess": 0.03}},
+    )
+    recording = recorded(System.resolve(plain), motor_torque(2.0, 100.0), 0)
+    fitted = fit_task(searched(FitTask.resolve(plain, [recording])))
+    task = FitTask.resolve(richer, [recording])
+    widths = [each.simulation.private_count for each in (fitted.problem, task.problem())]
+    assert widths == [2, 4]
+    again = refit_task(searched(task), fitted, other_start=np.array([0.01, 0.01]))
+    assert again.solution.unknowns.private.shape == (len(fitted.problem.segments), 4)
+    assert np.isfinite(again.solution.cost)
 
 
 def test_known_tests_of_terms_are_not_repeated(

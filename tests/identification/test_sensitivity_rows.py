@@ -16,7 +16,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.identify import _unseen_directions
+from mjfim.identification.identify import SHARES_THAT_DETERMINE, _unseen_directions
 from mjfim.identification.segment_simulation import SegmentBatch
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import FitTask
@@ -84,6 +84,33 @@ def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> N
     between = problem.system.plant.engine_steps
     assert _unseen_directions(task, problem).count == 0
     assert problem.system.plant.engine_steps - between < 0.2 * (between - before)
+
+
+def test_what_all_recordings_determine_only_together_takes_one_difference_step() -> None:
+    """The first halves of the recordings do not determine the last parameter, all of them do."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
+    design = DesignTask.resolve(experiment, threads=1)
+    recording = simulate_system(design.system, design.initial, 0)
+    task = FitTask.resolve(experiment, [recording], threads=1)
+    whole = task.problem()
+    samples_of_all = whole.sample_count
+    count = len(task.start)
+    asked: list[bool] = []
+
+    def rows(
+        problem: FitProblem, at: Any, *, with_error: bool, wanted: Any
+    ) -> list[tuple[Array, Array]]:
+        """The last parameter has no effect on a part of the data."""
+        asked.append(with_error)
+        J = 1e3 * np.eye(count) / task.system.parameters.magnitude
+        J[-1, -1] *= problem.sample_count == samples_of_all
+        J[-1, 0] = 1e3 / task.system.parameters.magnitude[0]
+        return [(J, np.zeros_like(J))]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mjfim.identification.identify.sensitivity_rows", rows)
+        assert _unseen_directions(task, whole).count == 0
+    assert asked == [False] * len(SHARES_THAT_DETERMINE)
 
 
 def test_an_effect_that_may_be_round_off_is_tested_with_its_error(

@@ -15,12 +15,15 @@ from scipy.optimize import least_squares
 from mjfim.budget import Budget, StopToken
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (
+    ABSOLUTE_STAGNATION,
+    SAME_LENGTH,
     IterationReport,
     SearchSettings,
     Solution,
     UnknownValues,
     minimise,
 )
+from mjfim.optimize.robust_losses import RobustLoss
 from tests.support.numerics import Array
 
 Rows = Callable[[Array, Array], Array]
@@ -547,3 +550,118 @@ def test_a_search_ends_where_it_cannot_beat_a_cost() -> None:
     )
     assert beaten is not None and beaten.success
     assert beaten.cost == pytest.approx(exact.cost)
+
+
+@dataclass(eq=False)
+class Robust(Analytic):
+    """Residuals under a robust loss, which is linearised by weights.
+
+    Attributes:
+        loss: The loss.
+        linearisations: Number of linearisations.
+    """
+
+    loss: RobustLoss = RobustLoss(kind="soft_l1", scale=1.0)
+    linearisations: int = 0
+
+    def cost(self, at: UnknownValues) -> float:
+        self.seen.append(at)
+        return 0.5 * sum(self.loss.value(r) for r in self.residuals(at))
+
+    def condense(self, at: UnknownValues) -> Condensed | None:
+        self.linearisations += 1
+        weights = [self.loss.weight(r) for r in self.residuals(at)]
+        weighted = tuple(
+            lambda theta, private, rows=rows, w=w: w * rows(theta, private)
+            for rows, w in zip(self.segments, weights, strict=True)
+        )
+        return Analytic(weighted, self.lower, self.upper).condense(at)
+
+
+def outliers() -> Robust:
+    """A parabola with noise of one standard deviation, a third of whose values are far too high."""
+    rng = np.random.default_rng(3)
+    t = np.linspace(-1.0, 1.0, 300)
+    A = np.stack([np.ones(300), t, t**2], axis=1)
+    y = A @ [5.0, -30.0, 20.0] + rng.standard_normal(300) + 25.0 * (rng.random(300) < 0.33)
+
+    def rows(theta: Array, private: Array) -> Array:
+        return A @ theta - y
+
+    return Robust((rows,), np.full(3, -FREE), np.full(3, FREE))
+
+
+def test_longer_steps_reach_the_minimum_of_a_robust_loss_sooner() -> None:
+    start = alone(0.0, 0.0, 0.0)
+    plain, longer = outliers(), outliers()
+    found = minimise(plain, start, SearchSettings(tolerance=1e-6))
+    sooner = minimise(longer, start, SearchSettings(tolerance=1e-6, lengthens=True))
+    assert found is not None and sooner is not None and sooner.success
+    assert longer.linearisations < 0.75 * plain.linearisations
+    expected = least_squares(
+        lambda theta: longer.segments[0](theta, np.zeros(0)),
+        start.theta,
+        loss="soft_l1",
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-14,
+    ).x
+    np.testing.assert_allclose(sooner.unknowns.theta, expected, rtol=0.0, atol=1e-4)
+    assert sooner.cost == longer.cost(sooner.unknowns)
+
+    # The iterates are those at which the search went on.
+    costs = [longer.cost(at) for at in sooner.iterates]
+    assert costs == sorted(costs, reverse=True)
+
+
+def test_steps_that_damping_hardly_changes_are_not_tried_twice() -> None:
+    p = problem(cliff, lower=[-10.0])
+    found = minimise(p, alone(3.0), SearchSettings(tolerance=1e-9, begins_near=True))
+    assert found is not None and found.success
+    assert found.unknowns.theta[0] == pytest.approx(0.25, rel=1e-6)
+
+    # With a damping of 1e-6, doubling alone would repeat the first step many times.
+    lengths = np.array([abs(float(at.theta[0]) - 3.0) for at in p.seen[1:]])
+    is_rejected = np.array([not np.isfinite(p.cost(at)) for at in p.seen[1:]])
+    last = int(np.flatnonzero(is_rejected)[0])
+    rejected = lengths[last : last + int(np.argmin(is_rejected[last:]))]
+    assert len(rejected) > 1
+    assert (rejected[1:] <= SAME_LENGTH * rejected[:-1]).all()
+
+
+def _with_all_segments(iterates: tuple[UnknownValues, ...], count: int) -> list[UnknownValues]:
+    """Iterates of a search without private unknowns, with entries for all segments again."""
+    return [UnknownValues(theta=at.theta, private=np.zeros((count, 0))) for at in iterates]
+
+
+def test_one_stagnant_iteration_is_enough_where_no_more_is_predicted() -> None:
+    start = UnknownValues(theta=np.array([60.0, 0.3]), private=np.zeros((40, 0)))
+    settings = SearchSettings(
+        tolerance=1e-9, in_true_deviations=True, relinearise_at_end=False, begins_near=True
+    )
+    p = drifting(0)
+    found = minimise(p, start, settings)
+    exact = minimise(drifting(0), start, SHARP)
+    assert found is not None and exact is not None and found.success
+    assert found.status == "converged: the residual stopped falling"
+
+    # Only the last decrease is below a hundredth of the square of a true standard deviation.
+    negligible = ABSOLUTE_STAGNATION * 2.0 * found.condensed.true_deviation**2
+    costs = [p.cost(at) for at in _with_all_segments(found.iterates, 40)] + [found.cost]
+    is_negligible = -np.diff(costs) <= negligible
+    assert is_negligible[-1]
+    assert not is_negligible[:-1].any()
+
+    # What is missed is far below the true accuracy.
+    H = exact.condensed.information()
+    missed = found.unknowns.theta - exact.unknowns.theta
+    assert np.sqrt(missed @ H @ missed) < 0.15 * found.condensed.true_deviation
+
+
+def test_a_search_that_leads_to_a_start_ends_where_its_cost_hardly_falls() -> None:
+    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
+    whole, ended = (problem(*decays(), lower=[0.0, -5.0]) for _ in range(2))
+    exact = solved(whole, start, SearchSettings())
+    found = solved(ended, start, SearchSettings(stagnant_share=0.9))
+    assert found.iterations < exact.iterations
+    assert exact.cost <= found.cost < whole.cost(start)
