@@ -561,7 +561,7 @@ class Robust(Analytic):
         linearisations: Number of linearisations.
     """
 
-    loss: RobustLoss = RobustLoss(kind="soft_l1", scale=1.0)
+    loss: RobustLoss = field(default_factory=lambda: RobustLoss(kind="soft_l1", scale=1.0))
     linearisations: int = 0
 
     def cost(self, at: UnknownValues) -> float:
