@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +19,8 @@ from mjfim.identification.continuation import WholeFit, continued_fit
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.identify import identify_system
-from mjfim.identification.searches import FitSearch
+from mjfim.identification.residual_tests import RELEVANT_SIZE_RATIO, is_larger_than_noise
+from mjfim.identification.searches import JUDGED_ROUGH_SHARE, FitSearch
 from mjfim.identification.segment_fits import (
     MIN_ROWS,
     SegmentFits,
@@ -25,7 +29,7 @@ from mjfim.identification.segment_fits import (
 )
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
-from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
+from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution, minimise
 from mjfim.plant.noise import Noise
 from mjfim.records.estimate import Estimate, Restart
 from mjfim.records.events import FitEvent
@@ -47,6 +51,9 @@ PENDULUM = """<mujoco>
 COM = {"target": "body/arm:ipos[2]", "guess": -0.4, "true": -0.4}
 DAMPING = {"target": "joint/hinge:damping", "guess": 0.002, "true": 0.002, "bounds": [0.0, 1.0]}
 RATE = 50.0
+
+# Mean square of residuals that are just large enough for a misfit [squared deviations of the noise].
+JUST_LARGER = 1.001 * RELEVANT_SIZE_RATIO**2
 
 # Factors by which the start is wrong, of the centre of mass and of the damping.
 START = (0.5, 0.5)
@@ -297,3 +304,77 @@ def test_the_cost_of_a_fit_with_other_noise_is_compared_with_the_noise_of_the_fi
     assert found.restart is not None
     assert found.restart.cost == pytest.approx(descent.problem.cost(found.solution.unknowns))
     assert found.restart.cost > 2.0 * found.solution.cost
+
+
+@pytest.mark.parametrize(
+    ("share", "went_on"),
+    [
+        pytest.param(1.1, [], id="a dearer fit does not matter"),
+        pytest.param(0.9995, ["nearer", "converged"], id="hardly cheaper"),
+        pytest.param(0.99, ["nearer"], id="a little cheaper"),
+        pytest.param(0.9, [], id="clearly cheaper"),
+    ],
+)
+def test_a_first_fit_goes_on_until_it_can_be_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, went_on: list[str]
+) -> None:
+    """Its cost may still fall by 2 %, and where the search has gone on, by 0.1 %."""
+    descent = Descent(tmp_path)
+    first = descent.fit(1, rough=True)
+    again = descent.fit(2)
+    asked: list[str] = []
+
+    def step(name: str) -> Callable[..., tuple[FitProblem, Solution]]:
+        def go_on(problem: FitProblem, solution: Solution) -> tuple[FitProblem, Solution]:
+            asked.append(name)
+            return problem, solution
+
+        return go_on
+
+    search: Any = SimpleNamespace(nearer=step("nearer"), converged=step("converged"))
+    monkeypatch.setattr(continuation, "_cost", lambda *_: share * first.solution.cost)
+    continuation._as_near_as_needed(search, first, again)
+    assert asked == went_on
+
+    # A fit that has converged is as near as it can be.
+    asked.clear()
+    solution = replace(first.solution, rough=False)
+    continuation._as_near_as_needed(search, replace(first, solution=solution), again)
+    assert not asked
+
+
+@pytest.mark.parametrize(
+    ("chi2", "is_stated", "clearly"),
+    [(2.0, True, True), (2.0, False, False), (1.0, True, False), (JUST_LARGER, True, False)],
+)
+def test_residuals_miss_the_data_clearly_if_they_do_so_also_at_the_minimum(
+    tmp_path: Path, chi2: float, is_stated: bool, clearly: bool
+) -> None:
+    descent = Descent(tmp_path)
+    fit = descent.fit(2)
+    dof = 100_000
+    quality = replace(fit.quality, chi2=chi2 * dof, dof=dof)
+    task: Any = SimpleNamespace(noise_is_stated=is_stated)
+    assert continuation._clearly_misses(task, replace(fit, quality=quality)) == clearly
+
+    # The small excess is significant, but may vanish on the way to the minimum.
+    assert is_larger_than_noise(JUST_LARGER * dof, dof)
+
+
+def test_a_search_that_ended_near_the_minimum_goes_on_as_far_as_asked(tmp_path: Path) -> None:
+    descent = Descent(tmp_path)
+    begun = descent.solutions[0]
+    search, problem = descent.search, descent.problem
+    for go_on in (search.nearer, search.converged):
+        assert go_on(problem, begun) == (problem, begun)
+
+    rough = replace(begun, rough=True)
+    near = search.nearer(problem, rough)[1]
+    best = search.converged(problem, rough)[1]
+    assert near.rough and not best.rough
+    assert best.success and best.cost <= near.cost < begun.cost
+    assert near.cost - best.cost < 2.0 * JUDGED_ROUGH_SHARE * near.cost
+
+    # Iterations count together.
+    assert near.iterations > begun.iterations
+    assert search.converged(problem, near)[1].cost == pytest.approx(best.cost)
