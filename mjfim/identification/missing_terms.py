@@ -70,7 +70,7 @@ SMALLEST_NORM = 1e-300
 
 # Largest number of samples that a linearisation by parameters and candidates simulates, over all of
 # its differences. With more data, a part of every recording is enough for the tests.
-MAX_SIMULATED = 300_000
+MAX_SIMULATED = 400_000
 
 # Fewest joints at which terms of one kind are tested together. With fewer, single terms are tried.
 FEWEST_JOINTS = 3

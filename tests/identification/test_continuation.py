@@ -52,7 +52,7 @@ COM = {"target": "body/arm:ipos[2]", "guess": -0.4, "true": -0.4}
 DAMPING = {"target": "joint/hinge:damping", "guess": 0.002, "true": 0.002, "bounds": [0.0, 1.0]}
 RATE = 50.0
 
-# Mean square of residuals that are just large enough for a misfit [squared deviations of the noise].
+# Mean square of whitened residuals that are just large enough for a misfit.
 JUST_LARGER = 1.001 * RELEVANT_SIZE_RATIO**2
 
 # Factors by which the start is wrong, of the centre of mass and of the damping.
