@@ -151,7 +151,8 @@ def fit_to_others(problem: FitProblem, step: LeaveOutStep, budget: Budget) -> Ot
             return OtherFit(unknowns=predicted.unknowns, has_initial_states=has_states)
         starts.append((cost_at_end, end))
 
-    found = minimise(others, min(starts, key=lambda start: start[0])[1], SEARCH, budget)
+    settings = replace(SEARCH, lengthens=problem.loss.kind != "linear")
+    found = minimise(others, min(starts, key=lambda start: start[0])[1], settings, budget)
     if found is None or budget.exhausted is not None:
         return None
     return OtherFit(

@@ -623,7 +623,8 @@ def equivalent_sigmas(explained: float, count: int) -> float:
     """
     if count == 1:
         return float(np.sqrt(max(explained, 0.0)))
-    log_probability = scipy.stats.chi2.logsf(max(explained, 0.0), count)
+    with np.errstate(divide="ignore"):
+        log_probability = np.log(scipy.special.chdtrc(count, max(explained, 0.0)))
 
     # Far out, the probability is below the smallest number. Then its expansion is exact enough
     # (Abramowitz and Stegun, Handbook of Mathematical Functions, 1964, 6.5.32).

@@ -50,8 +50,9 @@ class RobustLoss:
 
         # Variance of the normal distribution truncated at both sides.
         limit = self.outlier_threshold
-        inside = 1.0 - 2.0 * scipy.stats.norm.sf(limit)
-        return float(1.0 - 2.0 * limit * scipy.stats.norm.pdf(limit) / inside)
+        inside = 1.0 - 2.0 * scipy.special.ndtr(-limit)
+        density = np.exp(-0.5 * limit**2) / np.sqrt(2.0 * np.pi)
+        return float(1.0 - 2.0 * limit * density / inside)
 
     def value(self, r: Array) -> float:
         """Sum of the loss over residuals.

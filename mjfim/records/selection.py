@@ -18,6 +18,7 @@ class Decision(Enum):
     BEGUN = "begun"
     ADDED = "added"
     REJECTED = "rejected"
+    UNHELPFUL = "no better fit"
     REMOVED = "removed"
     POOLED = "pooled"
     HELD = "held"
@@ -136,7 +137,8 @@ class SelectionStep:
         path: Target of its parameter; empty for the stated model.
         count: Number of added terms after the step.
         error: Held-out error of the model with the term, or without a removed one [sigma]; NaN
-            where no part of the data could be predicted from the others.
+            where no part of the data could be predicted from the others, and where the fit with the
+            term is no better than without it.
         reduction: Reduction of the mean held-out loss by the term [sigma^2].
         standard_error: Standard error of the reduction [sigma^2].
         sigmas: Size of the term in standard deviations by the score test; 0 where none was made.
@@ -167,11 +169,13 @@ class SelectionStep:
     @property
     def is_kept(self) -> bool:
         """Whether the selection continued with the model of this step."""
-        return self.decision not in (Decision.REJECTED, Decision.KEPT)
+        return self.decision not in (Decision.REJECTED, Decision.UNHELPFUL, Decision.KEPT)
 
     @property
     def is_refuted(self) -> bool:
-        """Whether the term was tried and predicts left-out data no better."""
+        """Whether the term was tried, and fits the data or predicts left-out data no better."""
+        if self.decision is Decision.UNHELPFUL:
+            return True
         return self.decision is Decision.REJECTED and self.reduction <= 0.0
 
 
@@ -235,7 +239,7 @@ class Selection:
         See `key_of_term` for the keys.
         """
         # Only steps that tried to add a term are attempts.
-        attempts = (Decision.ADDED, Decision.REJECTED)
+        attempts = (Decision.ADDED, Decision.REJECTED, Decision.UNHELPFUL)
         last = {step.key: step for step in self.steps if step.path and step.decision in attempts}
         return frozenset(key for key, step in last.items() if step.is_refuted)
 

@@ -239,6 +239,25 @@ def tried_step(candidate: MissingTerm, model: FittedModel, reduction: Reduction)
     )
 
 
+def unhelpful_step(candidate: MissingTerm, count: int) -> SelectionStep:
+    """Step of a term with which the fit is no better, so that left-out data were not predicted.
+
+    Args:
+        candidate: The term.
+        count: Number of terms of the model without it.
+    """
+    return SelectionStep(
+        decision=Decision.UNHELPFUL,
+        description=candidate.description,
+        path=candidate.path,
+        count=count,
+        error=np.nan,
+        sigmas=candidate.sigmas,
+        share=candidate.share,
+        joints=candidate.joints,
+    )
+
+
 def _name_of(path: str, taken: Iterable[str]) -> str:
     """Name of a new parameter, such as `pivot_damping` for `joint/pivot:damping`."""
     place, _, field = path.partition(":")

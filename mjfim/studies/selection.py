@@ -54,6 +54,7 @@ from mjfim.studies.selected_models import (
     selected_term,
     stated_values,
     tried_step,
+    unhelpful_step,
     with_selection,
 )
 from mjfim.studies.simplification import possible_pools
@@ -178,6 +179,21 @@ def select_terms_system(
         steps=system.plant.engine_steps - steps_before,
     )
     return SelectedModel(estimate=estimate, system=selected)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Refit:
+    """A model with a new fit, of which left-out data are not predicted yet.
+
+    Attributes:
+        model: The terms of the model, with an earlier fit.
+        result: The new fit.
+        cost: Its cost with the noise of the fit of the stated model.
+    """
+
+    model: FittedModel
+    result: FitResult
+    cost: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -390,7 +406,8 @@ class _Selector:
             The chosen model, and why no more terms were added.
         """
         length = result.task.settings.segment_length
-        cut = self._assessed(model, first, result)
+        fit = self._costed(model, first, result)
+        cut = None if fit is None else self._assessed(fit, first)
         if cut is None or length is None:
             return replace(model, result=result, tests=None), ending
 
@@ -458,12 +475,11 @@ class _Selector:
         """The model with the one of some terms that predicts best; None where none is better."""
         tried: list[tuple[FittedModel, SelectionStep]] = []
         for candidate in candidates:
-            extended = self._extended(model, first, candidate)
+            attempt = self._tried(model, first, candidate, steps)
             if self._is_stopped():
                 return None
-            if extended is not None:
-                reduction = model.losses.reduction(extended.losses)
-                tried.append((extended, tried_step(candidate, extended, reduction)))
+            if attempt is not None:
+                tried.append(attempt)
 
         # Of the models that do not clearly predict worse than the best one, the one that fits the
         # data best is chosen: the fit uses all data, so that it tells similar terms apart better.
@@ -589,7 +605,7 @@ class _Selector:
         """
         names = model.result.task.system.parameters.names
         values = dict(zip(names, model.result.theta, strict=True))
-        simpler = self._fitted(changed, first, changed.terms, values, {})
+        simpler = self._fitted(changed, first, changed.terms, values)
         if simpler is None:
             return model
 
@@ -612,22 +628,42 @@ class _Selector:
 
     # ---- models
 
-    def _extended(
-        self, model: FittedModel, first: FittedModel, candidate: MissingTerm
-    ) -> FittedModel | None:
-        """The model with one term more; None where it cannot be simulated, or after a stop."""
+    def _tried(
+        self,
+        model: FittedModel,
+        first: FittedModel,
+        candidate: MissingTerm,
+        steps: list[SelectionStep],
+    ) -> tuple[FittedModel, SelectionStep] | None:
+        """The model with one term more, and the step that tried it, before it is decided on.
+
+        None where it cannot be simulated, after a stop, and where it fits the data no better.
+
+        Args:
+            model: The model.
+            first: The stated model.
+            candidate: The term.
+            steps: Receives the step of a term with which the fit is no better.
+        """
         names = model.result.task.system.parameters.names
         term = selected_term(candidate, names)
         values = dict(zip(names, model.result.theta, strict=True))
         starts = {name: parameter.value for name, parameter in term.further.items()}
-        return self._fitted(
-            model,
-            first,
-            (*model.terms, term),
-            values,
-            {term.name: candidate.value, **starts},
-            sizes=_sizes_of(term),
-        )
+        changes = {term.name: candidate.value, **starts}
+        terms = (*model.terms, term)
+        fit = self._refitted(model, first, terms, values, changes, sizes=_sizes_of(term))
+        if fit is None:
+            return None
+
+        # A term that does not even fit the data better need not predict left-out data.
+        if fit.cost >= model.cost:
+            steps.append(unhelpful_step(candidate, len(model.terms)))
+            return None
+        extended = self._assessed(fit, first)
+        if extended is None:
+            return None
+        reduction = model.losses.reduction(extended.losses)
+        return extended, tried_step(candidate, extended, reduction)
 
     def _without(
         self, model: FittedModel, first: FittedModel, term: SelectedTerm
@@ -643,7 +679,7 @@ class _Selector:
         names = model.result.task.system.parameters.names
         values = dict(zip(names, model.result.theta, strict=True))
         terms = tuple(each for each in model.terms if each is not term)
-        return self._fitted(model, first, terms, values, {})
+        return self._fitted(model, first, terms, values)
 
     def _fitted(
         self,
@@ -651,9 +687,23 @@ class _Selector:
         first: FittedModel,
         terms: tuple[SelectedTerm, ...],
         values: dict[str, float],
+    ) -> FittedModel | None:
+        """The stated model with some terms, which the similar model has too, with its losses.
+
+        None where it cannot be simulated, or after a stop. The arguments are those of `_refitted`.
+        """
+        fit = self._refitted(model, first, terms, values, {})
+        return None if fit is None else self._assessed(fit, first)
+
+    def _refitted(
+        self,
+        model: FittedModel,
+        first: FittedModel,
+        terms: tuple[SelectedTerm, ...],
+        values: dict[str, float],
         changes: dict[str, float],
         sizes: Collection[str] = (),
-    ) -> FittedModel | None:
+    ) -> _Refit | None:
         """Fit the stated model with some terms, beginning at the fit of a similar model.
 
         None where it cannot be simulated, or after a stop.
@@ -697,27 +747,34 @@ class _Selector:
             )
         except (InterruptedPassError, SimulationDivergedError):
             return None
-        return self._assessed(replace(model, terms=terms), first, result)
+        return self._costed(replace(model, terms=terms), first, result)
 
-    def _assessed(
-        self, model: FittedModel, first: FittedModel, result: FitResult
-    ) -> FittedModel | None:
-        """A model with a new fit, its losses and its cost; None after a request to stop.
+    def _costed(self, model: FittedModel, first: FittedModel, result: FitResult) -> _Refit | None:
+        """A model with a new fit and its cost; None after a request to stop.
 
         Args:
             model: The terms of the model, with an earlier fit.
             first: The stated model, whose noise weights the cost.
             result: The new fit.
         """
-        losses = self._losses(result, first.result)
         weighted = result.problem.with_noise(first.result.problem.noise)
         try:
             cost = weighted.cost(result.solution.unknowns)
         except InterruptedPassError:
             return None
+        return _Refit(model=model, result=result, cost=cost)
+
+    def _assessed(self, fit: _Refit, first: FittedModel) -> FittedModel | None:
+        """A fitted model with its losses; None after a request to stop.
+
+        Args:
+            fit: The fit.
+            first: The stated model, whose noise weights the losses.
+        """
+        losses = self._losses(fit.result, first.result)
         if losses is None:
             return None
-        return replace(model, result=result, losses=losses, cost=cost, tests=None)
+        return replace(fit.model, result=fit.result, losses=losses, cost=fit.cost, tests=None)
 
     def _tests_of(
         self, model: FittedModel, result: FitResult, first: FittedModel

@@ -312,7 +312,10 @@ def test_every_term_that_was_tried_has_its_name_unless_there_are_very_many() -> 
         ]
         begun = SelectionStep(decision=Decision.BEGUN, error=2.0)
         added = SelectionStep(decision=Decision.ADDED, description="friction", count=1, error=1.0)
-        selection = Selection(terms=(), steps=(begun, *steps, added), ending="")
+
+        # A term with which the fit is no better has no error to draw.
+        no_better = SelectionStep(decision=Decision.UNHELPFUL, description="a spring", error=np.nan)
+        selection = Selection(terms=(), steps=(begun, *steps, no_better, added), ending="")
         drawn = dataclasses.replace(estimate(SMALL), selection=selection)
         axes = plots.selection_figure(drawn).axes[0]
         names = [label.get_text() for label in axes.get_yticklabels()]

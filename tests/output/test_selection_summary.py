@@ -151,6 +151,27 @@ def test_the_rows_that_changed_the_model_stand_out() -> None:
     assert emphases == [Emphasis.NORMAL, Emphasis.NORMAL, Emphasis.STRONG]
 
 
+def test_a_term_with_which_the_fit_is_no_better_has_no_numbers_in_the_table() -> None:
+    unhelpful = SelectionStep(
+        decision=Decision.UNHELPFUL, description="a spring", path="joint/a:stiffness", error=np.nan
+    )
+    selection = Selection(terms=(), steps=(BEGUN, unhelpful), ending="")
+    (table,) = [part for part in describe_selection(selection) if isinstance(part, SummaryTable)]
+    assert [str(cell) for cell in table.rows[1].cells] == [
+        "a spring",
+        "no better fit",
+        "0",
+        "-",
+        "",
+        "",
+    ]
+
+    # It is not tried again, and is no reason for a misfit. The model stays the stated one.
+    assert selection.refuted == {unhelpful.key}
+    assert not unhelpful.is_kept
+    assert selection.errors == (2.0, 2.0)
+
+
 def test_the_verdict_names_the_added_terms() -> None:
     selection = Selection(terms=(SLIDE_FRICTION,), steps=(BEGUN,), ending="No further term.")
     verdict = verdict_of(results.estimate(selection=selection))

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mjfim.budget import Budget
+from mjfim.identification.held_out_losses import Reduction
 from mjfim.identification.missing_terms import TermTests
+from mjfim.records.missing_term import MissingTerm
 from mjfim.records.selection import Decision, SelectionStep
 from mjfim.studies import selection
 from mjfim.studies.selection import EQUAL_COST, _Selector
@@ -128,3 +132,49 @@ def test_terms_are_tried_again_where_the_tests_do_not_hold_at_the_final_fit(
 
     # Terms that left-out data have refuted are not tried a second time.
     assert [keys for _, keys in asked] == ([{refuted.key}] if tries else [])
+
+
+@pytest.mark.parametrize(("cost", "predicts"), [(99.0, True), (100.0, False), (120.0, False)])
+def test_left_out_data_are_predicted_only_with_terms_that_fit_better(
+    monkeypatch: pytest.MonkeyPatch, cost: float, predicts: bool
+) -> None:
+    names = SimpleNamespace(names=("mass",))
+    task = SimpleNamespace(system=SimpleNamespace(parameters=names))
+    losses = SimpleNamespace(
+        error=1.0, reduction=lambda other: Reduction(mean=0.5, standard_error=0.1)
+    )
+    model: Any = SimpleNamespace(
+        result=SimpleNamespace(task=task, theta=np.ones(1)), cost=100.0, terms=(), losses=losses
+    )
+    extended = SimpleNamespace(terms=("friction",), losses=losses)
+    candidate = MissingTerm(
+        description="dry friction of hinge",
+        path="joint/hinge:frictionloss",
+        value=0.1,
+        unit="N m",
+        sigmas=9.0,
+        share=0.4,
+    )
+    fit: Any = selection._Refit(model=model, result=model.result, cost=cost)
+    monkeypatch.setattr(_Selector, "_refitted", lambda *_, **__: fit)
+    asked: list[Any] = []
+
+    def assessed(self: _Selector, fit: Any, first: Any) -> Any:
+        """Keep the fit."""
+        asked.append(fit)
+        return extended
+
+    monkeypatch.setattr(_Selector, "_assessed", assessed)
+    steps: list[SelectionStep] = []
+    found = selector()._tried(model, model, candidate, steps)
+    assert bool(asked) == predicts
+    if predicts:
+        assert found is not None and found[0] is extended
+        assert found[1].reduction == 0.5
+        assert not steps
+        return
+    assert found is None
+    (step,) = steps
+    assert step.decision is Decision.UNHELPFUL
+    assert (step.path, step.count, step.sigmas) == (candidate.path, 0, 9.0)
+    assert np.isnan(step.error)

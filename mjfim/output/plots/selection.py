@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from mjfim.output.plots import style
 from mjfim.records.estimate import Estimate
-from mjfim.records.selection import Decision, Selection, SelectionStep
+from mjfim.records.selection import Decision, SelectionStep
 
 # Characters to which the names of terms are shortened.
 TERM_WIDTH = 40
@@ -35,25 +36,28 @@ def selection_figure(estimate: Estimate) -> Figure:
     """
     selection = estimate.selection
     assert selection is not None
-    rows = _rows(selection)
+
+    # A term with which the fit is no better has no error to draw.
+    steps = [step for step in selection.steps if step.decision is not Decision.UNHELPFUL]
+    rows = _rows(steps)
 
     figure = style.new_figure(FIXED_HEIGHT + ROW_HEIGHT * (len(rows.names) + 1))
     axes = figure.subplots()
     style.format_axes(axes, "error of left-out data [σ of the noise]")
 
     # The line joins the models with which the selection continued.
-    placed = list(zip(selection.steps, rows.places, strict=True))
+    placed = list(zip(steps, rows.places, strict=True))
     kept_rows = iter([row for step, row in placed if step.is_kept])
     for phase in selection.phases:
         errors = [step.error for step in phase]
         at = [next(kept_rows) for _ in phase]
         axes.plot(errors, at, "-o", color=style.IDENTIFIED_COLOUR, markersize=6.0)
 
-    right = LARGEST_DRAWN_RATIO * max(step.error for step in selection.steps if step.is_kept)
+    right = LARGEST_DRAWN_RATIO * max(step.error for step in steps if step.is_kept)
     if np.isnan(right):
         axes.set_xticks([])
     for step, row in placed:
-        if not step.is_kept:
+        if not step.is_kept and not np.isnan(step.error):
             is_beyond = step.error > right
             marker, error = (">", right) if is_beyond else ("x", step.error)
             axes.plot(error, row, marker, color=style.MUTED_COLOUR, markersize=6.0)
@@ -95,9 +99,8 @@ class _Rows:
     places: list[int]
 
 
-def _rows(selection: Selection) -> _Rows:
-    """Place the steps in rows: each in its own one, unless there are too many of them."""
-    steps = selection.steps
+def _rows(steps: Sequence[SelectionStep]) -> _Rows:
+    """Place steps in rows: each in its own one, unless there are too many of them."""
     if sum(not step.is_kept for step in steps) <= MAX_NAMED:
         return _Rows(
             names=[_label(step) for step in steps],

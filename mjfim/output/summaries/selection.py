@@ -23,6 +23,7 @@ WORDS = {
     Decision.BEGUN: "stated model",
     Decision.ADDED: "added",
     Decision.REJECTED: "not better",
+    Decision.UNHELPFUL: "no better fit",
     Decision.REMOVED: "not needed",
     Decision.POOLED: "pooled",
     Decision.HELD: "held at the guess",
@@ -116,8 +117,9 @@ def _table(selection: Selection) -> SummaryTable:
 def _row(step: SelectionStep) -> Row:
     """Row of a step."""
     is_begin = step.decision in (Decision.BEGUN, Decision.SHORTENED)
-    reduction = "" if is_begin else Quantity(value=step.reduction, digits=2)
-    error = "" if is_begin else Quantity(value=step.standard_error, digits=2)
+    is_compared = not is_begin and step.decision is not Decision.UNHELPFUL
+    reduction = "" if not is_compared else Quantity(value=step.reduction, digits=2)
+    error = "" if not is_compared else Quantity(value=step.standard_error, digits=2)
     is_change = step.is_kept and not is_begin
     is_other = step.decision is Decision.REJECTED and step.reduction > step.standard_error
     return Row(
