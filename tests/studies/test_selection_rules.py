@@ -146,7 +146,7 @@ def test_left_out_data_are_predicted_only_with_terms_that_fit_better(
     model: Any = SimpleNamespace(
         result=SimpleNamespace(task=task, theta=np.ones(1)), cost=100.0, terms=(), losses=losses
     )
-    extended = SimpleNamespace(terms=("friction",), losses=losses)
+    extended: Any = SimpleNamespace(terms=("friction",), losses=losses)
     candidate = MissingTerm(
         description="dry friction of hinge",
         path="joint/hinge:frictionloss",
