@@ -149,18 +149,30 @@ def identified(data: Path, measured: MeasuredSet, is_selecting: bool) -> Result:
     return Result(found=found, passes=found.steps / steps, seconds=seconds)
 
 
+def _changes(found: Estimate) -> list[str]:
+    """Terms that a selection added, and parameters that it pooled or held, in words."""
+    selection = found.selection
+    if selection is None:
+        return []
+    words = [term.description for term in selection.terms]
+    words += [f"one {pool.name}" for pool in selection.pooled]
+    return words + [f"{name} held at its guess" for name in selection.held]
+
+
 def row_of(measured: MeasuredSet, result: Result, is_selecting: bool) -> list[str]:
     """Cells of a result."""
     found = result.found
-    terms = found.selection.terms if found.selection is not None else ()
     ratios = [prediction.ratio for prediction in found.predictions if prediction.held_out]
+
+    # A parameter that is held at its guess has no interval.
     halves = 0.5 * np.ptp(found.interval, axis=1) / np.maximum(np.abs(found.theta), 1e-300)
+    halves = halves[[name not in found.held for name in found.parameters]]
     reasons = "; ".join(found.reasons) if found.misfit else "none"
     logs = f"{measured.name}, {len(measured.fitted)} fitted, {len(measured.held_out)} predicted"
     return [
         logs if not is_selecting else "",
         "--select" if is_selecting else "as stated",
-        ", ".join(term.description for term in terms) or "–",
+        ", ".join(_changes(found)) or "–",
         ", ".join(f"{ratio:.3g}" for ratio in ratios),
         f"{100.0 * float(np.median(halves)):.1f} %",
         reasons,
@@ -179,7 +191,7 @@ def main() -> int:
     args = parser.parse_args()
 
     table = Table(title="Measured data of other groups", title_justify="left", show_lines=True)
-    for heading in ("set", "identified", "added terms"):
+    for heading in ("set", "identified", "what changed"):
         table.add_column(heading)
     for heading in ("held-out / published", "median interval", "misfit", "seconds", "passes"):
         table.add_column(heading, justify="right")
