@@ -19,7 +19,13 @@ from mjfim.budget import Budget
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.left_out_parts import SEARCH, LeftOutPart, with_initial_states
 from mjfim.optimize.condensed_least_squares import Condensed
-from mjfim.optimize.levenberg_marquardt import WEAK_DAMPING, Solution, UnknownValues, minimise
+from mjfim.optimize.levenberg_marquardt import (
+    WEAK_DAMPING,
+    SearchSettings,
+    Solution,
+    UnknownValues,
+    minimise,
+)
 
 # Share of the predicted decrease of the cost that a step to the fit without a part may miss. The
 # errors of predictions hardly change with what is left of it.
@@ -28,6 +34,13 @@ ALLOWED_SHARE = 0.1
 # Dampings of the steps that are tried in turn. A step without damping is long in directions that
 # the data hardly determine, in which the linearisation does not hold so far.
 DAMPINGS = (WEAK_DAMPING, 1e-4, 1e-3, 1e-2)
+
+# Largest decrease of the cost, as a share of it, that the last step of a search may bring. A
+# linearisation that does not hold may promise any decrease.
+LARGEST_ROUGH_SHARE = 5e-3
+
+# Smallest cost in a denominator.
+SMALLEST_COST = 1e-300
 
 # Share of the decrease by the step without damping that a damped one has to predict.
 ENOUGH_SHARE = 0.7
@@ -151,13 +164,30 @@ def fit_to_others(problem: FitProblem, step: LeaveOutStep, budget: Budget) -> Ot
             return OtherFit(unknowns=predicted.unknowns, has_initial_states=has_states)
         starts.append((cost_at_end, end))
 
+    least, at = min(starts, key=lambda start: start[0])
     settings = replace(SEARCH, lengthens=problem.loss.kind != "linear")
-    found = minimise(others, min(starts, key=lambda start: start[0])[1], settings, budget)
+    if at is not guess:
+        share = ALLOWED_SHARE * step.ends[0].decrease / max(least, SMALLEST_COST)
+        settings = _as_near_as_a_step(settings, share)
+    found = minimise(others, at, settings, budget)
     if found is None or budget.exhausted is not None:
         return None
     return OtherFit(
         unknowns=replace(found.unknowns, private=step.begin.private), has_initial_states=False
     )
+
+
+def _as_near_as_a_step(settings: SearchSettings, share: float) -> SearchSettings:
+    """Settings of a search that ends as near to the fit as a step that counts as the fit.
+
+    It also ends where its iterations bring no more than such a step may miss.
+
+    Args:
+        settings: Settings of a search that goes on for longer.
+        share: What a step may miss, as a share of the cost.
+    """
+    near = min(max(settings.rough_share, share), LARGEST_ROUGH_SHARE)
+    return replace(settings, rough_share=near, stagnant_share=near)
 
 
 def predicted_part(

@@ -11,11 +11,17 @@ import mjfim
 from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.identification import leave_out_fits
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
-from mjfim.identification.leave_out_fits import fit_to_others, leave_out_steps, predicted_part
-from mjfim.identification.left_out_parts import left_out_parts
-from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution
+from mjfim.identification.leave_out_fits import (
+    PredictedEnd,
+    fit_to_others,
+    leave_out_steps,
+    predicted_part,
+)
+from mjfim.identification.left_out_parts import SEARCH, left_out_parts
+from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution, UnknownValues
 from tests.support.paths import ROOT
 
 TIGHT = SearchSettings(tolerance=1e-6)
@@ -119,6 +125,42 @@ def test_the_search_begins_at_the_guess_where_the_others_cost_less_there() -> No
     sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
     assert found is not None
     assert np.linalg.norm((found.unknowns.theta - good.ends[0].unknowns.theta) / sigma) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("decrease", "begins_at_guess", "expected"),
+    [
+        pytest.param(0.02, False, 2e-3, id="a tenth of what the step promises"),
+        pytest.param(1e-4, False, SEARCH.rough_share, id="no nearer than a search that ends"),
+        pytest.param(0.9, False, 5e-3, id="a linearisation that does not hold"),
+        pytest.param(0.02, True, SEARCH.rough_share, id="from the guess"),
+    ],
+)
+def test_a_search_goes_on_until_it_is_as_near_as_a_step_that_counts(
+    monkeypatch: pytest.MonkeyPatch, decrease: float, begins_at_guess: bool, expected: float
+) -> None:
+    problem, solution = fitted({}, 2)
+    (step, _) = leave_out_steps(problem, solution, list(left_out_parts(problem)))
+    asked: list[SearchSettings] = []
+
+    def kept(
+        others: FitProblem, begin: UnknownValues, settings: SearchSettings, budget: Budget
+    ) -> None:
+        """Keep the settings."""
+        asked.append(settings)
+
+    monkeypatch.setattr(leave_out_fits, "minimise", kept)
+
+    # The ends of the step are too far away, so that a search begins at the fit or at the guess.
+    assert step.cost is not None
+    away = replace(step.begin, theta=step.begin.theta * 1.05)
+    ends = (PredictedEnd(unknowns=away, decrease=decrease * step.cost),)
+    guessed = 0.5 * step.cost if begins_at_guess else 2.0 * step.cost
+    fit_to_others(problem, replace(step, ends=ends, cost_at_guess=guessed), Budget())
+    (settings,) = asked
+    assert settings.rough_share == pytest.approx(expected)
+    assert settings.stagnant_share == (0.0 if begins_at_guess else settings.rough_share)
+    assert not settings.lengthens
 
 
 def test_nothing_is_left_of_a_problem_with_one_part_only() -> None:
