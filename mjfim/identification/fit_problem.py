@@ -91,7 +91,7 @@ class FitProblem:
             recordings: Recordings in SI units.
             data_only: Whether to leave priors and bounds out.
             calibrated: Whether to calibrate the difference steps; False for a problem that is never
-                linearised.
+                linearised, or that gets those of another one.
 
         Returns:
             The problem.

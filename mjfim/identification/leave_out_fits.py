@@ -39,6 +39,10 @@ DAMPINGS = (WEAK_DAMPING, 1e-4, 1e-3, 1e-2)
 # linearisation that does not hold may promise any decrease.
 LARGEST_ROUGH_SHARE = 5e-3
 
+# Share of what a step may miss that an iteration has to bring. Two iterations in turn with less end
+# a search: as many as it has left would not bring more than what a step may miss.
+SLOW_SHARE = 0.25
+
 # Smallest cost in a denominator.
 SMALLEST_COST = 1e-300
 
@@ -180,14 +184,14 @@ def fit_to_others(problem: FitProblem, step: LeaveOutStep, budget: Budget) -> Ot
 def _as_near_as_a_step(settings: SearchSettings, share: float) -> SearchSettings:
     """Settings of a search that ends as near to the fit as a step that counts as the fit.
 
-    It also ends where its iterations bring no more than such a step may miss.
+    It also ends where its iterations bring little of what such a step may miss.
 
     Args:
         settings: Settings of a search that goes on for longer.
         share: What a step may miss, as a share of the cost.
     """
     near = min(max(settings.rough_share, share), LARGEST_ROUGH_SHARE)
-    return replace(settings, rough_share=near, stagnant_share=near)
+    return replace(settings, rough_share=near, stagnant_share=SLOW_SHARE * near)
 
 
 def predicted_part(

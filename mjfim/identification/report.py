@@ -165,8 +165,9 @@ def estimate_from(
     Args:
         result: The fit.
         budget: Budget with the stop token.
-        refuted: Keys of terms (`MissingTerm.key`) with which left-out data are predicted no better.
-            They are not named as missing terms, and are no reason for a misfit.
+        refuted: Keys of terms (`MissingTerm.key`) that are not missing, because a fit or the
+            prediction of left-out data is no better with them. They are not named as missing terms,
+            and are no reason for a misfit.
         tests: Tests of terms that this model may lack, where they are known; None to make them.
 
     Returns:

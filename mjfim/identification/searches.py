@@ -296,10 +296,11 @@ class FitSearch:
                 settings,
                 tolerance=FIRST_TOLERANCE,
                 rough_share=COMPARED_ROUGH_SHARE,
-                stagnant_share=COMPARED_ROUGH_SHARE,
             )
         if self.task.noise_is_stated:
             settings = replace(settings, cost_to_beat=cost_to_beat)
+            if is_rough:
+                settings = replace(settings, stagnant_share=COMPARED_ROUGH_SHARE)
             if is_judged and self._is_much(problem):
                 settings = replace(settings, rough_share=CLEAR_ROUGH_SHARE)
             return problem, self._minimise(problem, begin, settings, phase)

@@ -260,17 +260,18 @@ def problem_of_segments(
     """
     fit = system.experiment.fit.model_copy(update={"segments": length})
     experiment = system.experiment.model_copy(update={"fit": fit})
-    cut = replace(system, experiment=experiment)
     is_same_model = system is task.system
     try:
-        part = FitProblem.of(cut, task.recordings, calibrated=not is_same_model)
-        if part.system.dt != problem.system.dt:
-            return FitProblem.of(cut, task.recordings) if is_same_model else part
+        part = FitProblem.of(
+            replace(system, experiment=experiment), task.recordings, calibrated=not is_same_model
+        )
     except RecordingError:
         return None
 
     # Workers then receive no recording twice.
     part = replace(part, workers=problem.workers)
+    if part.system.dt != problem.system.dt:
+        return part
     simulation = replace(part.simulation, recordings=problem.recordings)
 
     # The difference steps of the whole recordings suit the same model over segments.

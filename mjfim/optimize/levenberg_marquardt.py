@@ -80,8 +80,9 @@ ASSUMED_LENGTH = 1.0
 # A step is complete if the predicted step is shorter than this multiple of it.
 COMPLETE_STEP = 1.1
 
-# A step is as long as a rejected one, and not simulated, if it is at least this share of it.
-SAME_LENGTH = 0.99
+# Relative change of every unknown of a step up to which it counts as the same step. Where that step
+# was rejected, it is not tried again.
+SAME_STEP = 0.01
 
 # Ratio of the actual to the predicted decrease above which a step is lengthened, and the largest
 # factor by which it is.
@@ -274,10 +275,10 @@ class SearchSettings:
         cost_to_beat: Cost above which a minimum is of no use. The search ends where its linearised
             cost stays clearly above it.
         lengthens: Whether a step is lengthened where the cost falls by more than predicted. Robust
-            losses are linearised by weights that make the linearised cost too steep, so that steps
-            are too short.
-        stagnant_share: Decrease of the cost, as a share of it, below which an iteration counts as
-            stagnant. It serves searches that need not converge; 0 for the others.
+            losses are linearised by weights that make the curvature of the linearised cost too
+            large, so that steps are too short.
+        stagnant_share: Decrease of the cost, as a share of it, up to which an iteration is of
+            little use. Two of them in turn end a search that need not converge; 0 for the others.
     """
 
     max_iterations: int = 60
@@ -383,6 +384,7 @@ class _Search:
             self.damping = WEAK_DAMPING
         self.damping_growth = 2.0
         self.stagnant_iterations = 0
+        self.slow_iterations = 0
         self.previous_length = ASSUMED_LENGTH
         self.unit = 1.0
         self.unit_is_known = not settings.in_true_deviations
@@ -418,7 +420,6 @@ class _Search:
         self.iteration += 1
         self.scale = np.maximum(self.scale, self.condensed.column_norms)
 
-        begin = self.unknowns
         trial = self._accepted_trial()
         if isinstance(trial, Solution):
             return trial
@@ -436,6 +437,9 @@ class _Search:
 
         converged = self._converged(trial, predicted)
         futile = self._is_futile(trial, predicted)
+        near = trial.fraction == 1.0 and self._is_near(trial, predicted)
+        if self.settings.lengthens and not (converged or futile or near):
+            trial = self._lengthened(trial)
         self.previous_length = trial.step.common_length
         self.unknowns = trial.unknowns
         self.cost = trial.cost
@@ -444,7 +448,7 @@ class _Search:
 
         if converged:
             return self._finished(trial.step)
-        if trial.fraction == 1.0 and self._is_near(predicted):
+        if near:
             self.condensed = self.condensed.after(trial.step)
             return replace(self._solution("near the minimum", success=True), rough=True)
         if futile:
@@ -456,30 +460,32 @@ class _Search:
             )
 
         self._relax_damping(trial.ratio)
-        if self.settings.lengthens:
-            self._lengthen(begin, trial)
         return self._linearise()
 
-    def _lengthen(self, begin: UnknownValues, trial: _Trial) -> None:
-        """Go further along a step along which the cost fell by more than predicted, if it falls.
+    def _lengthened(self, trial: _Trial) -> _Trial:
+        """A longer step along an accepted one, if the cost falls further there; else this step.
 
-        A parabola through both costs, with the slope of the linearisation, has its minimum at
+        The decrease that a step without damping and bounds predicts is half of what its slope
+        alone promises. A parabola with this slope through both costs has its minimum at
         `1 / (2 - ratio)` of the step.
 
         Args:
-            begin: Unknowns at the begin of the step.
-            trial: The accepted step.
+            trial: The accepted step from the present unknowns.
         """
         if trial.ratio < MIN_RATIO_TO_LENGTHEN or self.budget.exhausted is not None:
-            return
+            return trial
         factor = MAX_LENGTHENING
         if trial.ratio < 2.0:
             factor = min(1.0 / (2.0 - trial.ratio), MAX_LENGTHENING)
-        further = self.problem.moved(begin, trial.step, factor * trial.fraction)
-        cost = self.problem.cost(further)
-        if cost < self.cost:
-            self.unknowns, self.cost = further, cost
-            self.iterates[-1] = replace(further, private=further.private[:1])
+        fraction = factor * trial.fraction
+        further = self.problem.moved(self.unknowns, trial.step, fraction)
+        try:
+            cost = self.problem.cost(further)
+        except InterruptedPassError:
+            return trial
+        if cost >= trial.cost:
+            return trial
+        return replace(trial, unknowns=further, cost=cost, fraction=fraction)
 
     def _accepted_trial(self) -> _Trial | Solution:
         """Raise the damping until a step lowers the cost.
@@ -504,16 +510,14 @@ class _Search:
                 return self._stopped(reason)
 
     def _raise_damping(self, rejected: Step) -> None:
-        """Raise the damping until the step is shorter than a rejected one.
+        """Raise the damping until the step differs from a rejected one.
 
         Weak damping hardly changes a step, so that the simulation at its end would tell nothing.
         """
         while self.damping <= MAX_DAMPING:
             self.damping = max(self.damping, MIN_RAISED_DAMPING) * self.damping_growth
             self.damping_growth *= 2.0
-            step = self._step(self.damping)
-            is_shorter = step.common_length < SAME_LENGTH * rejected.common_length
-            if is_shorter or step.private_length < SAME_LENGTH * rejected.private_length:
+            if _differ(self._step(self.damping), rejected):
                 break
 
     def _trial(self) -> _Trial:
@@ -601,7 +605,6 @@ class _Search:
             most = MAX_ROUGH_ITERATIONS
         else:
             negligible = min(negligible, PREDICTED_STAGNATION * predicted.predicted_decrease)
-        negligible = max(negligible, self.settings.stagnant_share * self.cost)
         if self.cost - trial.cost <= negligible:
             self.stagnant_iterations += 1
         else:
@@ -643,11 +646,18 @@ class _Search:
         short = SHORT_STEP * self.unit * self.unknowns_length
         return complete and length < short and next_length < self._tolerance
 
-    def _is_near(self, predicted: Step) -> bool:
+    def _is_near(self, trial: _Trial, predicted: Step) -> bool:
         """Whether a search that need not converge has come near the minimum.
 
-        The minimum of the linearised cost was not much lower than the cost.
+        The minimum of the linearised cost was not much lower than the cost, or the cost has hardly
+        fallen for some iterations.
         """
+        if self.cost - trial.cost <= self.settings.stagnant_share * self.cost:
+            self.slow_iterations += 1
+        else:
+            self.slow_iterations = 0
+        if self.settings.stagnant_share and self.slow_iterations >= MAX_ROUGH_ITERATIONS:
+            return True
         return predicted.predicted_decrease < self.settings.rough_share * self.cost
 
     def _is_futile(self, trial: _Trial, predicted: Step) -> bool:
@@ -758,3 +768,17 @@ class _Search:
             interrupted=interrupted,
             iterates=tuple(self.iterates),
         )
+
+
+def _differ(step: Step, other: Step) -> bool:
+    """Whether two steps are not the same, by `SAME_STEP`.
+
+    Common unknowns are compared one by one, because the length of a step is hardly that of its weak
+    directions. Private unknowns are compared by kind, over all segments.
+    """
+    private = np.linalg.norm(step.private - other.private, axis=0)
+    of_other = np.linalg.norm(other.private, axis=0)
+    common = np.abs(step.common - other.common)
+    return bool(
+        (common > SAME_STEP * np.abs(other.common)).any() or (private > SAME_STEP * of_other).any()
+    )

@@ -233,10 +233,11 @@ class Selection:
 
     @property
     def refuted(self) -> frozenset[str]:
-        """Keys of terms with which left-out data are predicted no better, by the last attempt.
+        """Keys of terms that are not missing, by the last attempt to add them.
 
-        They explain residuals of the data to which they are fitted, but not those of other data.
-        See `key_of_term` for the keys.
+        With them, left-out data are predicted no better: they explain residuals of the data to
+        which they are fitted, but not those of other data. Or the fit itself is no better: they
+        explain the residuals only according to the linearisation. See `key_of_term` for the keys.
         """
         # Only steps that tried to add a term are attempts.
         attempts = (Decision.ADDED, Decision.REJECTED, Decision.UNHELPFUL)

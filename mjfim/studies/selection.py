@@ -359,6 +359,14 @@ class _Selector:
         final = replace(model, result=result, tests=self._tests_of(model, result, first))
         if self._is_stopped() or not model.is_changed or final.tests is not None:
             return final, ending
+
+        # Further terms are compared with the final fit.
+        if result is not model.result:
+            fit = self._costed(model, first, result)
+            assessed = None if fit is None else self._assessed(fit, first)
+            if assessed is None:
+                return final, ending
+            final = assessed
         return self._grown(final, first, steps, _refuted(steps))
 
     def _chosen(
@@ -652,11 +660,11 @@ class _Selector:
         changes = {term.name: candidate.value, **starts}
         terms = (*model.terms, term)
         fit = self._refitted(model, first, terms, values, changes, sizes=_sizes_of(term))
-        if fit is None:
+        if fit is None or self._is_stopped():
             return None
 
         # A term that does not even fit the data better need not predict left-out data.
-        if fit.cost >= model.cost:
+        if fit.cost >= model.cost and _is_comparable(fit, model):
             steps.append(unhelpful_step(candidate, len(model.terms)))
             return None
         extended = self._assessed(fit, first)
@@ -826,6 +834,27 @@ class _Selector:
     def _is_stopped(self) -> bool:
         """True after a request to stop."""
         return self.budget.stop.requested
+
+
+def _is_comparable(fit: _Refit, model: FittedModel) -> bool:
+    """Whether the cost of a fit with one term more shows that the term explains nothing.
+
+    A fit with the term could be as good as without it where both minimise the same sum of squares,
+    with the same initial states, and where the search ended at a minimum.
+
+    Args:
+        fit: The fit with the term.
+        model: The model without it.
+    """
+    found, without = fit.result, model.result
+    begins, others = (
+        [
+            (segment.begin, each.problem.simulation.private_count)
+            for segment in each.problem.segments
+        ]
+        for each in (found, without)
+    )
+    return begins == others and found.task.noise_is_stated and found.solution.success
 
 
 def _refuted(steps: Sequence[SelectionStep]) -> Collection[str]:

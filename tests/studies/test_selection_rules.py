@@ -126,6 +126,14 @@ def test_terms_are_tried_again_where_the_tests_do_not_hold_at_the_final_fit(
         return model, "tried again"
 
     monkeypatch.setattr(selection._Selector, "_grown", grown)
+    assessed: list[Any] = []
+
+    def with_losses(self: _Selector, fit: Any, first: Any) -> Any:
+        """The model with the cost of its final fit."""
+        assessed.append(fit)
+        return Model(result=fit.result, cost=fit.cost, tests=None)
+
+    monkeypatch.setattr(_Selector, "_assessed", with_losses)
     found, ending = selector()._completed(model, model, final, [refuted], "before")
     assert found.result is final
     assert ending == ("tried again" if tries else "before")
@@ -133,41 +141,66 @@ def test_terms_are_tried_again_where_the_tests_do_not_hold_at_the_final_fit(
     # Terms that left-out data have refuted are not tried a second time.
     assert [keys for _, keys in asked] == ([{refuted.key}] if tries else [])
 
+    # Others are compared with the cost and the losses of the final fit, not with earlier ones.
+    assert [fit.cost for fit in assessed] == ([50.0] if tries else [])
+    assert [grown.cost for grown, _ in asked] == ([50.0] if tries else [])
 
-@pytest.mark.parametrize(("cost", "predicts"), [(99.0, True), (100.0, False), (120.0, False)])
-def test_left_out_data_are_predicted_only_with_terms_that_fit_better(
-    monkeypatch: pytest.MonkeyPatch, cost: float, predicts: bool
+
+CANDIDATE = MissingTerm(
+    description="dry friction of hinge",
+    path="joint/hinge:frictionloss",
+    value=0.1,
+    unit="N m",
+    sigmas=9.0,
+    share=0.4,
+)
+
+
+def searched(
+    *, begin: float = 0.0, width: int = 2, stated: bool = True, success: bool = True
+) -> Any:
+    """A fit over one segment."""
+    return SimpleNamespace(
+        problem=SimpleNamespace(
+            segments=(SimpleNamespace(begin=begin),),
+            simulation=SimpleNamespace(private_count=width),
+        ),
+        task=SimpleNamespace(
+            noise_is_stated=stated,
+            system=SimpleNamespace(parameters=SimpleNamespace(names=("mass",))),
+        ),
+        solution=SimpleNamespace(success=success),
+        theta=np.ones(1),
+    )
+
+
+CASES = {
+    "better": (99.0, searched(), True),
+    "equal": (100.0, searched(), False),
+    "worse": (120.0, searched(), False),
+    "not converged": (120.0, searched(success=False), True),
+    "segments that begin earlier": (120.0, searched(begin=-0.1), True),
+    "further states": (120.0, searched(width=4), True),
+    "noise that is estimated": (120.0, searched(stated=False), True),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_left_out_data_are_predicted_unless_the_fit_shows_that_a_term_explains_nothing(
+    monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    names = SimpleNamespace(names=("mass",))
-    task = SimpleNamespace(system=SimpleNamespace(parameters=names))
+    cost, result, predicts = CASES[name]
     losses = SimpleNamespace(
         error=1.0, reduction=lambda other: Reduction(mean=0.5, standard_error=0.1)
     )
-    model: Any = SimpleNamespace(
-        result=SimpleNamespace(task=task, theta=np.ones(1)), cost=100.0, terms=(), losses=losses
-    )
+    model: Any = SimpleNamespace(result=searched(), cost=100.0, terms=(), losses=losses)
     extended: Any = SimpleNamespace(terms=("friction",), losses=losses)
-    candidate = MissingTerm(
-        description="dry friction of hinge",
-        path="joint/hinge:frictionloss",
-        value=0.1,
-        unit="N m",
-        sigmas=9.0,
-        share=0.4,
-    )
-    fit: Any = selection._Refit(model=model, result=model.result, cost=cost)
+    fit = selection._Refit(model=model, result=result, cost=cost)
     monkeypatch.setattr(_Selector, "_refitted", lambda *_, **__: fit)
-    asked: list[Any] = []
+    monkeypatch.setattr(_Selector, "_assessed", lambda *_: extended)
 
-    def assessed(self: _Selector, fit: Any, first: Any) -> Any:
-        """Keep the fit."""
-        asked.append(fit)
-        return extended
-
-    monkeypatch.setattr(_Selector, "_assessed", assessed)
     steps: list[SelectionStep] = []
-    found = selector()._tried(model, model, candidate, steps)
-    assert bool(asked) == predicts
+    found = selector()._tried(model, model, CANDIDATE, steps)
     if predicts:
         assert found is not None and found[0] is extended
         assert found[1].reduction == 0.5
@@ -176,5 +209,22 @@ def test_left_out_data_are_predicted_only_with_terms_that_fit_better(
     assert found is None
     (step,) = steps
     assert step.decision is Decision.UNHELPFUL
-    assert (step.path, step.count, step.sigmas) == (candidate.path, 0, 9.0)
+    assert (step.path, step.count, step.sigmas) == (CANDIDATE.path, 0, 9.0)
     assert np.isnan(step.error)
+
+
+def test_a_fit_that_was_stopped_shows_nothing_about_a_term(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model: Any = SimpleNamespace(result=searched(), cost=100.0, terms=())
+    stopped = selector()
+
+    def refitted(*_: object, **__: object) -> Any:
+        """A search that Ctrl-C ends far from its minimum."""
+        stopped.budget.stop.request()
+        return selection._Refit(model=model, result=searched(), cost=500.0)
+
+    monkeypatch.setattr(_Selector, "_refitted", refitted)
+    steps: list[SelectionStep] = []
+    assert stopped._tried(model, model, CANDIDATE, steps) is None
+    assert not steps

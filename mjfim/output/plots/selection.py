@@ -57,7 +57,7 @@ def selection_figure(estimate: Estimate) -> Figure:
     if np.isnan(right):
         axes.set_xticks([])
     for step, row in placed:
-        if not step.is_kept and not np.isnan(step.error):
+        if not step.is_kept:
             is_beyond = step.error > right
             marker, error = (">", right) if is_beyond else ("x", step.error)
             axes.plot(error, row, marker, color=style.MUTED_COLOUR, markersize=6.0)
