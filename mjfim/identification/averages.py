@@ -65,7 +65,7 @@ def hann_averages(
     """
     step = float(t[1] - t[0])
     half = max(round(0.5 * length / step), 1) - 1
-    window = scipy.signal.windows.hann(2 * half + 3)[1:-1]
+    window = np.hanning(2 * half + 3)[1:-1]
     window = window / window.sum()
     stride = max(round(length / step / PER_WINDOW), 1)
 
