@@ -40,7 +40,7 @@ DAMPINGS = (WEAK_DAMPING, 1e-4, 1e-3, 1e-2)
 LARGEST_ROUGH_SHARE = 5e-3
 
 # Share of what a step may miss that an iteration has to bring. Two iterations in turn with less end
-# a search: as many as it has left would not bring more than what a step may miss.
+# a search: the iterations that are left seldom bring much more than what a step may miss.
 SLOW_SHARE = 0.25
 
 # Smallest cost in a denominator.

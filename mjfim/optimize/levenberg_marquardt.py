@@ -234,7 +234,10 @@ class Solution:
         iterates: The begin and all accepted values, with the private unknowns of the first segment
             only.
         stuck: True where no step lowered the cost, although the linearisation predicts one.
-        rough: True where the search ended near the minimum, by `SearchSettings.rough_share`.
+        rough: True where the search ended near the minimum, by `SearchSettings.rough_share`, or
+            where it was slow.
+        slow: True where the search ended because its iterations brought little, by
+            `SearchSettings.stagnant_share`.
     """
 
     unknowns: UnknownValues
@@ -247,6 +250,7 @@ class Solution:
     iterates: tuple[UnknownValues, ...] = ()
     stuck: bool = False
     rough: bool = False
+    slow: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -437,9 +441,10 @@ class _Search:
 
         converged = self._converged(trial, predicted)
         futile = self._is_futile(trial, predicted)
-        near = trial.fraction == 1.0 and self._is_near(trial, predicted)
+        near = trial.fraction == 1.0 and self._is_near(predicted)
         if self.settings.lengthens and not (converged or futile or near):
             trial = self._lengthened(trial)
+        slow = self._is_slow(trial)
         self.previous_length = trial.step.common_length
         self.unknowns = trial.unknowns
         self.cost = trial.cost
@@ -448,9 +453,10 @@ class _Search:
 
         if converged:
             return self._finished(trial.step)
-        if near:
+        if near or (slow and trial.fraction == 1.0):
             self.condensed = self.condensed.after(trial.step)
-            return replace(self._solution("near the minimum", success=True), rough=True)
+            solution = self._solution("near the minimum", success=True)
+            return replace(solution, rough=True, slow=not near)
         if futile:
             return self._solution("stopped: another minimum costs less", success=False)
         if self._needs_no_relinearisation(trial, predicted):
@@ -646,19 +652,21 @@ class _Search:
         short = SHORT_STEP * self.unit * self.unknowns_length
         return complete and length < short and next_length < self._tolerance
 
-    def _is_near(self, trial: _Trial, predicted: Step) -> bool:
+    def _is_near(self, predicted: Step) -> bool:
         """Whether a search that need not converge has come near the minimum.
 
-        The minimum of the linearised cost was not much lower than the cost, or the cost has hardly
-        fallen for some iterations.
+        The minimum of the linearised cost was not much lower than the cost.
         """
-        if self.cost - trial.cost <= self.settings.stagnant_share * self.cost:
+        return predicted.predicted_decrease < self.settings.rough_share * self.cost
+
+    def _is_slow(self, trial: _Trial) -> bool:
+        """Count consecutive iterations of little use; True after too many of them."""
+        share = self.settings.stagnant_share
+        if self.cost - trial.cost <= share * self.cost:
             self.slow_iterations += 1
         else:
             self.slow_iterations = 0
-        if self.settings.stagnant_share and self.slow_iterations >= MAX_ROUGH_ITERATIONS:
-            return True
-        return predicted.predicted_decrease < self.settings.rough_share * self.cost
+        return share > 0.0 and self.slow_iterations >= MAX_ROUGH_ITERATIONS
 
     def _is_futile(self, trial: _Trial, predicted: Step) -> bool:
         """Whether the minimum will cost more than what is to be beaten.

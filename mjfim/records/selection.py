@@ -236,8 +236,8 @@ class Selection:
         """Keys of terms that are not missing, by the last attempt to add them.
 
         With them, left-out data are predicted no better: they explain residuals of the data to
-        which they are fitted, but not those of other data. Or the fit itself is no better: they
-        explain the residuals only according to the linearisation. See `key_of_term` for the keys.
+        which they are fitted, but not those of other data. Or the fit itself is no better, although
+        a test found them significant. See `key_of_term` for the keys.
         """
         # Only steps that tried to add a term are attempts.
         attempts = (Decision.ADDED, Decision.REJECTED, Decision.UNHELPFUL)

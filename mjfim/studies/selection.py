@@ -77,6 +77,9 @@ WORSE_ERROR_RATIO = 1.02
 # below which both explain the data equally well: by one standard deviation at most.
 EQUAL_COST = 0.5
 
+# Why a selection ended, after a request to stop.
+INTERRUPTED = "The selection was interrupted."
+
 # Share of the estimated size of a new term at which it has hardly any effect.
 SMALL_EFFECT = 0.01
 
@@ -360,14 +363,20 @@ class _Selector:
         if self._is_stopped() or not model.is_changed or final.tests is not None:
             return final, ending
 
+        refuted = _refuted(steps)
+        tests = self._term_tests(final)
+        final = replace(final, tests=tests)
+        is_possible = bool(tests.without(refuted).terms) and len(model.terms) < self.max_terms
+
         # Further terms are compared with the final fit.
-        if result is not model.result:
+        if is_possible and result is not model.result and not self._is_stopped():
             fit = self._costed(model, first, result)
             assessed = None if fit is None else self._assessed(fit, first)
-            if assessed is None:
-                return final, ending
-            final = assessed
-        return self._grown(final, first, steps, _refuted(steps))
+            if assessed is not None:
+                final = replace(assessed, tests=tests)
+        if self._is_stopped():
+            return final, INTERRUPTED
+        return self._grown(final, first, steps, refuted)
 
     def _chosen(
         self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
@@ -450,11 +459,11 @@ class _Selector:
         """
         while len(model.terms) < self.max_terms:
             begin_stage(f"looking for term {len(model.terms) + 1} that the model lacks")
-            tests = self._term_tests(model)
+            tests = self._term_tests(model) if model.tests is None else model.tests
             model = replace(model, tests=tests)
             candidates = tests.without(refuted).terms
             if self._is_stopped():
-                return model, "The selection was interrupted."
+                return model, INTERRUPTED
             if not candidates:
                 return model, f"No further term that was tested is significant.{tests.remark}"
 
@@ -466,7 +475,7 @@ class _Selector:
             for attempt in (similar, others):
                 better = better or self._best_extension(model, first, attempt, steps)
             if self._is_stopped():
-                return model, "The selection was interrupted."
+                return model, INTERRUPTED
             if better is None:
                 text = "No further term predicts left-out data clearly better."
                 return model, text + tests.remark
@@ -664,7 +673,8 @@ class _Selector:
             return None
 
         # A term that does not even fit the data better need not predict left-out data.
-        if fit.cost >= model.cost and _is_comparable(fit, model):
+        is_equal = 0.0 <= fit.cost - model.cost <= EQUAL_COST
+        if is_equal and _is_comparable(fit, model):
             steps.append(unhelpful_step(candidate, len(model.terms)))
             return None
         extended = self._assessed(fit, first)
@@ -837,10 +847,11 @@ class _Selector:
 
 
 def _is_comparable(fit: _Refit, model: FittedModel) -> bool:
-    """Whether the cost of a fit with one term more shows that the term explains nothing.
+    """Whether an equal cost of a fit with one term more shows that the term explains nothing.
 
-    A fit with the term could be as good as without it where both minimise the same sum of squares,
-    with the same initial states, and where the search ended at a minimum.
+    It does where both fits minimise the same sum of squares with the same initial states, and where
+    the search ended near a minimum. A fit that costs clearly more has missed the one without the
+    term, and shows nothing.
 
     Args:
         fit: The fit with the term.
@@ -854,7 +865,8 @@ def _is_comparable(fit: _Refit, model: FittedModel) -> bool:
         ]
         for each in (found, without)
     )
-    return begins == others and found.task.noise_is_stated and found.solution.success
+    is_ended = found.solution.success and not found.solution.slow
+    return begins == others and found.task.noise_is_stated and is_ended
 
 
 def _refuted(steps: Sequence[SelectionStep]) -> Collection[str]:

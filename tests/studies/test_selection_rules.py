@@ -15,7 +15,7 @@ from mjfim.identification.missing_terms import TermTests
 from mjfim.records.missing_term import MissingTerm
 from mjfim.records.selection import Decision, SelectionStep
 from mjfim.studies import selection
-from mjfim.studies.selection import EQUAL_COST, _Selector
+from mjfim.studies.selection import EQUAL_COST, INTERRUPTED, _Selector
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ class Model:
     cost: float = 100.0
     tests: TermTests | None = field(default_factory=TermTests)
     is_changed: bool = True
+    terms: tuple[str, ...] = ()
 
 
 def selector() -> _Selector:
@@ -104,48 +105,6 @@ def test_tests_do_not_hold_after_a_request_to_stop() -> None:
     assert stopped._tests_of(model, model.result, model) is None
 
 
-@pytest.mark.parametrize(
-    ("is_changed", "holds", "tries"),
-    [(True, False, True), (True, True, False), (False, False, False)],
-)
-def test_terms_are_tried_again_where_the_tests_do_not_hold_at_the_final_fit(
-    monkeypatch: pytest.MonkeyPatch, is_changed: bool, holds: bool, tries: bool
-) -> None:
-    model: Any = Model(is_changed=is_changed)
-    final: Any = Result(problem=Problem(100.0 if holds else 50.0))
-    refuted = SelectionStep(
-        decision=Decision.REJECTED, description="a spring", path="spring", error=1.0, reduction=-0.1
-    )
-    asked: list[Any] = []
-
-    def grown(
-        self: _Selector, model: Any, first: Any, steps: list[SelectionStep], refuted: Any
-    ) -> tuple[Any, str]:
-        """Keep the arguments."""
-        asked.append((model, set(refuted)))
-        return model, "tried again"
-
-    monkeypatch.setattr(selection._Selector, "_grown", grown)
-    assessed: list[Any] = []
-
-    def with_losses(self: _Selector, fit: Any, first: Any) -> Any:
-        """The model with the cost of its final fit."""
-        assessed.append(fit)
-        return Model(result=fit.result, cost=fit.cost, tests=None)
-
-    monkeypatch.setattr(_Selector, "_assessed", with_losses)
-    found, ending = selector()._completed(model, model, final, [refuted], "before")
-    assert found.result is final
-    assert ending == ("tried again" if tries else "before")
-
-    # Terms that left-out data have refuted are not tried a second time.
-    assert [keys for _, keys in asked] == ([{refuted.key}] if tries else [])
-
-    # Others are compared with the cost and the losses of the final fit, not with earlier ones.
-    assert [fit.cost for fit in assessed] == ([50.0] if tries else [])
-    assert [grown.cost for grown, _ in asked] == ([50.0] if tries else [])
-
-
 CANDIDATE = MissingTerm(
     description="dry friction of hinge",
     path="joint/hinge:frictionloss",
@@ -156,8 +115,98 @@ CANDIDATE = MissingTerm(
 )
 
 
+class Completion:
+    """A selector whose further steps are recorded in place of being done.
+
+    Attributes:
+        grown: Models that are extended, and the terms that are not tried again.
+        assessed: Fits of which left-out data are predicted.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, stops: bool = False) -> None:
+        self.grown: list[Any] = []
+        self.assessed: list[Any] = []
+        self.selector = selector()
+
+        def grown(
+            _: _Selector, model: Any, first: Any, steps: list[SelectionStep], refuted: Any
+        ) -> tuple[Any, str]:
+            """Keep the arguments."""
+            self.grown.append((model, set(refuted)))
+            return model, "tried again"
+
+        def assessed(_: _Selector, fit: Any, first: Any) -> Any:
+            """The model with the cost of its final fit; None after a request to stop."""
+            self.assessed.append(fit)
+            if stops:
+                self.selector.budget.stop.request()
+                return None
+            return Model(result=fit.result, cost=fit.cost, tests=None)
+
+        tests = TermTests(terms=(CANDIDATE,))
+        monkeypatch.setattr(_Selector, "_grown", grown)
+        monkeypatch.setattr(_Selector, "_assessed", assessed)
+        monkeypatch.setattr(_Selector, "_term_tests", lambda *_: tests)
+
+    def of(
+        self, model: Any, steps: list[SelectionStep] | None = None, cost: float = 50.0
+    ) -> tuple[Any, str]:
+        """What becomes of a model whose final fit has some cost."""
+        final: Any = Result(problem=Problem(cost))
+        return self.selector._completed(model, model, final, steps or [], "before")
+
+
+@pytest.mark.parametrize(
+    ("is_changed", "holds", "tries"),
+    [(True, False, True), (True, True, False), (False, False, False)],
+)
+def test_terms_are_tried_again_where_the_tests_do_not_hold_at_the_final_fit(
+    monkeypatch: pytest.MonkeyPatch, is_changed: bool, holds: bool, tries: bool
+) -> None:
+    completion = Completion(monkeypatch)
+    cost = 100.0 if holds else 50.0
+    found, ending = completion.of(Model(is_changed=is_changed), cost=cost)
+    assert found.result.problem.value == cost
+    assert ending == ("tried again" if tries else "before")
+
+    # They are compared with the cost and the losses of the final fit, not with earlier ones.
+    assert [fit.cost for fit in completion.assessed] == ([50.0] if tries else [])
+    assert [model.cost for model, _ in completion.grown] == ([50.0] if tries else [])
+    assert all(model.tests.terms == (CANDIDATE,) for model, _ in completion.grown)
+
+
+def test_terms_that_left_out_data_have_refuted_are_not_tried_a_second_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is predicted for them either."""
+    completion = Completion(monkeypatch)
+    refuted = SelectionStep(
+        decision=Decision.REJECTED,
+        description=CANDIDATE.description,
+        path=CANDIDATE.path,
+        error=1.0,
+        reduction=-0.1,
+    )
+    completion.of(Model(), [refuted])
+    assert [keys for _, keys in completion.grown] == [{CANDIDATE.key}]
+    assert not completion.assessed
+
+
+def test_a_stop_before_terms_are_tried_again_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    completion = Completion(monkeypatch, stops=True)
+    found, ending = completion.of(Model())
+    assert ending == INTERRUPTED
+    assert found.result.problem.value == 50.0
+    assert not completion.grown
+
+
 def searched(
-    *, begin: float = 0.0, width: int = 2, stated: bool = True, success: bool = True
+    *,
+    begin: float = 0.0,
+    width: int = 2,
+    stated: bool = True,
+    success: bool = True,
+    slow: bool = False,
 ) -> Any:
     """A fit over one segment."""
     return SimpleNamespace(
@@ -169,7 +218,7 @@ def searched(
             noise_is_stated=stated,
             system=SimpleNamespace(parameters=SimpleNamespace(names=("mass",))),
         ),
-        solution=SimpleNamespace(success=success),
+        solution=SimpleNamespace(success=success, slow=slow),
         theta=np.ones(1),
     )
 
@@ -177,11 +226,13 @@ def searched(
 CASES = {
     "better": (99.0, searched(), True),
     "equal": (100.0, searched(), False),
-    "worse": (120.0, searched(), False),
-    "not converged": (120.0, searched(success=False), True),
-    "segments that begin earlier": (120.0, searched(begin=-0.1), True),
-    "further states": (120.0, searched(width=4), True),
-    "noise that is estimated": (120.0, searched(stated=False), True),
+    "hardly worse": (100.0 + 0.9 * EQUAL_COST, searched(), False),
+    "another minimum": (120.0, searched(), True),
+    "not converged": (100.0, searched(success=False), True),
+    "ended because it was slow": (100.0, searched(slow=True), True),
+    "segments that begin earlier": (100.0, searched(begin=-0.1), True),
+    "further states": (100.0, searched(width=4), True),
+    "noise that is estimated": (100.0, searched(stated=False), True),
 }
 
 
