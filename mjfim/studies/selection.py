@@ -363,20 +363,18 @@ class _Selector:
         if self._is_stopped() or not model.is_changed or final.tests is not None:
             return final, ending
 
-        refuted = _refuted(steps)
+        # The final fit is another one. Left-out data are predicted from it anew: further terms are
+        # compared with it, and its intervals are widened by the scatter between these fits.
         tests = self._term_tests(final)
         final = replace(final, tests=tests)
-        is_possible = bool(tests.without(refuted).terms) and len(model.terms) < self.max_terms
-
-        # Further terms are compared with the final fit.
-        if is_possible and result is not model.result and not self._is_stopped():
+        if result is not model.result and not self._is_stopped():
             fit = self._costed(model, first, result)
             assessed = None if fit is None else self._assessed(fit, first)
             if assessed is not None:
                 final = replace(assessed, tests=tests)
         if self._is_stopped():
             return final, INTERRUPTED
-        return self._grown(final, first, steps, refuted)
+        return self._grown(final, first, steps, _refuted(steps))
 
     def _chosen(
         self, model: FittedModel, first: FittedModel, steps: list[SelectionStep]
