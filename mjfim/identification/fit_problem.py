@@ -669,6 +669,21 @@ class FitProblem:
             yield work(self, at, batch)
 
 
+def have_same_initial_states(problem: FitProblem, other: FitProblem) -> bool:
+    """Whether the private unknowns of two problems of the same recordings are alike.
+
+    With a delay among the parameters, segments begin earlier, and their initial states are others.
+    A joint or an actuator more has further states.
+
+    Args:
+        problem: A problem.
+        other: The other one.
+    """
+    begins, others = ([segment.begin for segment in each.segments] for each in (problem, other))
+    width = problem.simulation.private_count
+    return begins == others and width == other.simulation.private_count
+
+
 def _calibrated_along(system: System, recording: AlignedRecording, samples: int) -> System:
     """The system with difference steps that suit the first samples of a recording."""
     guess, control = system.parameters.guess, recording.ctrl[:samples]

@@ -26,7 +26,7 @@ from mjfim.identification.continuation import (
     is_doubtful,
     may_be_repeated,
 )
-from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_problem import FitProblem, have_same_initial_states
 from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.fit_start import begin_fit
 from mjfim.identification.fit_workers import FitWorkers
@@ -378,11 +378,7 @@ def _begin_near(problem: FitProblem, begin: UnknownValues, near: FitResult) -> U
     """
     found, layout = near.solution.unknowns, near.problem.layout
 
-    # With a delay among the parameters, segments begin earlier, and their initial states are
-    # others. A joint or an actuator more has further states.
-    begins = [segment.begin for segment in near.problem.segments]
-    is_same_begin = begins == [segment.begin for segment in problem.segments]
-    if is_same_begin and begin.private.shape == found.private.shape:
+    if have_same_initial_states(problem, near.problem):
         begin = replace(begin, private=found.private)
 
     # A parameter with a value for each recording keeps these values.

@@ -293,9 +293,7 @@ class FitSearch:
         settings = self._final_settings(problem, max_iterations)
         if is_rough:
             settings = replace(
-                settings,
-                tolerance=FIRST_TOLERANCE,
-                rough_share=COMPARED_ROUGH_SHARE,
+                settings, tolerance=FIRST_TOLERANCE, rough_share=COMPARED_ROUGH_SHARE
             )
         if self.task.noise_is_stated:
             settings = replace(settings, cost_to_beat=cost_to_beat)

@@ -225,17 +225,12 @@ def tried_step(candidate: MissingTerm, model: FittedModel, reduction: Reduction)
         model: The model with the term.
         reduction: Reduction of the loss of left-out data by the term.
     """
-    return SelectionStep(
+    return replace(
+        unhelpful_step(candidate, len(model.terms) - 1),
         decision=Decision.REJECTED,
-        description=candidate.description,
-        path=candidate.path,
-        count=len(model.terms) - 1,
         error=model.losses.error,
         reduction=reduction.mean,
         standard_error=reduction.standard_error,
-        sigmas=candidate.sigmas,
-        share=candidate.share,
-        joints=candidate.joints,
     )
 
 

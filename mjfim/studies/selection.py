@@ -21,6 +21,7 @@ from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.continuation import WholeFit, is_doubtful
+from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction, held_out_losses
 from mjfim.identification.horizons import with_length
@@ -368,8 +369,7 @@ class _Selector:
         tests = self._term_tests(final)
         final = replace(final, tests=tests)
         if result is not model.result and not self._is_stopped():
-            fit = self._costed(model, first, result)
-            assessed = None if fit is None else self._assessed(fit, first)
+            assessed = self._assessed(self._costed(model, first, result), first)
             if assessed is not None:
                 final = replace(assessed, tests=tests)
         if self._is_stopped():
@@ -421,8 +421,7 @@ class _Selector:
             The chosen model, and why no more terms were added.
         """
         length = result.task.settings.segment_length
-        fit = self._costed(model, first, result)
-        cut = None if fit is None else self._assessed(fit, first)
+        cut = self._assessed(self._costed(model, first, result), first)
         if cut is None or length is None:
             return replace(model, result=result, tests=None), ending
 
@@ -620,7 +619,7 @@ class _Selector:
         """
         names = model.result.task.system.parameters.names
         values = dict(zip(names, model.result.theta, strict=True))
-        simpler = self._fitted(changed, first, changed.terms, values)
+        simpler = self._assessed(self._refitted(changed, first, changed.terms, values, {}), first)
         if simpler is None:
             return model
 
@@ -695,21 +694,7 @@ class _Selector:
         names = model.result.task.system.parameters.names
         values = dict(zip(names, model.result.theta, strict=True))
         terms = tuple(each for each in model.terms if each is not term)
-        return self._fitted(model, first, terms, values)
-
-    def _fitted(
-        self,
-        model: FittedModel,
-        first: FittedModel,
-        terms: tuple[SelectedTerm, ...],
-        values: dict[str, float],
-    ) -> FittedModel | None:
-        """The stated model with some terms, which the similar model has too, with its losses.
-
-        None where it cannot be simulated, or after a stop. The arguments are those of `_refitted`.
-        """
-        fit = self._refitted(model, first, terms, values, {})
-        return None if fit is None else self._assessed(fit, first)
+        return self._assessed(self._refitted(model, first, terms, values, {}), first)
 
     def _refitted(
         self,
@@ -780,13 +765,15 @@ class _Selector:
             return None
         return _Refit(model=model, result=result, cost=cost)
 
-    def _assessed(self, fit: _Refit, first: FittedModel) -> FittedModel | None:
-        """A fitted model with its losses; None after a request to stop.
+    def _assessed(self, fit: _Refit | None, first: FittedModel) -> FittedModel | None:
+        """A fitted model with its losses; None without a fit, and after a request to stop.
 
         Args:
-            fit: The fit.
+            fit: The fit, or None.
             first: The stated model, whose noise weights the losses.
         """
+        if fit is None:
+            return None
         losses = self._losses(fit.result, first.result)
         if losses is None:
             return None
@@ -855,16 +842,10 @@ def _is_comparable(fit: _Refit, model: FittedModel) -> bool:
         fit: The fit with the term.
         model: The model without it.
     """
-    found, without = fit.result, model.result
-    begins, others = (
-        [
-            (segment.begin, each.problem.simulation.private_count)
-            for segment in each.problem.segments
-        ]
-        for each in (found, without)
-    )
+    found = fit.result
     is_ended = found.solution.success and not found.solution.slow
-    return begins == others and found.task.noise_is_stated and is_ended
+    is_same_start = have_same_initial_states(found.problem, model.result.problem)
+    return is_same_start and found.task.noise_is_stated and is_ended
 
 
 def _refuted(steps: Sequence[SelectionStep]) -> Collection[str]:

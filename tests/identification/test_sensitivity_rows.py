@@ -23,6 +23,14 @@ from mjfim.identification.task import FitTask
 from tests.support.paths import MODELS
 
 
+def cart_pendulum(horizon: float) -> FitTask:
+    """The fit to one recording of the cart-pendulum over a horizon [s]."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=horizon)
+    design = DesignTask.resolve(experiment, threads=1)
+    recording = simulate_system(design.system, design.initial, 0)
+    return FitTask.resolve(experiment, [recording], threads=1)
+
+
 def test_the_recordings_of_the_batch_that_diverges_are_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -74,10 +82,7 @@ def test_rows_without_error_are_those_of_one_sided_differences() -> None:
 
 
 def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=2.0)
-    design = DesignTask.resolve(experiment, threads=1)
-    recording = simulate_system(design.system, design.initial, 0)
-    task = FitTask.resolve(experiment, [recording], threads=1)
+    task = cart_pendulum(2.0)
     problem = task.problem()
     before = problem.system.plant.engine_steps
     sensitivity_rows(problem, problem.begin(task.start))
@@ -88,10 +93,7 @@ def test_what_a_part_of_a_recording_determines_is_not_tested_on_all_of_it() -> N
 
 def test_what_all_recordings_determine_only_together_takes_one_difference_step() -> None:
     """The first halves of the recordings do not determine the last parameter, all of them do."""
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
-    design = DesignTask.resolve(experiment, threads=1)
-    recording = simulate_system(design.system, design.initial, 0)
-    task = FitTask.resolve(experiment, [recording], threads=1)
+    task = cart_pendulum(0.5)
     whole = task.problem()
     samples_of_all = whole.sample_count
     count = len(task.start)
@@ -116,10 +118,7 @@ def test_what_all_recordings_determine_only_together_takes_one_difference_step()
 def test_an_effect_that_may_be_round_off_is_tested_with_its_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
-    design = DesignTask.resolve(experiment, threads=1)
-    recording = simulate_system(design.system, design.initial, 0)
-    task = FitTask.resolve(experiment, [recording], threads=1)
+    task = cart_pendulum(0.5)
     count = len(task.start)
 
     def rows(
