@@ -498,8 +498,9 @@ class _Search:
 
         Return a solution where no step lowers it, or where the budget is exhausted.
         """
+        step = self._step(self.damping)
         while True:
-            trial = self._trial()
+            trial = self._trial(step)
 
             # A step below the tolerance may miss the predicted decrease: round-off of the
             # simulation hides it.
@@ -510,28 +511,28 @@ class _Search:
             if small or self.damping > MAX_DAMPING or not self.settings.damped:
                 return self._without_progress(self._predicted_step())
 
-            self._raise_damping(trial.step)
+            step = self._shorter_step(step)
 
             if (reason := self.budget.exhausted) is not None:
                 return self._stopped(reason)
 
-    def _raise_damping(self, rejected: Step) -> None:
-        """Raise the damping until the step differs from a rejected one.
+    def _shorter_step(self, rejected: Step) -> Step:
+        """Raise the damping until the step differs from a rejected one, and return this step.
 
         Weak damping hardly changes a step, so that the simulation at its end would tell nothing.
         """
-        while self.damping <= MAX_DAMPING:
+        step = rejected
+        while self.damping <= MAX_DAMPING and not _differ(step, rejected):
             self.damping = max(self.damping, MIN_RAISED_DAMPING) * self.damping_growth
             self.damping_growth *= 2.0
-            if _differ(self._step(self.damping), rejected):
-                break
+            step = self._step(self.damping)
+        return step
 
-    def _trial(self) -> _Trial:
+    def _trial(self, step: Step) -> _Trial:
         """Evaluate a step with the current damping.
 
         Without damping, the step is halved while it raises the cost.
         """
-        step = self._step(self.damping)
         fraction = 1.0
 
         while True:
