@@ -31,7 +31,7 @@ FINISH_SECONDS = 6.0
 # Time after the second press of the user at which the process ends in any case [s].
 LAST_SECONDS = 5.0
 
-# Time after which an error is raised once more that came during a callback [s].
+# Time after which an error is raised once more that came during a callback or an import [s].
 AGAIN_SECONDS = 0.05
 
 # Time for which the end of the context waits for the thread that announces presses [s].
@@ -39,6 +39,9 @@ WATCHER_SECONDS = 1.0
 
 # Exit code of an interrupted program.
 INTERRUPTED_CODE = 1
+
+# Begin of the file names of the code by which Python imports modules.
+IMPORT_MACHINERY = "<frozen importlib._bootstrap"
 
 # Signals that interrupt a program.
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -91,9 +94,14 @@ class Interruption:
         self._is_own_press_expected = False
         self._before: dict[int, Any] = {}
 
-        # An error that Python has dropped, because the press came during a callback.
-        self._dropped: type[BaseException] | None = None
+        # An error that is raised later, because the press came during a callback or an import, and
+        # whether the signal that raises it is still to come.
+        self._postponed: type[BaseException] | None = None
         self._again: threading.Timer | None = None
+        self._is_again_expected = False
+
+        # Whether an error of this handler has ended something.
+        self._has_left = False
         self._hook_before = sys.unraisablehook
 
         self._watcher: threading.Thread | None = None
@@ -114,7 +122,7 @@ class Interruption:
         self._watcher.start()
         for number in SIGNALS:
             signal.signal(number, self)
-        self._hook_before, sys.unraisablehook = sys.unraisablehook, self._raise_again
+        self._hook_before, sys.unraisablehook = sys.unraisablehook, self._on_unraisable
         return self
 
     def __exit__(
@@ -150,17 +158,18 @@ class Interruption:
             UnfinishedError: The second press, or the end of the time, while something is written
                 that may be left out.
         """
-        if self._dropped is not None:
-            error, self._dropped = self._dropped, None
-            if self._is_optional or error is NoResultError:
-                raise error
+        if self._is_again_expected:
+            self._is_again_expected = False
+            error, self._postponed = self._postponed, None
+            if error is NoResultError or (error is not None and self._is_optional):
+                self._leave(error, frame)
             return
 
         # The thread that watches has sent this signal; computations go on.
         if self._is_own_press_expected:
             self._is_own_press_expected = False
             if self._is_optional:
-                raise UnfinishedError
+                self._leave(UnfinishedError, frame)
             return
         self.presses += 1
 
@@ -175,9 +184,9 @@ class Interruption:
         # The error ends the program; a further press must not disturb that.
         if not self._requests and not self._has_result:
             self._has_result = True
-            raise NoResultError
-        if self._is_optional and self.hurried:
-            raise UnfinishedError
+            self._leave(NoResultError, frame)
+        elif self._is_optional and self.hurried:
+            self._leave(UnfinishedError, frame)
 
     @property
     def hurried(self) -> bool:
@@ -225,7 +234,26 @@ class Interruption:
         finally:
             self._is_optional = False
 
-    def _raise_again(self, dropped: sys.UnraisableHookArgs) -> None:
+    def _leave(self, error: type[BaseException], frame: FrameType | None) -> None:
+        """Raise an error of this handler, or have it raised after the import that is running.
+
+        An import that ends halfway would leave modules behind that cannot be imported again.
+
+        Args:
+            error: The error.
+            frame: What the main thread is running, or None.
+
+        Raises:
+            NoResultError: It is the error.
+            UnfinishedError: It is the error.
+        """
+        if _is_importing(frame):
+            self._raise_later(error)
+            return
+        self._has_left = True
+        raise error
+
+    def _on_unraisable(self, dropped: sys.UnraisableHookArgs) -> None:
         """Raise an error of this handler once more where Python cannot pass it on.
 
         A press may come while a callback of Python's memory management runs, such as after an
@@ -234,15 +262,30 @@ class Interruption:
         Args:
             dropped: The error that is not passed on.
         """
-        if dropped.exc_type not in (NoResultError, UnfinishedError):
-            self._hook_before(dropped)
+        # A file that was opened in the moment of the press is closed by Python itself.
+        if self._has_left and issubclass(dropped.exc_type, ResourceWarning):
             return
 
-        # The callback has ended when the other thread sends the signal.
-        self._dropped = dropped.exc_type
-        self._again = threading.Timer(AGAIN_SECONDS, self._press_by_itself)
+        if dropped.exc_type in (NoResultError, UnfinishedError):
+            self._raise_later(dropped.exc_type)
+        else:
+            self._hook_before(dropped)
+
+    def _raise_later(self, error: type[BaseException]) -> None:
+        """Raise an error in the main thread a little later."""
+        self._postponed = error
+        if self._again is not None:
+            self._again.cancel()
+
+        # The callback, or the import, may have ended when the other thread sends the signal.
+        self._again = threading.Timer(AGAIN_SECONDS, self._press_again)
         self._again.daemon = True
         self._again.start()
+
+    def _press_again(self) -> None:
+        """Send the signal by which an error is raised that was postponed."""
+        self._is_again_expected = True
+        self._press_by_itself()
 
     def _press_by_itself(self) -> None:
         """Send a signal to the main thread, unless the program has left this context."""
@@ -275,6 +318,19 @@ class Interruption:
             self._announce(LAST_SENTENCE)
             remove_temporary_files()
             os._exit(INTERRUPTED_CODE)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Return whether a module is being imported.
+
+    Args:
+        frame: What a thread is running, or None.
+    """
+    while frame is not None:
+        if frame.f_code.co_filename.startswith(IMPORT_MACHINERY):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _send_to_main_thread() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import time
 import weakref
 from collections.abc import Iterator
 from concurrent.futures import Future
+from pathlib import Path
 
 import pytest
 
@@ -33,6 +35,14 @@ def interruption(sentences: list[str]) -> Iterator[Interruption]:
     with Interruption(sentences.append) as handler:
         yield handler
     assert [signal.getsignal(number) for number in module.SIGNALS] == before
+
+
+def _wait_for_an_end() -> None:
+    """Run until an error of the handler comes."""
+    end = time.monotonic() + 10.0
+    while time.monotonic() < end:
+        time.sleep(0.01)
+    pytest.fail("no error has come")
 
 
 @pytest.mark.parametrize("number", module.SIGNALS)
@@ -97,10 +107,7 @@ def test_the_second_press_follows_by_itself(
 
     def draw_for_ever() -> None:
         signal.raise_signal(signal.SIGINT)
-        end = time.monotonic() + 10.0
-        while time.monotonic() < end:
-            time.sleep(0.01)
-        pytest.fail("nobody has ended the figure")
+        _wait_for_an_end()
 
     interruption.keep()
     run_optional(draw_for_ever)
@@ -181,16 +188,88 @@ def test_a_press_during_a_callback_is_not_lost(
         reference = weakref.ref(held, lambda _: signal.raise_signal(signal.SIGINT))
         signal.raise_signal(signal.SIGINT)
         del held
-        end = time.monotonic() + 10.0
-        while time.monotonic() < end:
-            time.sleep(0.01)
-        pytest.fail(f"nobody has ended the figure of {reference}")
+        assert reference() is None
+        _wait_for_an_end()
 
     interruption.keep()
     run_optional(draw)
     assert interruption.incomplete
     assert interruption.presses == 2
     assert "Traceback" not in capfd.readouterr().err
+
+
+# A module that is imported while the user presses.
+PRESSED = """
+import signal
+
+signal.raise_signal(signal.SIGINT)
+IS_COMPLETE = True
+"""
+
+
+def _import_and_wait(name: str) -> None:
+    """Import a module, and run until an error of the handler comes."""
+    assert importlib.import_module(name).IS_COMPLETE
+    _wait_for_an_end()
+
+
+@pytest.fixture
+def pressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Name of a module whose import sends a signal to this process."""
+    name = "module_that_is_pressed"
+    (tmp_path / f"{name}.py").write_text(PRESSED)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield name
+    sys.modules.pop(name, None)
+
+
+def test_an_import_is_finished_before_the_program_ends(
+    interruption: Interruption, pressed: str
+) -> None:
+    """Python's own code for imports leaves files open where an error comes from outside."""
+    with pytest.raises(NoResultError):
+        _import_and_wait(pressed)
+    assert sys.modules[pressed].IS_COMPLETE
+
+
+def test_an_import_of_a_figure_is_finished_before_the_figure_is_left_out(
+    interruption: Interruption, pressed: str
+) -> None:
+    interruption.keep()
+    signal.raise_signal(signal.SIGINT)
+    run_optional(lambda: _import_and_wait(pressed))
+    assert interruption.incomplete
+    assert sys.modules[pressed].IS_COMPLETE
+
+    # The error was raised once, and the signal that did so is no press of the user.
+    time.sleep(4.0 * module.AGAIN_SECONDS)
+    assert interruption.presses == 2
+
+
+def test_presses_during_an_import_are_counted(
+    interruption: Interruption, tmp_path: Path, pressed: str
+) -> None:
+    """The second press ends the process after some time, also where the import hangs."""
+    (tmp_path / f"{pressed}.py").write_text(PRESSED + "signal.raise_signal(signal.SIGINT)\n")
+    with pytest.raises(NoResultError):
+        _import_and_wait(pressed)
+    assert interruption.presses == 2
+
+
+def test_a_file_that_was_open_in_the_moment_of_a_press_is_no_fault(
+    interruption: Interruption, tmp_path: Path
+) -> None:
+    """Python closes it, and warns about that; tests fail with such a warning."""
+
+    def draw() -> None:
+        file = (tmp_path / "figure").open("w")
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        file.close()
+
+    interruption.keep()
+    run_optional(draw)
+    assert interruption.incomplete
 
 
 def test_the_press_that_follows_ends_waiting(

@@ -12,8 +12,15 @@ import numpy as np
 # Files of which only the presence is compared: views hold random identifiers, and pictures times.
 NOT_COMPARED = (".rrd", ".png")
 
-# A measured time in a report, such as `18.2 s`.
+# Reports and tables, whose measured times are left out.
+TEXTS = (".html", ".md", ".tex")
+
+# A measured time in a text, such as `18.2 s`.
 DURATION = re.compile(r"\d[\d.]*(e[-+]\d+)? (s|min|h)\b")
+
+# A picture or video inside a report. The size of a video, and the number of its frames, are what
+# could be drawn in a limited time.
+EMBEDDED = re.compile(r'<(?:img|video) [^>]*>|"data:[^"]*"')
 
 
 def without_times(value: Any) -> Any:
@@ -25,21 +32,32 @@ def without_times(value: Any) -> Any:
     return value
 
 
+def with_arrays(value: Any, arrays: dict[str, bytes]) -> Any:
+    """JSON values with the arrays in place of their names.
+
+    Two fields with equal values may name the same array, or one each.
+    """
+    if isinstance(value, list | tuple):
+        return [with_arrays(entry, arrays) for entry in value]
+    return arrays.get(value, value) if isinstance(value, str) else value
+
+
 def contents_of(file: Path) -> Any:
     """The bytes of a file, or its arrays and JSON values without measured times."""
     if file.suffix in NOT_COMPARED:
         return file.suffix
     if file.suffix == ".json":
         return without_times(json.loads(file.read_text(encoding="utf-8")))
-    if file.suffix == ".html":
-        return DURATION.sub("", file.read_text(encoding="utf-8"))
+    if file.suffix in TEXTS:
+        text = file.read_text(encoding="utf-8")
+        return DURATION.sub("", EMBEDDED.sub("", text))
     if file.suffix != ".npz":
         return file.read_bytes()
 
-    with np.load(file) as arrays:
-        rest = {key: arrays[key].tobytes() for key in arrays if key != "record"}
-        record = without_times(json.loads(str(arrays["record"])))
-    return rest, record
+    with np.load(file) as archive:
+        arrays = {key: archive[key].tobytes() for key in archive if key != "record"}
+        record = without_times(json.loads(str(archive["record"])))
+    return with_arrays(record, arrays)
 
 
 def contents(folder: Path) -> dict[str, Any]:
