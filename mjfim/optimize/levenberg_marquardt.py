@@ -348,7 +348,7 @@ class _Trial:
         step: The complete step.
         unknowns: Values after the fraction of the step.
         cost: Cost at these values.
-        fraction: Fraction of the step that was taken.
+        fraction: Fraction of the step that was taken; above 1 where it was lengthened.
         ratio: Actual decrease of the cost over the predicted one.
     """
 
@@ -357,6 +357,11 @@ class _Trial:
     cost: float
     fraction: float
     ratio: float
+
+    @property
+    def length(self) -> float:
+        """Length of what was taken of the step [standard deviations]."""
+        return self.fraction * self.step.common_length
 
 
 class _Search:
@@ -449,7 +454,7 @@ class _Search:
         self.unknowns = trial.unknowns
         self.cost = trial.cost
         self._keep(trial.unknowns)
-        self._report(trial.step)
+        self._report(trial.length)
 
         if converged:
             return self._finished(trial.step)
@@ -698,13 +703,11 @@ class _Search:
         """Keep an iterate, with the private unknowns of the first segment only."""
         self.iterates.append(replace(at, private=at.private[:1]))
 
-    def _report(self, step: Step) -> None:
-        """Call the callback."""
+    def _report(self, length: float) -> None:
+        """Call the callback after a step of some length."""
         if self.callback is not None:
             self.callback(
-                IterationReport(
-                    iteration=self.iteration, cost=self.cost, step_length=step.common_length
-                )
+                IterationReport(iteration=self.iteration, cost=self.cost, step_length=length)
             )
 
     def _relax_damping(self, ratio: float) -> None:

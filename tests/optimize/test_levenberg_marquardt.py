@@ -6,6 +6,7 @@ The status names the reason where the search fails.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -621,6 +622,14 @@ def test_longer_steps_reach_the_minimum_of_a_robust_loss_sooner() -> None:
     assert again is not None
     assert [report.cost for report in reports] == [longer.cost(at) for at in again.iterates[1:]]
     assert (np.diff([report.cost for report in reports]) < 0.0).all()
+
+    # A reported length is that of the whole way, also where the step was lengthened.
+    for (before, after), report in zip(itertools.pairwise(again.iterates), reports, strict=True):
+        linearised = longer.condense(before)
+        assert linearised is not None
+        way = after.theta - before.theta
+        length = math.sqrt(way @ linearised.information() @ way)
+        assert report.step_length == pytest.approx(length, rel=1e-6)
 
     # Some accepted points lie beyond a tried one, on the line from the point before, but not far.
     seen = np.array([at.theta for at in longer.seen])
