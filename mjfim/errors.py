@@ -71,8 +71,19 @@ class NoResultError(MjfimError):
     """The computation was asked to stop before it had a result."""
 
 
-class UnfinishedError(Exception):
-    """The user wants the program to end; results that may be left out are not written."""
+class InterruptedByUserError(BaseException):
+    """The user wants the program to end, which has no result yet.
+
+    Like `KeyboardInterrupt`, this may come at any moment, and is no `Exception`: code that handles
+    errors of its own work must not take it for one of them.
+    """
+
+
+class UnfinishedError(BaseException):
+    """The user wants the program to end; results that may be left out are not written.
+
+    It is no `Exception`; see `InterruptedByUserError`.
+    """
 
 
 def unknown(kind: str, name: str, valid: Iterable[str]) -> str:

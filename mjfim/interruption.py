@@ -21,7 +21,7 @@ from types import FrameType, TracebackType
 from typing import Any, Protocol
 
 from mjfim.atomic_io import remove_temporary_files
-from mjfim.errors import NoResultError, UnfinishedError
+from mjfim.errors import InterruptedByUserError, UnfinishedError
 
 # Time after the first press at which files are left out that are not necessary [s]. Computations
 # usually end within about 5 s. What is drawn then may take much longer on a busy computer, and can
@@ -154,14 +154,14 @@ class Interruption:
         """React to a press.
 
         Raises:
-            NoResultError: There is nothing to keep yet.
+            InterruptedByUserError: There is nothing to keep yet.
             UnfinishedError: The second press, or the end of the time, while something is written
                 that may be left out.
         """
         if self._is_again_expected:
             self._is_again_expected = False
             error, self._postponed = self._postponed, None
-            if error is NoResultError or (error is not None and self._is_optional):
+            if error is InterruptedByUserError or (error is not None and self._is_optional):
                 self._leave(error, frame)
             return
 
@@ -184,7 +184,7 @@ class Interruption:
         # The error ends the program; a further press must not disturb that.
         if not self._requests and not self._has_result:
             self._has_result = True
-            self._leave(NoResultError, frame)
+            self._leave(InterruptedByUserError, frame)
         elif self._is_optional and self.hurried:
             self._leave(UnfinishedError, frame)
 
@@ -198,7 +198,11 @@ class Interruption:
 
         Args:
             folder: Folder that receives it, or None.
+
+        Raises:
+            InterruptedByUserError: A press came during an import, and the program goes on.
         """
+        self._end_if_postponed()
         self._has_result = True
         self.folder = folder or self.folder
 
@@ -208,7 +212,11 @@ class Interruption:
 
         Args:
             request: Asks the computation to stop; after an earlier press, it is asked at once.
+
+        Raises:
+            InterruptedByUserError: A press came during an import, and the program goes on.
         """
+        self._end_if_postponed()
         self._requests.append(request)
         if self.presses:
             request.request()
@@ -244,7 +252,7 @@ class Interruption:
             frame: What the main thread is running, or None.
 
         Raises:
-            NoResultError: It is the error.
+            InterruptedByUserError: It is the error.
             UnfinishedError: It is the error.
         """
         if _is_importing(frame):
@@ -266,7 +274,7 @@ class Interruption:
         if self._has_left and issubclass(dropped.exc_type, ResourceWarning):
             return
 
-        if dropped.exc_type in (NoResultError, UnfinishedError):
+        if dropped.exc_type in (InterruptedByUserError, UnfinishedError):
             self._raise_later(dropped.exc_type)
         else:
             self._hook_before(dropped)
@@ -282,8 +290,22 @@ class Interruption:
         self._again.daemon = True
         self._again.start()
 
+    def _end_if_postponed(self) -> None:
+        """End a program that goes on after an import in which the press came.
+
+        A short computation would end before the signal that raises the error.
+
+        Raises:
+            InterruptedByUserError: It was postponed.
+        """
+        if self._postponed is InterruptedByUserError:
+            self._postponed = None
+            raise InterruptedByUserError
+
     def _press_again(self) -> None:
         """Send the signal by which an error is raised that was postponed."""
+        if self._postponed is None:
+            return
         self._is_again_expected = True
         self._press_by_itself()
 

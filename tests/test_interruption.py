@@ -17,7 +17,7 @@ import pytest
 
 from mjfim import interruption as module
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import NoResultError
+from mjfim.errors import InterruptedByUserError
 from mjfim.interruption import Interruption, hurried, run_optional
 from tests.support.paths import ROOT
 
@@ -49,7 +49,7 @@ def _wait_for_an_end() -> None:
 def test_nothing_is_kept_before_there_is_a_result(
     interruption: Interruption, number: signal.Signals
 ) -> None:
-    with pytest.raises(NoResultError):
+    with pytest.raises(InterruptedByUserError):
         signal.raise_signal(number)
 
 
@@ -227,7 +227,7 @@ def test_an_import_is_finished_before_the_program_ends(
     interruption: Interruption, pressed: str
 ) -> None:
     """Python's own code for imports leaves files open where an error comes from outside."""
-    with pytest.raises(NoResultError):
+    with pytest.raises(InterruptedByUserError):
         _import_and_wait(pressed)
     assert sys.modules[pressed].IS_COMPLETE
 
@@ -246,12 +246,31 @@ def test_an_import_of_a_figure_is_finished_before_the_figure_is_left_out(
     assert interruption.presses == 2
 
 
+@pytest.mark.parametrize("begin", ["computing", "keep"])
+def test_no_work_begins_after_a_press_during_an_import(
+    interruption: Interruption, pressed: str, begin: str
+) -> None:
+    """Short work would end before the error comes, with a result that was asked to stop."""
+    importlib.import_module(pressed)
+    with pytest.raises(InterruptedByUserError):
+        interruption.keep() if begin == "keep" else _compute(interruption)
+
+    # The error is raised once.
+    time.sleep(4.0 * module.AGAIN_SECONDS)
+    assert interruption.presses == 1
+
+
+def _compute(interruption: Interruption) -> None:
+    with interruption.computing(StopToken()):
+        pytest.fail("the computation has begun")
+
+
 def test_presses_during_an_import_are_counted(
     interruption: Interruption, tmp_path: Path, pressed: str
 ) -> None:
     """The second press ends the process after some time, also where the import hangs."""
     (tmp_path / f"{pressed}.py").write_text(PRESSED + "signal.raise_signal(signal.SIGINT)\n")
-    with pytest.raises(NoResultError):
+    with pytest.raises(InterruptedByUserError):
         _import_and_wait(pressed)
     assert interruption.presses == 2
 

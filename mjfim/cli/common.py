@@ -32,6 +32,7 @@ from mjfim.amounts import MAX_THREADS
 from mjfim.atomic_io import observed_by, remove_temporary_files
 from mjfim.cli.inputs import require_inputs
 from mjfim.errors import (
+    InterruptedByUserError,
     MjfimError,
     ModelWarning,
     NoResultError,
@@ -454,10 +455,10 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         """Call the verb; print one message and exit for each error."""
         interruption = Interruption(_announce)
         try:
-            with interruption, _claims, _worded_warnings(), _pressed_during_import(interruption):
+            with interruption, _claims, _worded_warnings():
                 require_inputs(kwargs)
                 function(**kwargs)
-        except (NoResultError, UnfinishedError):
+        except (InterruptedByUserError, NoResultError, UnfinishedError):
             _say_what_is_there(interruption)
             raise typer.Exit(INTERRUPTED_CODE) from None
         except MjfimError as error:
@@ -486,17 +487,6 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
 
     app.command(function.__name__.rstrip("_").replace("_", "-"), cls=VerbCommand)(wrapped)
     return wrapped
-
-
-@contextmanager
-def _pressed_during_import(interruption: Interruption) -> Iterator[None]:
-    """Recognise a press during an import, where compiled modules raise an error of their own."""
-    try:
-        yield
-    except ImportError:
-        if interruption.presses:
-            raise NoResultError from None
-        raise
 
 
 @contextmanager

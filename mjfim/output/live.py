@@ -123,9 +123,6 @@ class _Watched:
                 show.end()
             else:
                 show(event)
-        except MjfimError:
-            # Ctrl-C is such an error; it concerns the search.
-            raise
         except Exception as error:
             self._show = None
             self._tell(f"the live view ended: {error}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 
-from mjfim.errors import MjfimError, UndrawnWarning, UnfinishedError
+from mjfim.errors import MjfimError, UndrawnWarning
 from mjfim.interruption import run_optional
 
 
@@ -29,7 +29,7 @@ def write_guarded(name: str, write: Callable[[], object]) -> None:
     """
     try:
         write()
-    except (MjfimError, OSError, UnfinishedError):
+    except (MjfimError, OSError):
         raise
     except Exception as error:
         fault = ": ".join(part for part in (type(error).__name__, str(error)) if part)

@@ -18,7 +18,7 @@ from rerun.chunk import RrdReader
 
 import mjfim
 from mjfim.cli.common import with_live_address
-from mjfim.errors import ExperimentError, NoResultError
+from mjfim.errors import ExperimentError, InterruptedByUserError
 from mjfim.experiment.system import System
 from mjfim.output import live as live_module
 from mjfim.output.live import live
@@ -354,10 +354,10 @@ class TestIndependence:
     def test_ctrl_c_reaches_the_search(self) -> None:
         class Interrupted:
             def __call__(self, event: Event) -> None:
-                raise NoResultError
+                raise InterruptedByUserError
 
         show = live_module._Watched(Interrupted(), print)  # type: ignore[arg-type]
-        with pytest.raises(NoResultError):
+        with pytest.raises(InterruptedByUserError):
             show(FitEvent(phase="all data", iteration=0, cost=1.0, step=1.0))
 
     @pytest.mark.slow
