@@ -205,6 +205,16 @@ class System:
             return replace(self, variant=variant, plant=plant(speeds, None))
         return replace(self, variant=variant, plant=plant((), plant(speeds, None)))
 
+    def without_laws(self) -> System:
+        """This system with the controls themselves as inputs; itself where it has no control laws.
+
+        Returns:
+            A system whose plant is not calibrated yet.
+        """
+        if self.laws is None:
+            return self
+        return replace(self, laws=None).with_variant(self.variant)
+
     def released(self, state: Array) -> System:
         """This system with another nominal initial state, which a design does not choose any more.
 

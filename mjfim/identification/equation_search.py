@@ -20,6 +20,7 @@ from mjfim.identification.equation_priors import EquationPriors
 from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.identification.motion_equations import MotionEquations, Rows
 from mjfim.identification.steady_bristles import StribeckParameters, stribeck_parameters
+from mjfim.model.control_laws import LawField
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.sizes import model_length, translations
 from mjfim.optimize.condensed_least_squares import bounded_least_squares, triangle
@@ -197,6 +198,7 @@ class EquationSearch:
         coordinates = LinearCoordinates.of(parameters, theta)
         contained = parameters.changes_model | (parameters.delay_derivative != 0.0)
         contained &= ~np.isin(parameters.names, system.experiment.fit.hold)
+        contained &= ~_of_laws(parameters)
         stribeck = tuple(
             each
             for each in stribeck_parameters(system)
@@ -606,6 +608,17 @@ class EquationSearch:
         covariance += moves @ moves.T
         covariance[speeds, speeds] += sigma**2
         return covariance
+
+
+def _of_laws(parameters: ParameterSet) -> np.ndarray:
+    """(p,) True for parameters that set numbers of control laws alone."""
+    return np.array(
+        [
+            bool(each.targets) and all(isinstance(t.field, LawField) for t in each.targets)
+            for each in parameters.parameters
+        ],
+        dtype=bool,
+    )
 
 
 def _inverse(information: Array, active: np.ndarray) -> Array:

@@ -22,6 +22,8 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.equation_search import EquationSearch, FoundEquations
+from mjfim.identification.known_controls import require_known_forces, with_known_controls
+from mjfim.identification.measured_forces import measured_forces
 from mjfim.identification.motion_equations import MotionEquations
 from mjfim.identification.residual_tests import whiteness_of
 from mjfim.parallel import one_blas_thread
@@ -45,9 +47,9 @@ def inverse_dynamics(
     """Fit parameters to the equation of motion along the measured motions.
 
     It needs the position or velocity of every degree of freedom, and the forces of the actuators,
-    measured or by the model from the control. It finds linear parameters from any start, in a small
-    part of the time of `identify`. Noise in velocities and accelerations biases it more, and
-    `identify` is the better estimator where a simulation follows the motion.
+    measured or by the model from the control in the log. It finds linear parameters from any start,
+    in a small part of the time of `identify`. Noise in velocities and accelerations biases it more,
+    and `identify` is the better estimator where a simulation follows the motion.
 
     Args:
         experiment: Model, parameters and noise; nothing else needs to be stated.
@@ -91,19 +93,19 @@ def fit_equations(
         The fit.
 
     Raises:
-        ExperimentError: Control laws compute the controls.
+        ExperimentError: Control laws compute controls, and a force of such an actuator was not
+            measured.
         RecordingError: A degree of freedom was not measured, or too little can be used.
     """
-    if system.laws is not None:
-        raise ExperimentError(
-            f"{system.experiment.source}: controllers: the equation of motion needs the controls "
-            "of the log, and a law computes them from the motion; fit with `identify` and without "
-            'fit.start = "inverse_dynamics"'
-        )
+    forces = measured_forces(system, recordings)
+    require_known_forces(system, recordings, forces)
+    recordings = [with_known_controls(system, each) for each in recordings]
+    system = system.without_laws()
+
     begun, steps = time.perf_counter(), system.plant.engine_steps
     parameters = system.parameters
     start = np.clip(start, parameters.lower, parameters.upper)
-    equations = MotionEquations.of(system, recordings, start)
+    equations = MotionEquations.of(system, recordings, forces, start)
     search = EquationSearch.of(system, equations, start)
     _require_rows(search, recordings)
 

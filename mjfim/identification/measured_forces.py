@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -26,17 +26,33 @@ class MeasuredForce:
         actuator: Address of the force of a single actuator; -1 for the force on a joint.
         dof: Degree of freedom on which all actuators act together; -1 for a single actuator.
         name: Name of the actuator or joint.
+        has_known_control: Whether recordings show the controls of its actuators; control laws may
+            compute them.
     """
 
     output: int
     actuator: int
     dof: int
     name: str
+    has_known_control: bool = True
 
     @property
     def is_of_joint(self) -> bool:
         """True for the force of all actuators on a joint."""
         return self.dof >= 0
+
+    def contains(self, model: mujoco.MjModel, actuator: int) -> bool:
+        """Return whether it contains all of the force of an actuator.
+
+        Args:
+            model: The model.
+            actuator: Index of the actuator.
+        """
+        if not self.is_of_joint:
+            return self.actuator == int(model.actuator_outadr[actuator])
+        if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+            return False
+        return self.dof == int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
 
 
 def measured_forces(
@@ -71,4 +87,18 @@ def measured_forces(
             address = int(model.actuator_outadr[element])
             name = element_name(model, "actuator", element)
             found.append(MeasuredForce(output=output, actuator=address, dof=-1, name=name))
-    return tuple(sorted(found, key=lambda force: force.is_of_joint))
+    computed = actuators_of_laws(system)
+    return tuple(
+        replace(force, has_known_control=not any(force.contains(model, i) for i in computed))
+        for force in sorted(found, key=lambda force: force.is_of_joint)
+    )
+
+
+def actuators_of_laws(system: System) -> tuple[int, ...]:
+    """Indices of the actuators whose controls are computed by control laws.
+
+    Args:
+        system: The system.
+    """
+    laws = () if system.laws is None else system.laws.laws
+    return tuple(int(system.model.actuator(law.actuator).id) for law in laws)

@@ -16,7 +16,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.measured_forces import measured_forces
+from mjfim.identification.measured_forces import MeasuredForce
 from mjfim.identification.measured_motion import measured_motion
 from mjfim.identification.recorded_equations import (
     Equation,
@@ -61,12 +61,18 @@ class MotionEquations:
     recorded: tuple[RecordedEquations, ...]
 
     @staticmethod
-    def of(system: System, recordings: Sequence[AlignedRecording], theta: Array) -> MotionEquations:
+    def of(
+        system: System,
+        recordings: Sequence[AlignedRecording],
+        forces: tuple[MeasuredForce, ...],
+        theta: Array,
+    ) -> MotionEquations:
         """The equations along recordings.
 
         Args:
-            system: The system that was recorded.
-            recordings: The recordings.
+            system: The system that was recorded, without control laws.
+            recordings: The recordings, with controls.
+            forces: Forces of actuators that are measured in a recording.
             theta: (p,) parameters at which the windows are chosen.
 
         Returns:
@@ -83,7 +89,7 @@ class MotionEquations:
         ]
         model = EquationModel(
             system=system.with_variant(RELAXED, Relaxation(constraints=True)),
-            measured_forces=measured_forces(system, recordings),
+            measured_forces=forces,
             friction_speeds=friction_speeds(motions),
         )
 

@@ -103,7 +103,10 @@ class EquationModel:
 
     @cached_property
     def equations(self) -> tuple[Equation, ...]:
-        """Equations of the degrees of freedom, and laws of actuators with a measured force."""
+        """Equations of the degrees of freedom, and laws of actuators with a measured force.
+
+        Where a control law computes the control of an actuator, its force has no equation.
+        """
         return tuple(_equations(self.system, self.measured_forces))
 
     def points(self, motion: MeasuredMotion, theta: Array, act: Array) -> MotionPoints:
@@ -290,4 +293,5 @@ def _equations(system: System, measured: Sequence[MeasuredForce]) -> Iterator[Eq
     for dof, name in enumerate(dof_names(system.model)):
         yield Equation(name=name, unit="N" if is_translation[dof] else "N m", dof=dof)
     for place, force in enumerate(measured):
-        yield Equation(name=f"law of {force.name}", law=place)
+        if force.has_known_control:
+            yield Equation(name=f"law of {force.name}", law=place)

@@ -494,8 +494,88 @@ def test_a_law_acts_on_a_motor_with_a_lag() -> None:
     assert 2.0 * found.cost < 1.15 * problem.value_count
 
 
-def test_the_equation_of_motion_is_refused() -> None:
+# ---- the equation of motion
+
+
+def arm_with_torques(folder: Path, controllers: dict[str, Any], sensors: str) -> mjfim.Experiment:
+    """The arm with measured torques, and guesses of its friction and inertia that are far off."""
+    text = ARM.read_text(encoding="utf-8")
+    text = text.replace("</mujoco>", f"<sensor>{sensors}</sensor></mujoco>")
+    (folder / "arm.xml").write_text(text, encoding="utf-8")
+    torques = {name: 0.02 for name in ("torque1", "torque2") if name in sensors}
+    return arm_experiment(
+        controllers,
+        model=str(folder / "arm.xml"),
+        parameters={
+            "mass": {"target": "body/fore:mass", "true": 1.2, "guess": 4.0},
+            "damping1": {"target": "joint/shoulder:damping", "true": 0.8, "guess": 3.0},
+            "damping2": {"target": "joint/elbow:damping", "true": 0.3, "guess": 0.05},
+            "kp": {"target": "controller/shoulder:kp", "true": 50.0, "guess": 20.0},
+        },
+        noise={"qpos:shoulder": 1e-5, "qpos:elbow": 1e-5, **torques},
+    )
+
+
+TORQUE1 = '<actuatorfrc name="torque1" actuator="shoulder"/>'
+TORQUE2 = '<actuatorfrc name="torque2" actuator="elbow"/>'
+
+
+@pytest.mark.parametrize(
+    ("controllers", "sensors"),
+    [
+        ({"shoulder": SHOULDER, "elbow": ELBOW}, TORQUE1 + TORQUE2),
+        ({"shoulder": SHOULDER}, TORQUE1),
+        ({"shoulder": SHOULDER}, '<jointactuatorfrc name="torque1" joint="shoulder"/>'),
+        ({"shoulder": SHOULDER}, TORQUE1 + TORQUE2),
+    ],
+)
+def test_measured_torques_take_the_place_of_controls_that_laws_compute(
+    controllers: dict[str, Any], sensors: str, tmp_path: Path
+) -> None:
+    """Gains of the laws are not in the equation of motion, and keep their guesses."""
+    experiment = arm_with_torques(tmp_path, controllers, sensors)
+    true = System.resolve(experiment).parameters.true
+    log = recorded(experiment, 3000, 4)
+
+    found = mjfim.inverse_dynamics(experiment, [log])
+
+    assert found.success
+    np.testing.assert_allclose(found.theta[:3], true[:3], rtol=0.05)
+    assert found.theta[3] == 20.0
+    assert found.absent == ("kp",)
+
+    # The motor of the elbow has an equation of its own where the log holds its control.
+    laws = [each.name for each in found.equations if each.name.startswith("law of")]
+    is_shown = "elbow" not in controllers and "torque2" in sensors
+    assert laws == (["law of elbow"] if is_shown else [])
+
+
+def test_the_fit_of_a_closed_loop_begins_at_the_equation_of_motion(tmp_path: Path) -> None:
+    experiment = arm_with_torques(
+        tmp_path, {"shoulder": SHOULDER, "elbow": ELBOW}, TORQUE1 + TORQUE2
+    ).replace(fit={"start": "inverse_dynamics", "bootstrap": 0})
+    true = System.resolve(experiment).parameters.true
+
+    found = mjfim.identify(experiment, [recorded(experiment, 500, 5)], progress=False)
+
+    assert found.success and not found.misfit
+    assert found.inverse_dynamics is not None
+    assert np.abs((found.theta - true) / found.std).max() < 4.0
+
+
+def test_the_equation_of_motion_needs_the_torque_of_every_law(tmp_path: Path) -> None:
     """It needs the controls, which the log of a closed loop does not hold."""
-    experiment = arm_experiment({"shoulder": SHOULDER}, parameters=PLANT, noise=NOISE)
-    with pytest.raises(ExperimentError, match="a law computes them from the motion"):
+    laws = {"shoulder": SHOULDER, "elbow": ELBOW}
+    experiment = arm_with_torques(tmp_path, laws, TORQUE1)
+    with pytest.raises(ExperimentError, match=r"controllers.elbow: the equation of motion needs"):
         mjfim.inverse_dynamics(experiment, [recorded(experiment, 100, 9)])
+
+    # The torque of one recording does not help another one.
+    experiment = arm_with_torques(tmp_path, {"shoulder": SHOULDER}, TORQUE1)
+    log = recorded(experiment, 100, 9)
+    column = log.outputs.index("torque1")
+    y = np.array(log.y)
+    y[:, column] = np.nan
+    without = replace(log, y=y, name="without.csv")
+    with pytest.raises(ExperimentError, match=r"which without.csv does not hold"):
+        mjfim.inverse_dynamics(experiment, [log, without])
