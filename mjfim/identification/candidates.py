@@ -16,13 +16,14 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
+from mjfim.model.control_laws import NUMBERS
 from mjfim.model.coordinates import ScalarJoint, scalar_joints
 from mjfim.model.elements import element_name, names_of
 from mjfim.model.paths import unit_of
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.terms.drives import SHORT_LAG
 from mjfim.model.terms.library import KINDS
-from mjfim.model.terms.term import TermTable
+from mjfim.model.terms.term import Term, TermTable
 from mjfim.records.missing_term import AddedTerm, TermParameter
 
 # Size at which the sensitivity of a term is taken where it is zero in the model, relative to the
@@ -35,6 +36,10 @@ STRIBECK_SHARES = (0.03, 0.1, 0.3)
 # Friction with the Stribeck effect in words.
 STRIBECK = "Stribeck friction"
 
+# Kind of the term of the library for friction that grows with the load, and this term in words.
+LOAD = "load_dependent_friction"
+LOAD_FRICTION = "friction that grows with the torque"
+
 # Fields of a joint that are candidates, with their names in words.
 JOINT_TERMS = {
     "frictionloss": "dry friction",
@@ -42,6 +47,12 @@ JOINT_TERMS = {
     "damping[1]": "quadratic damping",
     "armature": "rotor inertia",
     "stiffness": "a spring",
+}
+
+# Latencies of a control law that are candidates, with their names in words.
+LATENCIES = {
+    "latency": "late commands of the driver",
+    "feedback_latency": "late feedback of the driver",
 }
 
 # Smallest component of gravity, as a share of it, that does not count as zero.
@@ -119,7 +130,7 @@ def candidates_of(system: System, speeds: Array) -> Iterator[Candidate]:
         speeds: (nv,) root mean square of the speeds in the recordings [m/s or rad/s].
     """
     targets = targeted_paths(system)
-    of_model = (*_joint_terms(system), *_gains(system), *_tilts(system))
+    of_model = (*_joint_terms(system), *_latencies(system), *_gains(system), *_tilts(system))
     of_library = (*_frictions(system, speeds, targets), *_lags(system))
     of_sensors = (*_misalignments(system), *_output_errors(system))
     for candidate in (*of_model, *of_library, *of_sensors):
@@ -147,27 +158,10 @@ def load_candidates_of(system: System) -> Iterator[Candidate]:
     Args:
         system: The system.
     """
-    model: Any = system.model
-    kind = "load_dependent_friction"
-    targets = targeted_paths(system)
-    for actuator in range(model.nactuator):
-        name = element_name(model, "actuator", actuator)
-        if not name or int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
-            continue
-
-        joint = int(model.actuator_trnid[actuator, 0])
-        rubs = _has_dry_friction(
-            system, element_name(model, "joint", joint), int(model.jnt_dofadr[joint]), targets
-        )
-        if not rubs or has_term(system, kind, name):
-            continue
-
-        # The term may be impossible at this actuator, at a servo for example.
-        added = added_term(system, kind, name)
-        table = TermTable(name=added.name, element=(("actuator", name),))
-        try:
-            least = KINDS[kind].of(table, system.source.stated.model, period_of(system))
-        except ExperimentError:
+    for name in _loaded_motors(system):
+        added = added_term(system, LOAD, name)
+        least = _least_load_friction(system, added)
+        if least is None:
             continue
         coefficient = CandidateParameter(
             path=f"term/{added.name}:coefficient",
@@ -178,11 +172,53 @@ def load_candidates_of(system: System) -> Iterator[Candidate]:
             size=LINEARISATION_SIZE,
         )
         yield Candidate(
-            description=f"friction that grows with the torque of {name}",
+            description=f"{LOAD_FRICTION} of {name}",
             tested=(coefficient,),
             added=added,
-            source=KINDS[kind].sources[0],
+            source=KINDS[LOAD].sources[0],
         )
+
+
+def impossible_terms_of(system: System) -> Iterator[str]:
+    """Terms in words, each with the reason, that a model lacks and cannot have.
+
+    Args:
+        system: The system.
+    """
+    targets = targeted_paths(system)
+    if _is_rk4(system.model):
+        for joint in _rubbing_joints(system, targets):
+            if not any(has_term(system, kind, joint.name) for kind in ("stribeck", "lugre")):
+                yield f"{STRIBECK} of {joint.name} (its bristle is unstable with RK4)"
+    for name in _loaded_motors(system):
+        if _least_load_friction(system, added_term(system, LOAD, name)) is None:
+            yield f"{LOAD_FRICTION} of {name} (it needs a direct drive at a hinge)"
+
+
+def _loaded_motors(system: System) -> Iterator[str]:
+    """Names of the actuators at joints with dry friction, without friction that grows with load."""
+    model: Any = system.model
+    targets = targeted_paths(system)
+    for actuator in range(model.nactuator):
+        name = element_name(model, "actuator", actuator)
+        if not name or int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+            continue
+
+        joint = int(model.actuator_trnid[actuator, 0])
+        rubs = _has_dry_friction(
+            system, element_name(model, "joint", joint), int(model.jnt_dofadr[joint]), targets
+        )
+        if rubs and not has_term(system, LOAD, name):
+            yield name
+
+
+def _least_load_friction(system: System, added: AddedTerm) -> Term | None:
+    """The term at its least value; None where it is impossible, at a servo for example."""
+    table = TermTable(name=added.name, element=(("actuator", added.element_name),))
+    try:
+        return KINDS[LOAD].of(table, system.source.stated.model, period_of(system))
+    except ExperimentError:
+        return None
 
 
 def targeted_paths(system: System) -> set[str]:
@@ -345,6 +381,30 @@ def _tilts(system: System) -> Iterator[Candidate]:
         yield _single(f"a tilt of the base along {'xyz'[axis]}", number)
 
 
+def _latencies(system: System) -> Iterator[Candidate]:
+    """Latencies of every control law."""
+    model: Any = system.model
+    laws = () if system.laws is None else system.laws.laws
+    for field, words in LATENCIES.items():
+        for law in laws:
+            size = LINEARISATION_SIZE * period_of(system)
+            value = float(model.numeric_data[law.first + NUMBERS.index(field)])
+            latency = CandidateParameter(
+                path=f"controller/{law.actuator}:{field}",
+                unit="s",
+                positive=True,
+                value=value,
+                linearised_at=value or size,
+                size=size,
+            )
+            yield Candidate(
+                description=f"{words} of {law.actuator}",
+                tested=(latency,),
+                kind=words,
+                joint=law.joint,
+            )
+
+
 def _gains(system: System) -> Iterator[Candidate]:
     """Gain of every direct drive, such as a torque constant; servos have gains of their own."""
     model: Any = system.model
@@ -375,17 +435,25 @@ def _frictions(system: System, speeds: Array, targets: set[str]) -> Iterator[Can
     """Richer friction of every joint that has dry friction, in the model or as a parameter."""
     model: Any = system.model
     force = force_sizes(model, period_of(system) / LEAST_MOVE_PER_SAMPLE)
-    is_rk4 = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-    for joint in stated_joints(system):
-        if not element_name(model, "joint", joint.joint):
-            continue
-        if not _has_dry_friction(system, joint.name, joint.v, targets):
-            continue
-
+    for joint in _rubbing_joints(system, targets):
         size = LINEARISATION_SIZE * float(force[joint.v])
         yield from _asymmetric(system, joint, size)
-        if not is_rk4:
+        if not _is_rk4(model):
             yield from _stribeck(system, joint, float(speeds[joint.v]), size)
+
+
+def _rubbing_joints(system: System, targets: set[str]) -> Iterator[ScalarJoint]:
+    """Joints with a name that have dry friction, in the model or as a parameter."""
+    for joint in stated_joints(system):
+        if element_name(system.model, "joint", joint.joint) and _has_dry_friction(
+            system, joint.name, joint.v, targets
+        ):
+            yield joint
+
+
+def _is_rk4(model: Any) -> bool:
+    """Whether a model is integrated with RK4."""
+    return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def _asymmetric(system: System, joint: ScalarJoint, size: float) -> Iterator[Candidate]:

@@ -26,6 +26,7 @@ from mjfim.identification.candidates import (
     Candidate,
     CandidateParameter,
     candidates_of,
+    impossible_terms_of,
     load_candidates_of,
 )
 from mjfim.identification.data_parts import part_of_data
@@ -35,6 +36,7 @@ from mjfim.identification.extended_problems import (
     with_residuals_of,
 )
 from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.payload_candidates import payload_candidates_of
 from mjfim.identification.screened_terms import screened_terms
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -165,8 +167,8 @@ class TermTests:
         if self.data is None:
             return ""
         about_data = "" if self.data.is_complete else f" {self.data}"
-        about_terms = f" {self.data.untested_sentence}" if self.data.untested else ""
-        return about_data + about_terms
+        sentences = (self.data.untested_sentence, self.data.impossible_sentence)
+        return about_data + "".join(f" {sentence}" for sentence in sentences if sentence)
 
 
 def find_missing_terms(
@@ -184,7 +186,9 @@ def find_missing_terms(
     """
     system = problem.system
     groups = [
-        *in_groups(list(candidates_of(system, _typical_speeds(problem, at)))),
+        *in_groups(
+            [*candidates_of(system, _typical_speeds(problem, at)), *payload_candidates_of(system)]
+        ),
         # Contacts would slow down all simulations of the other candidates.
         *in_groups(list(load_candidates_of(system))),
     ]
@@ -203,6 +207,7 @@ def find_missing_terms(
             recordings=part.recording_count,
             count=len(problem.recordings),
             untested=tuple(dict.fromkeys(untested)),
+            impossible=tuple(impossible_terms_of(system)),
         ),
     )
 

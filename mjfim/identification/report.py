@@ -445,6 +445,8 @@ def _warnings(findings: _Findings) -> Iterator[str]:
         yield f"the model may lack {term}"
     if findings.tests.data is not None and findings.tests.data.untested:
         yield f"terms that the model may lack: {findings.tests.data.untested_sentence}"
+    if findings.reasons and findings.tests.data is not None and findings.tests.data.impossible:
+        yield f"terms that the model may lack: {findings.tests.data.impossible_sentence}"
 
     yield from _implausible_estimates(result.task.system.parameters, result.theta)
     yield from _warnings_of_poorly_known(findings.accuracy.poorly_known)

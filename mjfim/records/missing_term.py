@@ -155,12 +155,14 @@ class TermTestData:
         count: Number of all fitted recordings.
         untested: Terms in words that could not be tested, because the model cannot have them or the
             simulation diverges with them.
+        impossible: Terms in words, each with the reason, that a model of this kind cannot have.
     """
 
     share: float
     recordings: int
     count: int
     untested: tuple[str, ...] = ()
+    impossible: tuple[str, ...] = ()
 
     @property
     def is_complete(self) -> bool:
@@ -190,6 +192,13 @@ class TermTestData:
             f"{pronoun}: {first_ones(self.untested)}."
         )
 
+    @property
+    def impossible_sentence(self) -> str:
+        """Sentence about terms that this model cannot have; empty for none."""
+        if not self.impossible:
+            return ""
+        return f"Not tested in this model: {first_ones(self.impossible)}."
+
     def __str__(self) -> str:
         return f"Terms that the model may lack were tested on {self.amount}."
 
@@ -201,6 +210,7 @@ class TermTestData:
             "of_recordings": self.count,
             "words": str(self),
             "untested": list(self.untested),
+            "impossible": list(self.impossible),
         }
 
 

@@ -1,0 +1,98 @@
+"""Terms that a model may lack: latencies of drivers, and terms that a model cannot have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.experiment.system import System
+from mjfim.identification.candidates import candidates_of, impossible_terms_of
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.identify import least_squares
+from mjfim.identification.missing_terms import find_missing_terms
+from tests.support.closed_loop import arm_experiment
+
+LAW = {"kp": 40.0, "kd": 2.0, "rate": 500.0}
+DAMPING = {"damping": {"target": "joint/elbow:damping", "true": 0.3, "guess": 0.5}}
+
+FRICTION = """<mujoco><option integrator="{integrator}"/><worldbody><body name="cart">
+  <joint name="slide" type="slide" axis="1 0 0" frictionloss="0.1"/><geom size="0.1"/>
+  </body></worldbody><actuator><motor name="push" joint="slide"/></actuator></mujoco>"""
+
+
+def closed_loop(latency: float) -> mjfim.Experiment:
+    """The two-joint arm under a law at either joint, of which that of the elbow is late."""
+    laws = {"shoulder": LAW, "elbow": {**LAW, "latency": latency}}
+    return arm_experiment(laws, parameters=DAMPING)
+
+
+def test_a_late_driver_is_the_first_missing_term() -> None:
+    t = np.arange(600)[:, None] / 500.0
+    references = 0.4 * np.sin(2.0 * np.pi * t * np.array([1.3, 2.1]) + np.array([0.0, 1.0]))
+    log = mjfim.simulate(closed_loop(0.002), references, 1)
+
+    problem = FitProblem.of(System.resolve(closed_loop(0.0)), [log])
+    at = least_squares(problem, problem.system.parameters.guess).unknowns
+    first = find_missing_terms(problem, [log], at).terms[0]
+
+    assert first.path == "controller/elbow:latency"
+    assert first.value == pytest.approx(0.002, rel=0.05)
+    assert first.share > 0.99
+
+
+def test_a_latency_that_is_a_parameter_is_no_missing_term() -> None:
+    experiment = closed_loop(0.002)
+    known = {"late": {"target": "controller/elbow:latency"}}
+    paths = [
+        {each.path for each in candidates_of(system, np.ones(2))}
+        for system in (
+            System.resolve(experiment),
+            System.resolve(experiment.replace(parameters=known)),
+        )
+    ]
+    assert paths[0] - paths[1] == {"controller/elbow:latency"}
+    assert {"controller/shoulder:latency", "controller/elbow:feedback_latency"} <= paths[1]
+
+
+@pytest.mark.parametrize(
+    ("integrator", "words"),
+    [
+        (
+            "RK4",
+            [
+                "Stribeck friction of slide (its bristle is unstable with RK4)",
+                "friction that grows with the torque of push (it needs a direct drive at a hinge)",
+            ],
+        ),
+        (
+            "implicitfast",
+            ["friction that grows with the torque of push (it needs a direct drive at a hinge)"],
+        ),
+    ],
+)
+def test_terms_that_a_model_cannot_have_are_named(
+    integrator: str, words: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "cart.xml").write_text(FRICTION.format(integrator=integrator), encoding="utf-8")
+    experiment = mjfim.Experiment(
+        model=str(tmp_path / "cart.xml"),
+        rate=100.0,
+        noise={"state": 1e-3},
+        parameters={"friction": {"target": "joint/slide:frictionloss"}},
+    )
+    assert list(impossible_terms_of(System.resolve(experiment))) == words
+
+    # The estimate says so where it does not explain the data.
+    system = System.resolve(experiment)
+    force = 2.0 * np.sin(0.1 * np.arange(300))[:, None]
+    log = mjfim.simulate(experiment, force, 0)
+    tests = find_missing_terms(
+        problem := FitProblem.of(system, [log]), [log], problem.begin(system.parameters.guess)
+    )
+    assert tests.data is not None
+    assert list(tests.data.impossible) == words
+    assert words[0] in tests.remark
+    assert words[0] in str(tests.data.summary()["impossible"])
