@@ -134,6 +134,14 @@ def test_help() -> None:
         assert re.search(rf"^\W*{verb}\s+[A-Z]", result.stdout, re.MULTILINE), verb
 
 
+def test_help_shows_everything_that_stands_in_backticks() -> None:
+    """Square brackets are markup of the help, which leaves out their content."""
+    verbs = re.findall(r"^\W*([a-z-]+)\s+[A-Z]", run("--help").stdout, re.MULTILINE)
+    assert "simulate" in verbs
+    for verb in verbs:
+        assert "``" not in run(verb, "--help").stdout, verb
+
+
 def test_misuse_as_a_process(tmp_path: Path) -> None:
     """A process ends with one message and exit code 2; warnings are errors there."""
     path = write_experiment(tmp_path, rate="33.0")
