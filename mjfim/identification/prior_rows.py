@@ -98,9 +98,11 @@ class PriorRows:
             if not body.is_physical_after(begin, step):
                 return None
             theta[body.columns] = body.moved(begin, step)
-            place = np.ix_(body.columns, body.columns)
-            by_linear = body.derivative(body.linear(theta[body.columns]))
-            follows[place] = by_linear @ np.linalg.inv(body.derivative(body.linear(begin)))
+
+            # Without a way through barycentric coordinates, from which those of a body that is
+            # nearly a rod cannot always be found.
+            at_end, at_begin = body.linear_slopes(theta[body.columns]), body.linear_slopes(begin)
+            follows[np.ix_(body.columns, body.columns)] = np.linalg.solve(at_end.T, at_begin.T)
 
         end = replace(at, theta=theta, per_recording=own)
         rows = self.common(end)

@@ -64,7 +64,7 @@ from mjfim.records.estimate import Estimate, Whiteness
 from mjfim.records.intervals import NORMAL_95
 from mjfim.records.recording import Recording
 from mjfim.studies.selection import select_terms_system
-from scripts.benchmarks.arm_models import TIMESTEP, Arm, panda, ur5e
+from scripts.benchmarks.arm_models import LAWS, TIMESTEP, Arm, panda, ur5e
 
 # Samples of the controller per measurement, and the longest delay of the measurements [samples].
 STRIDE = 4
@@ -80,6 +80,9 @@ SPREAD = 0.2
 STRIBECK = (0.2, 0.5)
 OFFSET = (-0.2, 0.2)
 STRIBECK_SPEED = 0.1
+
+# True gains of discrete laws over those of the guess.
+GAINS = (0.75, 1.3)
 
 # Fundamental frequency [Hz] and number of harmonics of the references, and the share of the ranges
 # of the joints that they use.
@@ -194,7 +197,7 @@ def arm_of(name: str) -> Arm:
     Raises:
         ValueError: Its model is absent.
     """
-    arm = panda() if name == "Panda" else ur5e()
+    arm = panda() if name == "Panda" else ur5e(has_laws=name == LAWS)
     if arm is None:
         raise ValueError(f"the model of {name} is absent")
     return arm
@@ -225,6 +228,12 @@ def stated(arm: Arm, folder: Path, *, is_richer: bool) -> mjfim.Experiment:
         parameters[f"excess {joint}"] = {"target": f"term/stribeck {joint}:excess"}
         parameters[f"speed {joint}"] = {"target": f"term/stribeck {joint}:speed"}
         parameters[f"offset {joint}"] = {"target": f"term/offset {joint}:offset"}
+    controllers: dict[str, Any] = {}
+    for joint, (kp, kd) in zip(arm.joints, () if arm.gains is None else arm.gains, strict=False):
+        controllers[joint] = {"kp": float(kp), "kd": float(kd), "rate": 1.0 / TIMESTEP}
+        for field in ("kp", "kd"):
+            target = f"controller/{joint}:{field}"
+            parameters[f"{field} {joint}"] = {"target": target, "nuisance": True}
     noise = {f"qpos:{joint}": ANGLE_SIGMA for joint in arm.joints}
     torques = [f"torque_{joint}" for joint in arm.joints]
     noise |= dict(zip(torques, arm.sigma.tolist(), strict=True))
@@ -235,6 +244,7 @@ def stated(arm: Arm, folder: Path, *, is_richer: bool) -> mjfim.Experiment:
         initial={"qpos": arm.home.tolist()},
         parameters=parameters,
         terms=terms,
+        controllers=controllers,
         nuisance={"delay": True},
         noise=noise,
         fit={"start": "inverse_dynamics", "segments": 1.0, "bootstrap": 200},
@@ -260,6 +270,9 @@ def robot(arm: Arm, system: System, lacks: bool, rng: np.random.Generator) -> tu
     for joint, typical in zip(arm.joints, arm.friction.tolist(), strict=True):
         theta[names.index(f"damping {joint}")] = typical * rng.uniform(0.5, 2.0)
         theta[names.index(f"frictionloss {joint}")] = typical * rng.uniform(0.5, 1.5)
+    for j, name in enumerate(names):
+        if name.startswith(("kp ", "kd ")):
+            theta[j] *= rng.uniform(*GAINS)
     theta[names.index("delay")] = TIMESTEP * int(rng.integers(1, MAX_DELAY + 1))
     if not lacks:
         return system, theta

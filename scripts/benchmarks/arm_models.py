@@ -35,6 +35,8 @@ class Arm:
         range: (n,) largest distances from them [rad].
         friction: (n,) typical dry friction [N m] and viscous friction [N m s/rad].
         sigma: (n,) standard deviations of the measured torques [N m].
+        gains: (n, 2) gains [N m/rad] and [N m s/rad] of the discrete laws of its drivers, whose
+            motors take torques; None where the model has servos.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Arm:
     range: Array
     friction: Array
     sigma: Array
+    gains: Array | None = None
 
 
 def with_sensors(spec: mujoco.MjSpec) -> str:
@@ -110,8 +113,17 @@ UR_KP = (6000.0, 6000.0, 4000.0, 800.0, 800.0, 800.0)
 UR_KV = (300.0, 300.0, 200.0, 40.0, 40.0, 40.0)
 
 
-def ur5e() -> Arm:
-    """An arm with the dimensions and masses of a UR5e."""
+# Name of the arm with discrete laws.
+LAWS = "UR5e, discrete laws"
+
+
+def ur5e(*, has_laws: bool = False) -> Arm:
+    """An arm with the dimensions and masses of a UR5e.
+
+    Args:
+        has_laws: Whether discrete laws move it in place of servos. These have half of the gains, so
+            that they are stable at their rate.
+    """
     spec = mujoco.MjSpec()
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     parent = spec.worldbody
@@ -134,11 +146,14 @@ def ur5e() -> Arm:
         body.fullinertia = _cylinder(UR_MASS[i], UR_RADIUS[i], end)
         parent, place, turn = body, end, alpha
         actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=UR_KP[i], kv=UR_KV[i])
+        if has_laws:
+            actuator.set_to_motor()
+        else:
+            actuator.set_to_position(kp=UR_KP[i], kv=UR_KV[i])
 
     large = np.arange(6) < 3
     return Arm(
-        name="UR5e",
+        name=LAWS if has_laws else "UR5e",
         xml=with_sensors(spec),
         joints=UR_JOINTS,
         links=tuple(f"link_{joint}" for joint in UR_JOINTS),
@@ -146,6 +161,7 @@ def ur5e() -> Arm:
         range=np.array([1.5, 0.6, 0.9, 1.2, 1.2, 1.5]),
         friction=np.where(large, 6.0, 1.2),
         sigma=np.where(large, 0.6, 0.15),
+        gains=0.5 * np.array([UR_KP, UR_KV]).T if has_laws else None,
     )
 
 
