@@ -19,9 +19,10 @@ from mjfim.identification.averages import PER_WINDOW
 from mjfim.identification.equation_priors import EquationPriors
 from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.identification.motion_equations import MotionEquations, Rows
+from mjfim.identification.recorded_equations import EquationModel
 from mjfim.identification.steady_bristles import StribeckParameters, stribeck_parameters
 from mjfim.model.control_laws import LawField
-from mjfim.model.parameters import ParameterSet
+from mjfim.model.parameters import ParameterSet, Target
 from mjfim.model.sizes import model_length, translations
 from mjfim.optimize.condensed_least_squares import bounded_least_squares, triangle
 
@@ -198,7 +199,7 @@ class EquationSearch:
         coordinates = LinearCoordinates.of(parameters, theta)
         contained = parameters.changes_model | (parameters.delay_derivative != 0.0)
         contained &= ~np.isin(parameters.names, system.experiment.fit.hold)
-        contained &= ~_of_laws(parameters)
+        contained &= ~_of_laws(parameters, equations.model)
         stribeck = tuple(
             each
             for each in stribeck_parameters(system)
@@ -610,13 +611,16 @@ class EquationSearch:
         return covariance
 
 
-def _of_laws(parameters: ParameterSet) -> np.ndarray:
-    """(p,) True for parameters that set numbers of control laws alone."""
+def _of_laws(parameters: ParameterSet, model: EquationModel) -> np.ndarray:
+    """(p,) True for parameters that set only numbers of control laws that no equation contains."""
+    contained = model.gain_rows
+
+    def is_left_out(target: Target) -> bool:
+        """Whether a target is a number of a law that no equation contains."""
+        return isinstance(target.field, LawField) and not contained & set(target.field.rows)
+
     return np.array(
-        [
-            bool(each.targets) and all(isinstance(t.field, LawField) for t in each.targets)
-            for each in parameters.parameters
-        ],
+        [bool(p.targets) and all(map(is_left_out, p.targets)) for p in parameters.parameters],
         dtype=bool,
     )
 

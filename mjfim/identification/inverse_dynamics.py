@@ -22,7 +22,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
 from mjfim.identification.equation_search import EquationSearch, FoundEquations
-from mjfim.identification.known_controls import require_known_forces, with_known_controls
+from mjfim.identification.known_controls import require_known_forces
 from mjfim.identification.measured_forces import measured_forces
 from mjfim.identification.motion_equations import MotionEquations
 from mjfim.identification.residual_tests import whiteness_of
@@ -97,15 +97,14 @@ def fit_equations(
             measured.
         RecordingError: A degree of freedom was not measured, or too little can be used.
     """
-    forces = measured_forces(system, recordings)
+    forces, laws = measured_forces(system, recordings), system.laws
     require_known_forces(system, recordings, forces)
-    recordings = [with_known_controls(system, each) for each in recordings]
     system = system.without_laws()
 
     begun, steps = time.perf_counter(), system.plant.engine_steps
     parameters = system.parameters
     start = np.clip(start, parameters.lower, parameters.upper)
-    equations = MotionEquations.of(system, recordings, forces, start)
+    equations = MotionEquations.of(system, recordings, start, forces=forces, laws=laws)
     search = EquationSearch.of(system, equations, start)
     _require_rows(search, recordings)
 

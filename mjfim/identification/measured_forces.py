@@ -26,8 +26,8 @@ class MeasuredForce:
         actuator: Address of the force of a single actuator; -1 for the force on a joint.
         dof: Degree of freedom on which all actuators act together; -1 for a single actuator.
         name: Name of the actuator or joint.
-        has_known_control: Whether recordings show the controls of its actuators; control laws may
-            compute them.
+        has_known_control: Whether the controls of its actuators follow from a recording. Those of a
+            control law with an integral, or before the dynamics of an actuator, do not.
     """
 
     output: int
@@ -87,18 +87,22 @@ def measured_forces(
             address = int(model.actuator_outadr[element])
             name = element_name(model, "actuator", element)
             found.append(MeasuredForce(output=output, actuator=address, dof=-1, name=name))
-    computed = actuators_of_laws(system)
+    hidden = [
+        actuator
+        for actuator, integrates in actuators_of_laws(system).items()
+        if integrates or model.actuator_actnum[actuator]
+    ]
     return tuple(
-        replace(force, has_known_control=not any(force.contains(model, i) for i in computed))
+        replace(force, has_known_control=not any(force.contains(model, i) for i in hidden))
         for force in sorted(found, key=lambda force: force.is_of_joint)
     )
 
 
-def actuators_of_laws(system: System) -> tuple[int, ...]:
-    """Indices of the actuators whose controls are computed by control laws.
+def actuators_of_laws(system: System) -> dict[int, bool]:
+    """Indices of the actuators whose controls are computed by laws, and which have an integral.
 
     Args:
         system: The system.
     """
     laws = () if system.laws is None else system.laws.laws
-    return tuple(int(system.model.actuator(law.actuator).id) for law in laws)
+    return {int(system.model.actuator(law.actuator).id): law.integrates for law in laws}

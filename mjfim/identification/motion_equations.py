@@ -24,6 +24,7 @@ from mjfim.identification.recorded_equations import (
     RecordedEquations,
     friction_speeds,
 )
+from mjfim.model.control_laws import ControlLaws
 from mjfim.model.variants import RELAXED, Relaxation
 from mjfim.plant.equation_of_motion import EquationTerms
 
@@ -64,16 +65,19 @@ class MotionEquations:
     def of(
         system: System,
         recordings: Sequence[AlignedRecording],
-        forces: tuple[MeasuredForce, ...],
         theta: Array,
+        *,
+        forces: tuple[MeasuredForce, ...],
+        laws: ControlLaws | None,
     ) -> MotionEquations:
         """The equations along recordings.
 
         Args:
             system: The system that was recorded, without control laws.
-            recordings: The recordings, with controls.
-            forces: Forces of actuators that are measured in a recording.
+            recordings: The recordings.
             theta: (p,) parameters at which the windows are chosen.
+            forces: Forces of actuators that are measured in a recording.
+            laws: Laws that have computed controls of the recordings; None without any.
 
         Returns:
             The equations.
@@ -90,17 +94,20 @@ class MotionEquations:
         model = EquationModel(
             system=system.with_variant(RELAXED, Relaxation(constraints=True)),
             measured_forces=forces,
+            laws=laws,
             friction_speeds=friction_speeds(motions),
         )
 
         # Contacts and stops act in the stated model.
         stated = EquationModel(
-            system=system, measured_forces=(), friction_speeds=model.friction_speeds
+            system=system, measured_forces=(), laws=laws, friction_speeds=model.friction_speeds
         )
         recorded = []
         for motion in motions:
             compiled = system.plant.model(theta)
-            points = stated.points(motion, theta, stated.activations([compiled], motion)[0])
+            points = stated.points(
+                motion, compiled, theta, stated.activations([compiled], motion)[0]
+            )
             constrained = stated.equation.constrained(compiled, points)
             recorded.append(model.recorded(motion, theta, constrained))
         return MotionEquations(model=model, recorded=tuple(recorded))
@@ -166,7 +173,7 @@ class MotionEquations:
         for each in self.recorded:
             act = self.model.activations(models, each.motion)
             for k, (model, theta) in enumerate(zip(models, thetas, strict=True)):
-                points = self.model.points(each.motion, theta, act[min(k, len(act) - 1)])
+                points = self.model.points(each.motion, model, theta, act[min(k, len(act) - 1)])
                 terms = self.model.equation.terms(model, points)
                 found[k].append(self._averaged(each, terms))
         return [self._joined(parts, bool(ok)) for parts, ok in zip(found, compiled, strict=True)]

@@ -12,9 +12,11 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.averages import Averages, hann_averages
+from mjfim.identification.known_controls import GAINS, controls_along, held_controls
 from mjfim.identification.measured_forces import MeasuredForce
 from mjfim.identification.measured_motion import POINTS_PER_INTERVAL, REACH, MeasuredMotion
 from mjfim.identification.steady_bristles import bristles_of
+from mjfim.model.control_laws import NUMBERS, ControlLaws
 from mjfim.model.coordinates import dof_names
 from mjfim.model.sizes import translations
 from mjfim.model.targets import ModelField
@@ -86,11 +88,14 @@ class EquationModel:
     Attributes:
         system: The system, whose plant has no constraints.
         measured_forces: The measured forces.
+        laws: Laws that have computed controls of the recordings; None without any. The system has
+            none: controls are its inputs.
         friction_speeds: (nv,) speeds below which dry friction is viscous [m/s or rad/s].
     """
 
     system: System
     measured_forces: tuple[MeasuredForce, ...]
+    laws: ControlLaws | None
     friction_speeds: Array
 
     @cached_property
@@ -105,15 +110,29 @@ class EquationModel:
     def equations(self) -> tuple[Equation, ...]:
         """Equations of the degrees of freedom, and laws of actuators with a measured force.
 
-        Where a control law computes the control of an actuator, its force has no equation.
+        Where no recording shows the control of an actuator, its force has no equation.
         """
         return tuple(_equations(self.system, self.measured_forces))
 
-    def points(self, motion: MeasuredMotion, theta: Array, act: Array) -> MotionPoints:
+    @cached_property
+    def gain_rows(self) -> frozenset[int]:
+        """Places, among the custom numbers of the model, of the gains of laws with an equation."""
+        model = self.system.model
+        known = [force for force in self.measured_forces if force.has_known_control]
+        laws = () if self.laws is None else self.laws.laws
+        return frozenset(
+            law.first + NUMBERS.index(gain)
+            for law in laws
+            if any(force.contains(model, model.actuator(law.actuator).id) for force in known)
+            for gain in GAINS
+        )
+
+    def points(self, motion: MeasuredMotion, model: Any, theta: Array, act: Array) -> MotionPoints:
         """Points of a motion.
 
         Args:
             motion: The motion.
+            model: The model at these parameters, with the numbers of the laws.
             theta: (p,) parameters, of which only delays matter.
             act: (n, na) activations.
         """
@@ -121,7 +140,7 @@ class EquationModel:
         return MotionPoints(
             states=np.concatenate([motion.qpos, motion.qvel, act], axis=1),
             acceleration=motion.qacc,
-            ctrl=motion.control(delay),
+            ctrl=controls_along(motion, model, self.laws, delay),
         )
 
     def activations(self, models: Sequence[Any], motion: MeasuredMotion) -> list[Array]:
@@ -167,7 +186,7 @@ class EquationModel:
             self.system.plant.simulator,
             models,
             self.system.nominal_initial_state,
-            recording.ctrl,
+            held_controls(recording, self.laws, self.system.model.nu),
         )
         samples = recording.dt * np.arange(found.shape[1])
         return [
@@ -186,7 +205,7 @@ class EquationModel:
             constrained: (n, nv) True where contacts, stops or equalities act.
         """
         model = self.system.plant.model(theta)
-        points = self.points(motion, theta, self.activations([model], motion)[0])
+        points = self.points(motion, model, theta, self.activations([model], motion)[0])
 
         # Points where unknown forces act do not count.
         usable = motion.usable & ~constrained

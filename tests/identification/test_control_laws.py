@@ -532,7 +532,7 @@ TORQUE2 = '<actuatorfrc name="torque2" actuator="elbow"/>'
 def test_measured_torques_take_the_place_of_controls_that_laws_compute(
     controllers: dict[str, Any], sensors: str, tmp_path: Path
 ) -> None:
-    """Gains of the laws are not in the equation of motion, and keep their guesses."""
+    """The gain of a law follows from the measured torque, in an equation of its own."""
     experiment = arm_with_torques(tmp_path, controllers, sensors)
     true = System.resolve(experiment).parameters.true
     log = recorded(experiment, 3000, 4)
@@ -541,13 +541,24 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
 
     assert found.success
     np.testing.assert_allclose(found.theta[:3], true[:3], rtol=0.05)
+    assert found.theta[3] == pytest.approx(true[3], rel=0.05)
+    assert not found.absent
+    laws = [each.name for each in found.equations if each.name.startswith("law of")]
+    assert laws == ["law of shoulder", "law of elbow"][: sensors.count("torque")]
+
+
+def test_a_law_with_an_integral_has_no_equation(tmp_path: Path) -> None:
+    """A part of a recording does not show its integral, so that gains keep their guesses."""
+    laws = {"shoulder": {**SHOULDER, "ki": 20.0}, "elbow": ELBOW}
+    experiment = arm_with_torques(tmp_path, laws, TORQUE1 + TORQUE2)
+    true = System.resolve(experiment).parameters.true
+
+    found = mjfim.inverse_dynamics(experiment, [recorded(experiment, 3000, 4)])
+
+    np.testing.assert_allclose(found.theta[:3], true[:3], rtol=0.05)
     assert found.theta[3] == 20.0
     assert found.absent == ("kp",)
-
-    # The motor of the elbow has an equation of its own where the log holds its control.
-    laws = [each.name for each in found.equations if each.name.startswith("law of")]
-    is_shown = "elbow" not in controllers and "torque2" in sensors
-    assert laws == (["law of elbow"] if is_shown else [])
+    assert [each.name for each in found.equations][2:] == ["law of elbow"]
 
 
 def test_the_fit_of_a_closed_loop_begins_at_the_equation_of_motion(tmp_path: Path) -> None:
