@@ -131,7 +131,12 @@ class Interruption:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Restore the handlers of before."""
+        """Restore the handlers of before.
+
+        Raises:
+            InterruptedByUserError: A press came during an import, and the work has ended without a
+                result that is kept.
+        """
         global _current
         if not self._before:
             return
@@ -150,6 +155,10 @@ class Interruption:
         if self._watcher is not None:
             self._watcher.join(timeout=WATCHER_SECONDS)
 
+        # Short work may end before an error comes that was postponed.
+        if kind is None:
+            self._end_if_postponed()
+
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """React to a press.
 
@@ -158,18 +167,15 @@ class Interruption:
             UnfinishedError: The second press, or the end of the time, while something is written
                 that may be left out.
         """
-        if self._is_again_expected:
-            self._is_again_expected = False
+        # This handler has sent the signal itself; two of its signals may arrive as one. After the
+        # time for files that may be left out, computations go on.
+        if self._is_again_expected or self._is_own_press_expected:
             error, self._postponed = self._postponed, None
+            if error is None and self._is_own_press_expected:
+                error = UnfinishedError
+            self._is_again_expected = self._is_own_press_expected = False
             if error is InterruptedByUserError or (error is not None and self._is_optional):
                 self._leave(error, frame)
-            return
-
-        # The thread that watches has sent this signal; computations go on.
-        if self._is_own_press_expected:
-            self._is_own_press_expected = False
-            if self._is_optional:
-                self._leave(UnfinishedError, frame)
             return
         self.presses += 1
 

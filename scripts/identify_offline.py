@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 
 import mjfim
-from mjfim.errors import MjfimError, NoResultError
+from mjfim.errors import InterruptedByUserError, MjfimError, NoResultError
 from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS, Interruption
 
 
@@ -42,7 +42,7 @@ def main() -> int:
         with Interruption(announce) as interruption:
             code = identify(args.experiment, args.recordings, force=args.force)
         return INTERRUPTED_CODE if interruption.presses else code
-    except NoResultError:
+    except (InterruptedByUserError, NoResultError):
         announce(NOTHING_SENTENCE)
         return INTERRUPTED_CODE
     except MjfimError as error:

@@ -265,6 +265,11 @@ def _compute(interruption: Interruption) -> None:
         pytest.fail("the computation has begun")
 
 
+def test_the_end_of_the_work_does_not_hide_a_press_during_an_import(pressed: str) -> None:
+    with pytest.raises(InterruptedByUserError), Interruption(lambda _: None):
+        importlib.import_module(pressed)
+
+
 def test_presses_during_an_import_are_counted(
     interruption: Interruption, tmp_path: Path, pressed: str
 ) -> None:

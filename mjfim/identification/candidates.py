@@ -160,8 +160,9 @@ def load_candidates_of(system: System) -> Iterator[Candidate]:
     """
     for name in _loaded_motors(system):
         added = added_term(system, LOAD, name)
-        least = _least_load_friction(system, added)
-        if least is None:
+        try:
+            least = _least_load_friction(system, added)
+        except ExperimentError:
             continue
         coefficient = CandidateParameter(
             path=f"term/{added.name}:coefficient",
@@ -191,13 +192,20 @@ def impossible_terms_of(system: System) -> Iterator[str]:
             if not any(has_term(system, kind, joint.name) for kind in ("stribeck", "lugre")):
                 yield f"{STRIBECK} of {joint.name} (its bristle is unstable with RK4)"
     for name in _loaded_motors(system):
-        if _least_load_friction(system, added_term(system, LOAD, name)) is None:
-            yield f"{LOAD_FRICTION} of {name} (it needs a direct drive at a hinge)"
+        try:
+            _least_load_friction(system, added_term(system, LOAD, name))
+        except ExperimentError as error:
+            # The message begins with a key, and ends with what would be right.
+            reason = str(error).partition(": ")[2].partition(";")[0]
+            yield f"{LOAD_FRICTION} of {name} ({reason})"
 
 
 def _loaded_motors(system: System) -> Iterator[str]:
-    """Names of the actuators at joints with dry friction, without friction that grows with load."""
-    model: Any = system.model
+    """Names of the actuators at joints with dry friction, without friction that grows with load.
+
+    Actuators that terms have added are none of them.
+    """
+    model: Any = system.source.stated.model
     targets = targeted_paths(system)
     for actuator in range(model.nactuator):
         name = element_name(model, "actuator", actuator)
@@ -206,19 +214,16 @@ def _loaded_motors(system: System) -> Iterator[str]:
 
         joint = int(model.actuator_trnid[actuator, 0])
         rubs = _has_dry_friction(
-            system, element_name(model, "joint", joint), int(model.jnt_dofadr[joint]), targets
+            model, element_name(model, "joint", joint), int(model.jnt_dofadr[joint]), targets
         )
         if rubs and not has_term(system, LOAD, name):
             yield name
 
 
-def _least_load_friction(system: System, added: AddedTerm) -> Term | None:
-    """The term at its least value; None where it is impossible, at a servo for example."""
+def _least_load_friction(system: System, added: AddedTerm) -> Term:
+    """The term at its least value; ExperimentError where it is impossible, such as at a servo."""
     table = TermTable(name=added.name, element=(("actuator", added.element_name),))
-    try:
-        return KINDS[LOAD].of(table, system.source.stated.model, period_of(system))
-    except ExperimentError:
-        return None
+    return KINDS[LOAD].of(table, system.source.stated.model, period_of(system))
 
 
 def targeted_paths(system: System) -> set[str]:
@@ -239,9 +244,8 @@ def _without_index(path: str) -> str:
     return path.removesuffix("[0]")
 
 
-def _has_dry_friction(system: System, joint: str, v: int, targets: set[str]) -> bool:
+def _has_dry_friction(model: Any, joint: str, v: int, targets: set[str]) -> bool:
     """Whether a joint with the degree of freedom v has dry friction, stated or as a parameter."""
-    model: Any = system.model
     return bool(model.dof_frictionloss[v]) or f"joint/{joint}:frictionloss" in targets
 
 
@@ -446,7 +450,7 @@ def _rubbing_joints(system: System, targets: set[str]) -> Iterator[ScalarJoint]:
     """Joints with a name that have dry friction, in the model or as a parameter."""
     for joint in stated_joints(system):
         if element_name(system.model, "joint", joint.joint) and _has_dry_friction(
-            system, joint.name, joint.v, targets
+            system.model, joint.name, joint.v, targets
         ):
             yield joint
 

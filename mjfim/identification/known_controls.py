@@ -17,10 +17,9 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.measured_forces import MeasuredForce, actuators_of_laws
-from mjfim.identification.measured_motion import MeasuredMotion
-from mjfim.model.control_laws import NUMBERS, ControlLaw, ControlLaws
-from mjfim.model.elements import element_name
+from mjfim.identification.measured_forces import MeasuredForce, laws_of_actuators
+from mjfim.identification.measured_motion import FEWEST_READINGS, MeasuredMotion
+from mjfim.model.control_laws import NUMBERS, ControlLaw, ControlLaws, Quantity
 from mjfim.plant.law_commands import ON
 
 # Numbers of a law that the equation of motion may determine; its times and limits keep their start.
@@ -40,16 +39,16 @@ def require_known_forces(
     Raises:
         ExperimentError: A recording holds no force of such an actuator.
     """
-    for actuator in actuators_of_laws(system):
+    for actuator, law in laws_of_actuators(system).items():
         outputs = [force.output for force in forces if force.contains(system.model, actuator)]
-        name = element_name(system.model, "actuator", actuator)
         for recording in recordings:
-            if not recording.measured[:, outputs].any():
+            if recording.measured[:, outputs].sum() < FEWEST_READINGS:
                 raise ExperimentError(
-                    f"{system.experiment.source}: controllers.{name}: the equation of motion needs "
-                    f"the control of {name}, which this law computes, or its measured force, which "
-                    f"{recording.name} does not hold; add a sensor `actuatorfrc` to the model and "
-                    'its column to the log, or remove fit.start = "inverse_dynamics"'
+                    f"{system.experiment.source}: controllers.{law.actuator}: the equation of "
+                    f"motion needs the control of {law.actuator}, which this law computes, or its "
+                    f"measured force, which {recording.name} does not hold; add a sensor "
+                    "`actuatorfrc` or `jointactuatorfrc` to the model and its column to the log, "
+                    'or remove fit.start = "inverse_dynamics"'
                 )
 
 
@@ -61,12 +60,7 @@ def held_controls(recording: AlignedRecording, laws: ControlLaws | None, nu: int
         laws: The laws; None without any.
         nu: Number of controls.
     """
-    if laws is None:
-        return recording.ctrl
-    inputs, controls = laws.direct
-    found = np.zeros((len(recording.ctrl), nu))
-    found[:, controls] = recording.ctrl[:, inputs]
-    return found
+    return recording.ctrl if laws is None else _stated(recording.ctrl, laws, nu)
 
 
 def controls_along(
@@ -80,39 +74,56 @@ def controls_along(
         laws: The laws; None without any.
         delay: Time by which the readings lag [s].
     """
-    recorded = motion.control(delay)
+    inputs = motion.control(delay)
     if laws is None:
-        return recorded
-    inputs, controls = laws.direct
-    found = np.zeros((len(motion.t), model.nu))
-    found[:, controls] = recorded[:, inputs]
+        return inputs
+    found = _stated(inputs, laws, model.nu)
     for law in laws.laws:
-        found[:, law.control] = _control_of(law, motion, model, delay)
+        found[:, law.control] = _control_of(law, motion, model, laws.held, delay)
     return found
 
 
-def _control_of(law: ControlLaw, motion: MeasuredMotion, model: Any, delay: float) -> Array:
+def _stated(inputs: Array, laws: ControlLaws, nu: int) -> Array:
+    """(n, nu) controls that are inputs themselves, zero for those of laws; inputs: (n, w)."""
+    columns, controls = laws.direct
+    found = np.zeros((len(inputs), nu))
+    found[:, controls] = inputs[:, columns]
+    return found
+
+
+def _control_of(
+    law: ControlLaw, motion: MeasuredMotion, model: Any, held: np.ndarray, delay: float
+) -> Array:
     """(n,) control that a law computes from a log and a measured motion, without its memory."""
     values = model.numeric_data[law.first : law.first + len(NUMBERS)].tolist()
     numbers = dict(zip(NUMBERS, values, strict=True))
-    commands = motion.control(delay + numbers["latency"])
 
-    def column(quantity: Any, otherwise: float) -> Array:
+    # A control is held until the next evaluation, and is older on average.
+    age = 0.5 * (law.tick - 1) * float(model.opt.timestep)
+
+    def column(quantity: Quantity, otherwise: float, latency: float = 0.0) -> Array:
         """(n,) column of the log, or a constant where the law reads none."""
         place = law.columns.get(quantity)
-        return np.full(len(motion.t), otherwise) if place is None else commands[:, place]
+        if place is None:
+            return np.full(len(motion.t), otherwise)
+        if held[place]:
+            return motion.control(delay + latency)[:, place]
 
-    # The control is held until the next evaluation, so that the state is older by half a period.
-    lag = numbers["feedback_latency"] + 0.5 * law.tick * float(model.opt.timestep)
+        # Points of a continuous signal, at the begin of each sample.
+        recording = motion.recording
+        samples = recording.dt * np.arange(len(recording.ctrl))
+        times = motion.t + motion.lag - delay - latency - age
+        return np.interp(times, samples, recording.ctrl[:, place])
+
+    past = motion.t - numbers["feedback_latency"] - age
     q, v = (
-        np.interp(motion.t - lag, motion.t, values)
-        for values in (motion.qpos[:, law.q], motion.qvel[:, law.v])
+        np.interp(past, motion.t, state) for state in (motion.qpos[:, law.q], motion.qvel[:, law.v])
     )
-    reference = column("reference", 0.0)
-    wanted = column("reference_velocity", 0.0)
-    if law.reference_differences:
-        wanted = np.gradient(reference, motion.step)
-    error = numbers["kp"] * (reference - q) + numbers["kd"] * (wanted - v)
-    control = column("gain", 1.0) * error + column("feedforward", 0.0)
+    late = numbers["latency"]
+    position = column("reference", 0.0, late) - q
+    velocity = column("reference_velocity", 0.0, late) - v
+    control = column("gain", 1.0) * (numbers["kp"] * position + numbers["kd"] * velocity)
+    limit = numbers["integral_limit"]
+    control += np.clip(numbers["integral"], -limit, limit) + column("feedforward", 0.0, late)
     control = np.clip(control, numbers["saturation_low"], numbers["saturation_high"])
     return np.where(column("enable", 1.0) < ON, 0.0, control)

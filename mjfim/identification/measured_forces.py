@@ -10,11 +10,17 @@ import numpy as np
 
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.model.control_laws import NUMBERS, ControlLaw
+from mjfim.model.coordinates import actuator_names
 from mjfim.model.elements import element_name
+from mjfim.model.servos import AT_JOINT
 
 # Sensors of forces of single actuators, and of all actuators on a joint.
 ACTUATOR_FORCE = int(mujoco.mjtSensor.mjSENS_ACTUATORFRC)
 JOINT_FORCE = int(mujoco.mjtSensor.mjSENS_JOINTACTFRC)
+
+# Numbers of a control law that give it a memory, with their values without one.
+WITHOUT_MEMORY = {"slew": np.inf, "time_constant": 0.0, "velocity_time_constant": 0.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +33,7 @@ class MeasuredForce:
         dof: Degree of freedom on which all actuators act together; -1 for a single actuator.
         name: Name of the actuator or joint.
         has_known_control: Whether the controls of its actuators follow from a recording. Those of a
-            control law with an integral, or before the dynamics of an actuator, do not.
+            control law with a memory, or before the dynamics of an actuator, do not.
     """
 
     output: int
@@ -50,9 +56,24 @@ class MeasuredForce:
         """
         if not self.is_of_joint:
             return self.actuator == int(model.actuator_outadr[actuator])
-        if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT):
+        if not _is_at_joint(model, actuator):
             return False
         return self.dof == int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
+
+    def may_contain(self, model: mujoco.MjModel, actuator: int) -> bool:
+        """Return whether it may contain some of the force of an actuator, such as by a tendon.
+
+        Args:
+            model: The model.
+            actuator: Index of the actuator.
+        """
+        by_other_means = self.is_of_joint and not _is_at_joint(model, actuator)
+        return by_other_means or self.contains(model, actuator)
+
+
+def _is_at_joint(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator acts on a single joint."""
+    return mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
 
 
 def measured_forces(
@@ -89,20 +110,34 @@ def measured_forces(
             found.append(MeasuredForce(output=output, actuator=address, dof=-1, name=name))
     hidden = [
         actuator
-        for actuator, integrates in actuators_of_laws(system).items()
-        if integrates or model.actuator_actnum[actuator]
+        for actuator, law in laws_of_actuators(system).items()
+        if model.actuator_actnum[actuator] or _has_memory(system, law)
     ]
     return tuple(
-        replace(force, has_known_control=not any(force.contains(model, i) for i in hidden))
+        replace(force, has_known_control=not any(force.may_contain(model, i) for i in hidden))
         for force in sorted(found, key=lambda force: force.is_of_joint)
     )
 
 
-def actuators_of_laws(system: System) -> dict[int, bool]:
-    """Indices of the actuators whose controls are computed by laws, and which have an integral.
+def laws_of_actuators(system: System) -> dict[int, ControlLaw]:
+    """Control laws by the index of the actuator whose control they compute.
 
     Args:
         system: The system.
     """
     laws = () if system.laws is None else system.laws.laws
-    return {int(system.model.actuator(law.actuator).id): law.integrates for law in laws}
+    names = actuator_names(system.model)
+    return {names.index(law.actuator): law for law in laws}
+
+
+def _has_memory(system: System, law: ControlLaw) -> bool:
+    """Whether a control depends on more than the reference and the state at one time."""
+    if law.integrates or law.differences or law.reference_differences:
+        return True
+    values = system.model.numeric_data[law.first : law.first + len(NUMBERS)].tolist()
+    numbers = dict(zip(NUMBERS, values, strict=True))
+    unknown = {t.path for p in system.parameters.parameters for t in p.targets}
+    return any(
+        numbers[field] != without or f"controller/{law.actuator}:{field}" in unknown
+        for field, without in WITHOUT_MEMORY.items()
+    )

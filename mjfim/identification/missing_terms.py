@@ -288,7 +288,7 @@ def _of_one_kind(members: Sequence[_Member]) -> list[list[_Member]]:
     return [
         sorted(of_kind, key=lambda member: -member.term.sigmas)
         for kind, of_kind in kinds.items()
-        if kind and len(of_kind) >= FEWEST_JOINTS
+        if kind and len({member.candidate.joint for member in of_kind}) >= FEWEST_JOINTS
     ]
 
 
@@ -561,15 +561,17 @@ def _joint_score_test(
             )
         )
         further += each.candidate.further
+    # Two drivers may act on the same joint.
+    joints = tuple(dict.fromkeys(each.candidate.joint for each in left))
     return replace(
         first.term,
-        description=f"{first.candidate.kind} at {len(left)} joints",
+        description=f"{first.candidate.kind} at {len(joints)} joints",
         value=float(found.values[0]),
         sigmas=found.sigmas,
         share=found.explained / squares,
         further=tuple(further),
         more_added=tuple(each.term.added for each in others if each.term.added is not None),
-        joints=tuple(each.candidate.joint for each in left),
+        joints=joints,
     )
 
 

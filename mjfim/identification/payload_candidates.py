@@ -11,6 +11,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
@@ -43,12 +44,14 @@ LEAST_TURN = 1e-6
 def payload_candidates_of(system: System) -> Iterator[Candidate]:
     """A payload at each moving body that moves no other one, and that has no payload yet.
 
+    Bodies that terms have added, such as those of contacts, are none of the robot.
+
     Where all inertial parameters of a body are unknown, a payload is a part of them.
 
     Args:
         system: The system.
     """
-    model: Any = system.model
+    model: Any = system.source.stated.model
     known = {spec.inertial for spec in system.experiment.parameters.values()}
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -70,7 +73,7 @@ def payload_candidates_of(system: System) -> Iterator[Candidate]:
 
 def _payload(system: System, body: str, place: Array, axes: tuple[int, ...]) -> Candidate:
     """A payload at a place: (3,) in the frame of a body, which a fit moves along some axes [m]."""
-    model: Any = system.model
+    model: Any = system.source.stated.model
     number = int(model.body(body).id)
     values = {axis: float(x) for axis, x in zip(AXES, place, strict=True) if x}
     added = added_term(system, KIND, body, values)
@@ -116,7 +119,7 @@ def _is_moved(model: mujoco.MjModel, body: int) -> bool:
 
 
 def _axes_with_effect(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
-    """Axes of a body along which the place of a load has an effect.
+    """Axes of a body along which the place of a load has an effect of its own.
 
     Along an axis whose direction in the world never changes, such as that of the hinges of a planar
     robot, the place changes neither the velocity of a load nor the work of gravity.
@@ -129,5 +132,10 @@ def _axes_with_effect(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
         mujoco.mj_integratePos(model, data.qpos, rng.standard_normal(model.nv), 1.0)
         mujoco.mj_kinematics(model, data)
         directions.append(data.xmat[body].reshape(3, 3).copy())
-    turned = np.ptp(directions, axis=0).max(axis=0)
-    return tuple(np.flatnonzero(turned > LEAST_TURN).tolist())
+
+    # Of the axes of a body that is turned against the hinges, as many have an effect of their own
+    # as there are directions in which a place has one; those with the largest effect come first.
+    turned = np.concatenate(directions[1:]) - np.tile(directions[0], (POSES - 1, 1))
+    _, R, order = scipy.linalg.qr(turned, mode="economic", pivoting=True)
+    count = int((np.abs(np.diag(R)) > LEAST_TURN).sum())
+    return tuple(sorted(order[:count].tolist()))

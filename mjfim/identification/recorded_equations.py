@@ -17,7 +17,7 @@ from mjfim.identification.measured_forces import MeasuredForce
 from mjfim.identification.measured_motion import POINTS_PER_INTERVAL, REACH, MeasuredMotion
 from mjfim.identification.steady_bristles import bristles_of
 from mjfim.model.control_laws import NUMBERS, ControlLaws
-from mjfim.model.coordinates import dof_names
+from mjfim.model.coordinates import actuator_names, dof_names
 from mjfim.model.sizes import translations
 from mjfim.model.targets import ModelField
 from mjfim.plant.equation_of_motion import EquationOfMotion, MotionPoints
@@ -117,13 +117,13 @@ class EquationModel:
     @cached_property
     def gain_rows(self) -> frozenset[int]:
         """Places, among the custom numbers of the model, of the gains of laws with an equation."""
-        model = self.system.model
+        model, names = self.system.model, actuator_names(self.system.model)
         known = [force for force in self.measured_forces if force.has_known_control]
         laws = () if self.laws is None else self.laws.laws
         return frozenset(
             law.first + NUMBERS.index(gain)
             for law in laws
-            if any(force.contains(model, model.actuator(law.actuator).id) for force in known)
+            if any(force.contains(model, names.index(law.actuator)) for force in known)
             for gain in GAINS
         )
 

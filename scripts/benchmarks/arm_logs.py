@@ -1,7 +1,7 @@
 """Identification of simulated arms from closed-loop logs: coverage, held-out torques and time.
 
-    python -m scripts.benchmarks arm_logs [--runs 50] [--seconds 18] [--selected 4] [--long 2]
-    [--seed 0] [-o FILE.json]
+    python -m scripts.benchmarks arm_logs [--runs 50] [--seconds 18] [--selected 4] [--laws 12]
+    [--long 2] [--seed 0] [-o FILE.json]
 
 The arms are the Franka Emika Panda (its model lies beside the repository; it is left out where that
 is absent) and an arm with the dimensions and masses of a UR5e. Position servos follow Fourier
@@ -9,6 +9,9 @@ series at 500 Hz. Angles of joints and torques of motors are logged at 125 Hz, w
 milliseconds late. The true inertias differ from those of the model at random, and so do damping
 and dry friction of the joints. The fit knows the servos and the rotors. It estimates ten inertial
 parameters of every link, damping and dry friction of every joint, and the delay.
+
+In further runs, the UR5e has motors that take torques, and the logged references move it by
+discrete PD laws, of which the fit knows the rate and has to estimate the gains.
 
 In half of the runs, the robot has friction that the stated model lacks: Stribeck friction and a
 Coulomb friction that differs by direction. These are fitted again with a model that has such
@@ -229,11 +232,12 @@ def stated(arm: Arm, folder: Path, *, is_richer: bool) -> mjfim.Experiment:
         parameters[f"speed {joint}"] = {"target": f"term/stribeck {joint}:speed"}
         parameters[f"offset {joint}"] = {"target": f"term/offset {joint}:offset"}
     controllers: dict[str, Any] = {}
-    for joint, (kp, kd) in zip(arm.joints, () if arm.gains is None else arm.gains, strict=False):
-        controllers[joint] = {"kp": float(kp), "kd": float(kd), "rate": 1.0 / TIMESTEP}
-        for field in ("kp", "kd"):
-            target = f"controller/{joint}:{field}"
-            parameters[f"{field} {joint}"] = {"target": target, "nuisance": True}
+    if arm.gains is not None:
+        for joint, (kp, kd) in zip(arm.joints, arm.gains.tolist(), strict=True):
+            controllers[joint] = {"kp": kp, "kd": kd, "rate": 1.0 / TIMESTEP}
+            for field in ("kp", "kd"):
+                target = f"controller/{joint}:{field}"
+                parameters[f"{field} {joint}"] = {"target": target, "nuisance": True}
     noise = {f"qpos:{joint}": ANGLE_SIGMA for joint in arm.joints}
     torques = [f"torque_{joint}" for joint in arm.joints]
     noise |= dict(zip(torques, arm.sigma.tolist(), strict=True))
@@ -763,6 +767,7 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=50, help="runs in all")
     parser.add_argument("--seconds", type=float, default=18.0, help="data of a run [s]")
     parser.add_argument("--selected", type=int, default=4, help="runs by a selection of terms")
+    parser.add_argument("--laws", type=int, default=12, help="further runs under discrete laws")
     parser.add_argument("--long", type=int, default=1, help="timed fits of each arm")
     parser.add_argument("--processes", type=int, default=cores(), help="runs side by side")
     parser.add_argument("--seed", type=int, default=0)
@@ -787,6 +792,19 @@ def main() -> int:
             whole=False,
         )
         for number in range(args.runs)
+    ]
+    with_laws = Job(
+        arm=LAWS,
+        seed=args.seed,
+        number=0,
+        lacks=False,
+        fit=Fit.STATED,
+        seconds=args.seconds,
+        threads=1,
+        whole=False,
+    )
+    jobs += [
+        replace(with_laws, number=number, lacks=bool(number % 2)) for number in range(args.laws)
     ]
     lacking = [job for job in jobs if job.lacks]
     jobs += [replace(job, fit=Fit.RICHER) for job in lacking]

@@ -22,6 +22,10 @@ FRICTION = """<mujoco><option integrator="{integrator}"/><worldbody><body name="
   <joint name="slide" type="slide" axis="1 0 0" frictionloss="0.1"/><geom size="0.1"/>
   </body></worldbody><actuator><motor name="push" joint="slide"/></actuator></mujoco>"""
 
+SERVO_SENTENCE = (
+    "friction that grows with the torque of push ('push' is no direct drive at a hinge with a name)"
+)
+
 
 def closed_loop(latency: float) -> mjfim.Experiment:
     """The two-joint arm under a law at either joint, of which that of the elbow is late."""
@@ -64,12 +68,12 @@ def test_a_latency_that_is_a_parameter_is_no_missing_term() -> None:
             "RK4",
             [
                 "Stribeck friction of slide (its bristle is unstable with RK4)",
-                "friction that grows with the torque of push (it needs a direct drive at a hinge)",
+                SERVO_SENTENCE,
             ],
         ),
         (
             "implicitfast",
-            ["friction that grows with the torque of push (it needs a direct drive at a hinge)"],
+            [SERVO_SENTENCE],
         ),
     ],
 )

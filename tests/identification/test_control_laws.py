@@ -547,9 +547,54 @@ def test_measured_torques_take_the_place_of_controls_that_laws_compute(
     assert laws == ["law of shoulder", "law of elbow"][: sensors.count("torque")]
 
 
-def test_a_law_with_an_integral_has_no_equation(tmp_path: Path) -> None:
-    """A part of a recording does not show its integral, so that gains keep their guesses."""
-    laws = {"shoulder": {**SHOULDER, "ki": 20.0}, "elbow": ELBOW}
+@pytest.mark.parametrize(
+    "further",
+    [
+        {"latency": 0.1},
+        {"latency": 0.1, "gain": True},
+        {"latency": 0.1, "enable": True},
+        {"interpolation": "linear", "rate": 1000.0},
+        {"integral": 3.0},
+        {"feedback_latency": 0.01},
+        {"feedforward": True},
+    ],
+)
+def test_gains_follow_from_every_part_of_a_law_that_a_log_shows(
+    further: dict[str, Any], tmp_path: Path
+) -> None:
+    law = {"kp": 50.0, "kd": 3.0, "rate": 250.0, **further}
+    experiment = arm_with_torques(tmp_path, {"shoulder": law}, TORQUE1)
+    kd = {"kd": {"target": "controller/shoulder:kd", "true": 3.0, "guess": 1.0}}
+    experiment = experiment.replace(parameters=kd)
+    system = System.resolve(experiment)
+    inputs = references(3000, 4, len(system.inputs), steps=0.0)
+    t = np.arange(3000) / 500.0
+    for column, name in enumerate(system.inputs):
+        if name.startswith(("gain:", "enable:")):
+            inputs[:, column] = 0.6 + 0.4 * np.sign(np.sin(4.0 * t))
+        if name.startswith("feedforward:"):
+            inputs[:, column] = 2.0 * np.sin(5.0 * t)
+
+    found = mjfim.inverse_dynamics(experiment, [mjfim.simulate(experiment, inputs, 4)])
+
+    # Noise of the positions biases gains by about a percent.
+    np.testing.assert_allclose(found.theta[3:], system.parameters.true[3:], rtol=0.02)
+    assert (found.std[3:] < 0.01 * system.parameters.true[3:]).all()
+
+
+@pytest.mark.parametrize(
+    "memory",
+    [
+        {"ki": 20.0},
+        {"slew": 400.0},
+        {"time_constant": 0.03},
+        {"velocity_time_constant": 0.01},
+        {"velocity": "difference"},
+    ],
+)
+def test_a_law_with_a_memory_has_no_equation(memory: dict[str, Any], tmp_path: Path) -> None:
+    """Its control does not follow from one time of a recording, so that gains keep their guess."""
+    laws = {"shoulder": {**SHOULDER, **memory}, "elbow": ELBOW}
     experiment = arm_with_torques(tmp_path, laws, TORQUE1 + TORQUE2)
     true = System.resolve(experiment).parameters.true
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -75,6 +76,29 @@ def test_a_planar_robot_does_not_show_the_place_along_its_hinges() -> None:
     assert [axes(each) for each in found] == ["xz", "xz"]
     assert [each.further[-1].value for each in found] == pytest.approx([-0.15, -0.3])
     assert len({each.variant_of for each in found}) == 1
+
+
+def test_a_planar_robot_whose_frame_is_turned_has_two_places_to_find(tmp_path: Path) -> None:
+    """No axis of the last body is that of the hinges, along which the place has no effect."""
+    text = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1"/>
+      <body name="fore" pos="0 0 -0.3" euler="30 0 20"><joint name="b" axis="{axis}"/>
+      <geom size="0.05" pos="0 0 -0.2"/></body></body></worldbody></mujoco>"""
+    turned = np.zeros(4)
+    mujoco.mju_euler2Quat(turned, np.radians([30.0, 0.0, 20.0]), "xyz")
+    axis = np.zeros(3)
+    mujoco.mju_negQuat(turned, turned)
+    mujoco.mju_rotVecQuat(axis, np.array([0.0, 1.0, 0.0]), turned)
+    found = candidates(tmp_path, text.format(axis=" ".join(map(str, axis))), "joint/b:damping")
+    assert {len(axes(each)) for each in found} == {2}
+
+
+def test_bodies_of_terms_carry_no_payload() -> None:
+    """Friction that grows with the torque of a motor is a contact with a ball."""
+    terms = {"worm": {"kind": "load_dependent_friction", "actuator": "elbow"}}
+    parameters = {**DAMPINGS, "worm": {"target": "term/worm:coefficient", "guess": 0.05}}
+    system = System.resolve(planar_arm(terms=terms, parameters=parameters))
+    found = list(payload_candidates_of(system))
+    assert [each.description for each in found] == ["a payload at fore"] * 2
 
 
 def test_payloads_are_tested_at_every_last_body(tmp_path: Path) -> None:

@@ -57,6 +57,9 @@ def contents_of(file: Path) -> Any:
     with np.load(file) as archive:
         arrays = {key: archive[key].tobytes() for key in archive if key != "record"}
         record = without_times(json.loads(str(archive["record"])))
+
+    # Each array is that of a field, so that nothing is left out of the comparison.
+    assert set(arrays) <= set(re.findall(r'"([^"]*)"', json.dumps(record)))
     return with_arrays(record, arrays)
 
 
