@@ -685,13 +685,18 @@ class _Selector:
     ) -> FittedModel | None:
         """The model without a term; None where it cannot be simulated, or after a stop.
 
-        There is none either where a pool replaces parameters of the term.
+        There is none either where a pool replaces parameters of the term, and where all other
+        parameters are held.
         """
         if any(not term.parameters.keys().isdisjoint(pool.members) for pool in model.pooled):
             return None
+        task = model.result.task
+        names = task.system.parameters.names
+        if set(names) <= {*term.parameters, *task.settings.hold}:
+            return None
+
         held = tuple(name for name in model.held if name not in term.parameters)
         model = replace(model, held=held)
-        names = model.result.task.system.parameters.names
         values = dict(zip(names, model.result.theta, strict=True))
         terms = tuple(each for each in model.terms if each is not term)
         return self._assessed(self._refitted(model, first, terms, values, {}), first)
