@@ -220,7 +220,9 @@ def test_many_candidates_are_tested_in_groups(
 
     monkeypatch.setattr(missing_terms, "MAX_TESTED", 4)
     in_groups = find_missing_terms(problem, logs, at).terms
-    assert [term.path for term in in_groups] == [term.path for term in whole]
+
+    # The last one may be any of several terms with the same effect, here a gain or a payload.
+    assert [term.path for term in in_groups[:-1]] == [term.path for term in whole[:-1]]
     for part, complete in zip(in_groups, whole, strict=True):
         assert part.sigmas == pytest.approx(complete.sigmas, rel=0.02)
 

@@ -90,14 +90,18 @@ def test_a_complete_model_stays_as_it_is(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_terms_that_no_data_tell_apart_are_named_with_what_they_imply(tmp_path: Path) -> None:
-    """Inertia of the cart, inertia of the hinge and a weaker motor have the same effect."""
+    """Inertia of the cart or of the hinge, a weaker motor and a payload have the same effect."""
     found = mjfim.select_terms(stated(), recorded(tmp_path, 'armature="0.9"', count=2))
     assert found.selection is not None
     (term,) = found.selection.terms
     assert term.path == "joint/slide:armature"
     (step,) = [step for step in found.selection.steps if step.decision is Decision.ADDED]
     others = {other.path: other.values for other in step.alternatives}
-    assert set(others) == {"joint/hinge:armature", "actuator/force:gainprm[0]"}
+    assert set(others) == {
+        "joint/hinge:armature",
+        "actuator/force:gainprm[0]",
+        "term/pendulum_payload:mass",
+    }
 
     # Inertia about the hinge instead of the cart's needs a heavier bob on a shorter rod:
     # m = 2 + 0.9 and m l = 2.
