@@ -67,8 +67,7 @@ def simulate(
     """Simulate a recording of a design at the `true` parameter values, with noise.
 
     Without a design it is a recording of the initial control, of the references that it states for
-    the control laws, or of the motion of a model without actuators from its initial
-    state.
+    the control laws, or of the motion of a model without actuators from its initial state.
     """
     from mjfim.excitation.stated_inputs import stated_motion
     from mjfim.excitation.task import DesignTask

@@ -16,12 +16,12 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
-from mjfim.model.control_laws import NUMBERS
 from mjfim.model.coordinates import ScalarJoint, scalar_joints
 from mjfim.model.elements import element_name, names_of
 from mjfim.model.paths import unit_of
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.terms.drives import SHORT_LAG
+from mjfim.model.terms.friction import is_rk4
 from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import Term, TermTable
 from mjfim.records.missing_term import AddedTerm, TermParameter
@@ -187,7 +187,7 @@ def impossible_terms_of(system: System) -> Iterator[str]:
         system: The system.
     """
     targets = targeted_paths(system)
-    if _is_rk4(system.model):
+    if is_rk4(system.model):
         for joint in _rubbing_joints(system, targets):
             if not any(has_term(system, kind, joint.name) for kind in ("stribeck", "lugre")):
                 yield f"{STRIBECK} of {joint.name} (its bristle is unstable with RK4)"
@@ -308,6 +308,23 @@ def _single(description: str, parameter: CandidateParameter) -> Candidate:
     return Candidate(description=description, tested=(parameter,))
 
 
+def _not_negative(path: str, unit: str, value: float, size: float) -> CandidateParameter:
+    """A number that is not negative, which is tested at a small size where it is zero."""
+    return CandidateParameter(
+        path=path,
+        unit=unit,
+        positive=True,
+        value=value,
+        linearised_at=value or size,
+        size=size,
+    )
+
+
+def _of_joint(words: str, name: str, number: CandidateParameter, joint: str) -> Candidate:
+    """A candidate that is one number of a joint, or of a driver of this joint with its own name."""
+    return Candidate(description=f"{words} of {name}", tested=(number,), kind=words, joint=joint)
+
+
 def _joint_terms(system: System) -> Iterator[Candidate]:
     """Friction, damping, rotor inertia and stiffness of every joint with one degree of freedom."""
     model: Any = system.model
@@ -334,20 +351,8 @@ def _joint_terms(system: System) -> Iterator[Candidate]:
 
             size = float(sizes[field][joint.v])
             path = f"joint/{joint.name}:{field}"
-            number = CandidateParameter(
-                path=path,
-                unit=unit_of(model, path),
-                positive=True,
-                value=value,
-                linearised_at=value or size,
-                size=size,
-            )
-            yield Candidate(
-                description=f"{words} of {joint.name}",
-                tested=(number,),
-                kind=words,
-                joint=joint.name,
-            )
+            number = _not_negative(path, unit_of(model, path), value, size)
+            yield _of_joint(words, joint.name, number, joint.name)
 
 
 def stated_joints(system: System) -> tuple[ScalarJoint, ...]:
@@ -387,26 +392,12 @@ def _tilts(system: System) -> Iterator[Candidate]:
 
 def _latencies(system: System) -> Iterator[Candidate]:
     """Latencies of every control law."""
-    model: Any = system.model
     laws = () if system.laws is None else system.laws.laws
     for field, words in LATENCIES.items():
         for law in laws:
-            size = LINEARISATION_SIZE * period_of(system)
-            value = float(model.numeric_data[law.first + NUMBERS.index(field)])
-            latency = CandidateParameter(
-                path=f"controller/{law.actuator}:{field}",
-                unit="s",
-                positive=True,
-                value=value,
-                linearised_at=value or size,
-                size=size,
-            )
-            yield Candidate(
-                description=f"{words} of {law.actuator}",
-                tested=(latency,),
-                kind=words,
-                joint=law.joint,
-            )
+            path, value = f"controller/{law.actuator}:{field}", law.numbers(system.model)[field]
+            latency = _not_negative(path, "s", value, LINEARISATION_SIZE * period_of(system))
+            yield _of_joint(words, law.actuator, latency, law.joint)
 
 
 def _gains(system: System) -> Iterator[Candidate]:
@@ -442,7 +433,7 @@ def _frictions(system: System, speeds: Array, targets: set[str]) -> Iterator[Can
     for joint in _rubbing_joints(system, targets):
         size = LINEARISATION_SIZE * float(force[joint.v])
         yield from _asymmetric(system, joint, size)
-        if not _is_rk4(model):
+        if not is_rk4(model):
             yield from _stribeck(system, joint, float(speeds[joint.v]), size)
 
 
@@ -455,18 +446,13 @@ def _rubbing_joints(system: System, targets: set[str]) -> Iterator[ScalarJoint]:
             yield joint
 
 
-def _is_rk4(model: Any) -> bool:
-    """Whether a model is integrated with RK4."""
-    return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
-
-
 def _asymmetric(system: System, joint: ScalarJoint, size: float) -> Iterator[Candidate]:
     """Friction of a joint that differs by direction."""
     kind = "asymmetric_friction"
     if has_term(system, kind, joint.name):
         return
     added = added_term(system, kind, joint.name)
-    offset = _field(added, "offset", unit_of_force(joint), positive=False, size=size)
+    offset = field_of_term(added, "offset", unit_of_force(joint), positive=False, size=size)
     yield Candidate(
         description=f"friction of {joint.name} that differs by direction",
         tested=(offset,),
@@ -485,7 +471,7 @@ def _stribeck(system: System, joint: ScalarJoint, speed: float, size: float) -> 
     for share in STRIBECK_SHARES:
         stribeck_speed = share * speed
         added = added_term(system, kind, joint.name, {"speed": stribeck_speed})
-        excess = _field(added, "excess", unit_of_force(joint), positive=True, size=size)
+        excess = field_of_term(added, "excess", unit_of_force(joint), positive=True, size=size)
         further = TermParameter(
             path=f"term/{added.name}:speed",
             value=stribeck_speed,
@@ -538,10 +524,18 @@ def _lags(system: System) -> Iterator[Candidate]:
         )
 
 
-def _field(
+def field_of_term(
     added: AddedTerm, field: str, unit: str, *, positive: bool, size: float
 ) -> CandidateParameter:
-    """A field of a term of the library that is zero without the term."""
+    """A field of a term of the library that is zero without the term.
+
+    Args:
+        added: The table of the term.
+        field: Name of the field.
+        unit: Its unit; may be empty.
+        positive: True where only positive values make sense.
+        size: Small size of the field, larger than 0 [unit].
+    """
     return CandidateParameter(
         path=f"term/{added.name}:{field}",
         unit=unit,

@@ -19,7 +19,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.measured_forces import MeasuredForce, laws_of_actuators
 from mjfim.identification.measured_motion import FEWEST_READINGS, MeasuredMotion
-from mjfim.model.control_laws import NUMBERS, ControlLaw, ControlLaws, Quantity
+from mjfim.model.control_laws import ControlLaw, ControlLaws, Quantity
 from mjfim.plant.law_commands import ON
 
 # Numbers of a law that the equation of motion may determine; its times and limits keep their start.
@@ -95,8 +95,7 @@ def _control_of(
     law: ControlLaw, motion: MeasuredMotion, model: Any, held: np.ndarray, delay: float
 ) -> Array:
     """(n,) control that a law computes from a log and a measured motion, without its memory."""
-    values = model.numeric_data[law.first : law.first + len(NUMBERS)].tolist()
-    numbers = dict(zip(NUMBERS, values, strict=True))
+    numbers = law.numbers(model)
 
     # A control is held until the next evaluation, and is older on average.
     age = 0.5 * (law.tick - 1) * float(model.opt.timestep)
@@ -107,7 +106,7 @@ def _control_of(
         if place is None:
             return np.full(len(motion.t), otherwise)
         if held[place]:
-            return motion.control(delay + latency)[:, place]
+            return motion.held(place, delay + latency)
 
         # Points of a continuous signal, at the begin of each sample.
         recording = motion.recording

@@ -8,7 +8,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
-from mjfim.model.control_laws import FIELDS, NUMBERS, ControlLaw, law_unit
+from mjfim.model.control_laws import FIELDS, ControlLaw, law_unit
 from mjfim.model.units import FORCE_UNITS, control_unit
 from mjfim.records.control_law import ControlLawInLoop
 
@@ -47,9 +47,7 @@ def _law_in_loop(system: System, law: ControlLaw, theta: Array, clipped: float) 
     """Describe one law."""
     assert system.laws is not None
     model = system.plant.model(theta)
-    values = dict(
-        zip(NUMBERS, model.numeric_data[law.first : law.first + len(NUMBERS)].tolist(), strict=True)
-    )
+    values = law.numbers(model)
 
     numbers: dict[str, float] = {}
     units: dict[str, str] = {}

@@ -10,10 +10,10 @@ import numpy as np
 
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.model.control_laws import NUMBERS, ControlLaw
+from mjfim.model.control_laws import ControlLaw
 from mjfim.model.coordinates import actuator_names
 from mjfim.model.elements import element_name
-from mjfim.model.servos import AT_JOINT
+from mjfim.model.servos import acts_at_joint
 
 # Sensors of forces of single actuators, and of all actuators on a joint.
 ACTUATOR_FORCE = int(mujoco.mjtSensor.mjSENS_ACTUATORFRC)
@@ -56,7 +56,7 @@ class MeasuredForce:
         """
         if not self.is_of_joint:
             return self.actuator == int(model.actuator_outadr[actuator])
-        if not _is_at_joint(model, actuator):
+        if not acts_at_joint(model, actuator):
             return False
         return self.dof == int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
 
@@ -67,13 +67,8 @@ class MeasuredForce:
             model: The model.
             actuator: Index of the actuator.
         """
-        by_other_means = self.is_of_joint and not _is_at_joint(model, actuator)
+        by_other_means = self.is_of_joint and not acts_at_joint(model, actuator)
         return by_other_means or self.contains(model, actuator)
-
-
-def _is_at_joint(model: mujoco.MjModel, actuator: int) -> bool:
-    """Whether an actuator acts on a single joint."""
-    return mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
 
 
 def measured_forces(
@@ -134,8 +129,7 @@ def _has_memory(system: System, law: ControlLaw) -> bool:
     """Whether a control depends on more than the reference and the state at one time."""
     if law.integrates or law.differences or law.reference_differences:
         return True
-    values = system.model.numeric_data[law.first : law.first + len(NUMBERS)].tolist()
-    numbers = dict(zip(NUMBERS, values, strict=True))
+    numbers = law.numbers(system.model)
     unknown = {t.path for p in system.parameters.parameters for t in p.targets}
     return any(
         numbers[field] != without or f"controller/{law.actuator}:{field}" in unknown

@@ -77,19 +77,28 @@ class MeasuredMotion:
         Args:
             delay: Time by which the readings lag [s].
         """
-        recorded, dt = self.recording.ctrl, self.recording.dt
+        mean = np.empty((len(self.t), self.recording.ctrl.shape[1]))
+        for column in range(mean.shape[1]):
+            mean[:, column] = self.held(column, delay)
+        return mean
+
+    def held(self, column: int, delay: float) -> Array:
+        """(n,) mean over the time of each point of one input, held over each sample.
+
+        Args:
+            column: Index of the input.
+            delay: Time by which the readings lag [s].
+        """
+        recorded, dt = self.recording.ctrl[:, column], self.recording.dt
         edges = dt * np.arange(len(recorded) + 1)
-        integral = np.concatenate([np.zeros((1, recorded.shape[1])), dt * np.cumsum(recorded, 0)])
+        integral = np.concatenate([[0.0], dt * np.cumsum(recorded)])
 
         # Before the first sample and after the last one, their controls are held.
         middle = self.t + self.lag - delay
         middle = np.clip(middle, 0.5 * self.step, edges[-1] - 0.5 * self.step)
-        mean = np.empty((len(self.t), recorded.shape[1]))
-        for j, column in enumerate(integral.T):
-            before = np.interp(middle - 0.5 * self.step, edges, column)
-            after = np.interp(middle + 0.5 * self.step, edges, column)
-            mean[:, j] = (after - before) / self.step
-        return mean
+        before = np.interp(middle - 0.5 * self.step, edges, integral)
+        after = np.interp(middle + 0.5 * self.step, edges, integral)
+        return np.asarray((after - before) / self.step)
 
     def smoothed(self, values: Array, reach: float) -> tuple[Array, np.ndarray]:
         """Values that were measured beside the motion, without noise of higher frequencies.

@@ -18,8 +18,8 @@ from mjfim.experiment.system import System
 from mjfim.identification.candidates import (
     LINEARISATION_SIZE,
     Candidate,
-    CandidateParameter,
     added_term,
+    field_of_term,
     has_term,
 )
 from mjfim.model.elements import element_name
@@ -44,9 +44,8 @@ LEAST_TURN = 1e-6
 def payload_candidates_of(system: System) -> Iterator[Candidate]:
     """A payload at each moving body that moves no other one, and that has no payload yet.
 
-    Bodies that terms have added, such as those of contacts, are none of the robot.
-
-    Where all inertial parameters of a body are unknown, a payload is a part of them.
+    Bodies that terms have added, such as those of contacts, do not belong to the robot. Where all
+    inertial parameters of a body are unknown, a payload is a part of them.
 
     Args:
         system: The system.
@@ -78,14 +77,7 @@ def _payload(system: System, body: str, place: Array, axes: tuple[int, ...]) -> 
     values = {axis: float(x) for axis, x in zip(AXES, place, strict=True) if x}
     added = added_term(system, KIND, body, values)
     size = LINEARISATION_SIZE * float(model.body_subtreemass[model.body_rootid[number]])
-    mass = CandidateParameter(
-        path=f"term/{added.name}:mass",
-        unit="kg",
-        positive=True,
-        value=0.0,
-        linearised_at=size,
-        size=size,
-    )
+    mass = field_of_term(added, "mass", "kg", positive=True, size=size)
     coordinates = tuple(
         TermParameter(
             path=f"term/{added.name}:{AXES[i]}",
@@ -107,15 +99,10 @@ def _payload(system: System, body: str, place: Array, axes: tuple[int, ...]) -> 
 
 def _last_bodies(model: mujoco.MjModel) -> list[int]:
     """Bodies that move, and with which no body moves that has joints of its own."""
-    moving = [body for body in range(1, model.nbody) if int(model.body_weldid[body]) == body]
-    moving = [body for body in moving if _is_moved(model, body)]
+    # A body with joints is welded to no other one; a mocap body has none.
+    moving = np.flatnonzero(model.body_jntnum).tolist()
     carriers = {int(model.body_weldid[model.body_parentid[body]]) for body in moving}
     return [body for body in moving if body not in carriers]
-
-
-def _is_moved(model: mujoco.MjModel, body: int) -> bool:
-    """Whether a body has joints; others that are welded to nothing are mocap bodies."""
-    return int(model.body_jntnum[body]) > 0
 
 
 def _axes_with_effect(model: mujoco.MjModel, body: int) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ from mjfim.identification.known_controls import GAINS, controls_along, held_cont
 from mjfim.identification.measured_forces import MeasuredForce
 from mjfim.identification.measured_motion import POINTS_PER_INTERVAL, REACH, MeasuredMotion
 from mjfim.identification.steady_bristles import bristles_of
-from mjfim.model.control_laws import NUMBERS, ControlLaws
+from mjfim.model.control_laws import ControlLaws
 from mjfim.model.coordinates import actuator_names, dof_names
 from mjfim.model.sizes import translations
 from mjfim.model.targets import ModelField
@@ -121,7 +121,7 @@ class EquationModel:
         known = [force for force in self.measured_forces if force.has_known_control]
         laws = () if self.laws is None else self.laws.laws
         return frozenset(
-            law.first + NUMBERS.index(gain)
+            law.row(gain)
             for law in laws
             if any(force.contains(model, names.index(law.actuator)) for force in known)
             for gain in GAINS

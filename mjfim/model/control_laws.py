@@ -124,6 +124,14 @@ class ControlLaw:
     reference_differences: bool
     integrates: bool
 
+    def row(self, name: str) -> int:
+        """Place of one of `NUMBERS` among the custom numbers of the model."""
+        return self.first + NUMBERS.index(name)
+
+    def numbers(self, model: Any) -> dict[str, float]:
+        """Values of all `NUMBERS` in a model, by name."""
+        return {name: float(model.numeric_data[self.row(name)]) for name in NUMBERS}
+
 
 # Columns that follow the inputs of a log for every law with an integral, see `ControlLaws`.
 MEASURED_SUMS = ("sum", "reference", "position", "share")

@@ -48,6 +48,16 @@ def is_integrated(model: Any, actuator: int) -> bool:
     return int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
 
 
+def acts_at_joint(model: Any, actuator: int) -> bool:
+    """Return whether an actuator acts on a single joint.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        actuator: Number of the actuator.
+    """
+    return mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
+
+
 def commanded_joint(model: Any, actuator: int) -> int | None:
     """Slide or hinge whose position, times the gear, the control of an actuator commands.
 
@@ -58,8 +68,7 @@ def commanded_joint(model: Any, actuator: int) -> int | None:
     Returns:
         Number of the joint; None for all but position servos with one control at such a joint.
     """
-    at_joint = mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
-    if not at_joint or int(model.actuator_ctrlnum[actuator]) != 1:
+    if not acts_at_joint(model, actuator) or int(model.actuator_ctrlnum[actuator]) != 1:
         return None
     if is_integrated(model, actuator) or servo_kind(model, actuator) != "position":
         return None

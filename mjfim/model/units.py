@@ -9,7 +9,13 @@ from typing import Any
 
 import mujoco
 
-from mjfim.model.servos import AT_JOINT, SCALAR_JOINTS, actuator_gear, is_integrated, servo_kind
+from mjfim.model.servos import (
+    SCALAR_JOINTS,
+    acts_at_joint,
+    actuator_gear,
+    is_integrated,
+    servo_kind,
+)
 
 # Unit of the coordinate of a slide joint and of every other translation.
 LENGTH = "m"
@@ -159,8 +165,7 @@ def gain_unit(model: Any, actuator: int, field: str) -> str:
     Returns:
         The unit; empty where the servo does not act with a gear of 1 on a slide or hinge.
     """
-    at_joint = mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
-    if not at_joint or actuator_gear(model, actuator) != 1:
+    if not acts_at_joint(model, actuator) or actuator_gear(model, actuator) != 1:
         return ""
 
     joint = int(model.actuator_trnid[actuator, 0])

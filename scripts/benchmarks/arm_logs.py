@@ -780,21 +780,8 @@ def main() -> int:
         console.print("The model of the Panda is absent (../shared/models): it is left out.")
 
     # Halves of the runs of each arm lack friction in the model.
-    jobs = [
-        Job(
-            arm=arms[number % len(arms)],
-            seed=args.seed,
-            number=number,
-            lacks=bool(number // len(arms) % 2),
-            fit=Fit.STATED,
-            seconds=args.seconds,
-            threads=1,
-            whole=False,
-        )
-        for number in range(args.runs)
-    ]
-    with_laws = Job(
-        arm=LAWS,
+    first = Job(
+        arm=arms[0],
         seed=args.seed,
         number=0,
         lacks=False,
@@ -803,8 +790,18 @@ def main() -> int:
         threads=1,
         whole=False,
     )
+    jobs = [
+        replace(
+            first,
+            arm=arms[number % len(arms)],
+            number=number,
+            lacks=bool(number // len(arms) % 2),
+        )
+        for number in range(args.runs)
+    ]
     jobs += [
-        replace(with_laws, number=number, lacks=bool(number % 2)) for number in range(args.laws)
+        replace(first, arm=LAWS, number=number, lacks=bool(number % 2))
+        for number in range(args.laws)
     ]
     lacking = [job for job in jobs if job.lacks]
     jobs += [replace(job, fit=Fit.RICHER) for job in lacking]
@@ -815,16 +812,7 @@ def main() -> int:
 
     # Times are taken one after the other.
     timed = [
-        Job(
-            arm=arm,
-            seed=args.seed,
-            number=number,
-            lacks=False,
-            fit=Fit.STATED,
-            seconds=LONG,
-            threads=cores(),
-            whole=True,
-        )
+        replace(first, arm=arm, number=number, seconds=LONG, threads=cores(), whole=True)
         for number in range(args.long)
         for arm in arms
     ]

@@ -148,7 +148,7 @@ class Stribeck(_PassiveDevice):
         """Resolve the term; RK4 is refused, whose stages would make the bristle unstable."""
         at = JointSizes.of(table, model, period, cls.kind)
         require_free_name(model, "actuator", table.name)
-        if _is_rk4(model):
+        if is_rk4(model):
             raise ExperimentError(
                 "kind: with the integrator RK4, the bristle of 'stribeck' is unstable; use the "
                 "kind 'lugre', or the integrator implicitfast in the MJCF"
@@ -229,7 +229,7 @@ class LuGre(_PassiveDevice):
         require_free_name(model, "actuator", table.name)
 
         stiffness, damping = BRISTLE_STIFFNESS, BRISTLE_DAMPING
-        if _is_rk4(model):
+        if is_rk4(model):
             stiffness, damping = BRISTLE_STIFFNESS_RK4, BRISTLE_DAMPING_RK4
         timestep = float(model.opt.timestep)
         frictionloss = float(model.dof_frictionloss[at.dof])
@@ -416,8 +416,12 @@ def _stribeck_speed(value: float, at: JointSizes, path: str) -> TermQuantity:
     )
 
 
-def _is_rk4(model: Any) -> bool:
-    """Whether a model is integrated with RK4."""
+def is_rk4(model: Any) -> bool:
+    """Return whether a model is integrated with RK4.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+    """
     return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
