@@ -80,34 +80,6 @@ def extended_problem(
     return wider, replace(at, theta=theta, private=private)
 
 
-def with_residuals_of(
-    problem: FitProblem, at: UnknownValues, wider: FitProblem, begin: UnknownValues
-) -> FitProblem | None:
-    """An extended problem that has the residuals of the stated one at its solution.
-
-    Where the extended model differs a little from the stated one, because the effects of new terms
-    are not quite zero, the measured values are moved by the difference of both predictions.
-
-    Args:
-        problem: The stated problem.
-        at: Its solution.
-        wider: The extended problem.
-        begin: The same unknowns of the extended problem.
-
-    Returns:
-        The problem; None where a simulation diverges.
-    """
-    stated, extended = problem.predict(at), wider.predict(begin)
-    if stated is None or extended is None:
-        return None
-
-    recordings = []
-    for recording, before, after in zip(wider.recordings, stated, extended, strict=True):
-        difference = np.nan_to_num(after - before)
-        recordings.append(replace(recording, y=recording.y + difference, file=None))
-    return replace(wider, simulation=replace(wider.simulation, recordings=tuple(recordings)))
-
-
 def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment, ...]:
     """The segments of a problem with initial states of the extended model."""
     system = wider.system

@@ -227,6 +227,18 @@ class FitProblem:
             segments.append(segment.first_part(recording.t, recording.dt, share))
         return replace(self, simulation=replace(self.simulation, segments=tuple(segments)))
 
+    def from_known_states(self, at: UnknownValues) -> tuple[FitProblem, UnknownValues]:
+        """The problem with initial states that are no unknowns, for derivatives by theta alone.
+
+        Args:
+            at: Unknowns with the initial states.
+
+        Returns:
+            The problem, and the unknowns without those of initial states that are free.
+        """
+        simulation, known = self.simulation.from_known_states(at)
+        return replace(self, simulation=simulation), known
+
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
         """This problem with some measured values only.
 
@@ -400,7 +412,7 @@ class FitProblem:
             simulation diverges.
         """
         outputs = [np.full(recording.y.shape, np.nan) for recording in self.recordings]
-        batches = self.simulation.batches(derivatives=False)
+        batches = self.batches(derivatives=False)
         for found in self.of_batches(FitProblem.outputs_of_batch, batches, at):
             if found is None:
                 return None
@@ -433,7 +445,7 @@ class FitProblem:
             One array for each output [y-unit]; None where a simulation diverges.
         """
         parts: list[list[Array]] = [[np.zeros(0)] for _ in self.system.outputs.names]
-        batches = self.simulation.batches(derivatives=False)
+        batches = self.batches(derivatives=False)
         for batch in self.of_batches(FitProblem.outputs_of_batch, batches, at):
             if batch is None:
                 return None
@@ -479,7 +491,7 @@ class FitProblem:
             The cost; infinite where a simulation diverges.
         """
         total = 0.0
-        batches = self.simulation.batches(derivatives=False)
+        batches = self.batches(derivatives=False)
         for losses in self.of_batches(FitProblem.losses_of_batch, batches, at):
             if losses is None:
                 return np.inf
@@ -498,7 +510,7 @@ class FitProblem:
             (P,) losses; infinite in all segments of a batch in which a simulation diverges.
         """
         total = np.zeros(len(self.segments))
-        batches = list(self.simulation.batches(derivatives=False))
+        batches = list(self.batches(derivatives=False))
         found = self.of_batches(FitProblem.losses_of_batch, batches, at)
         for batch, losses in zip(batches, found, strict=True):
             if losses is None:
@@ -531,7 +543,7 @@ class FitProblem:
             (ny,) sum of every output [y-unit^2]; None where a simulation diverges.
         """
         total = np.zeros(len(self.system.outputs))
-        batches = self.simulation.batches(derivatives=False)
+        batches = self.batches(derivatives=False)
         for squares in self.of_batches(FitProblem.squares_of_batch, batches, at):
             if squares is None:
                 return None
@@ -551,9 +563,7 @@ class FitProblem:
         m = self.simulation.private_count + self.layout.column_count + 1
         blocks = np.zeros((self.blocks.count, m, m))
 
-        batches = self.simulation.batches(
-            derivatives=True, central=self.central, step=self.difference_step
-        )
+        batches = self.batches(derivatives=True)
         for found in self.of_batches(FitProblem.blocks_of_batch, batches, at):
             if found is None:
                 return None
@@ -650,6 +660,32 @@ class FitProblem:
                 joined = np.concatenate([blocks.get(index, empty), weighted[first:last]])
                 blocks[index] = triangle(joined)
         return blocks
+
+    def batches(
+        self,
+        *,
+        derivatives: bool,
+        central: bool | None = None,
+        wanted: np.ndarray | None = None,
+    ) -> Iterator[SegmentBatch]:
+        """All segments in batches for the workers of this problem, or for this process.
+
+        Args:
+            derivatives: Whether to compute derivatives.
+            central: True for two-sided differences; default: those of this problem.
+            wanted: (p,) True for the parameters by which to differentiate; default: those that have
+                common columns.
+
+        Returns:
+            The batches.
+        """
+        return self.simulation.batches(
+            derivatives=derivatives,
+            central=self.central if central is None else central,
+            step=self.difference_step,
+            wanted=wanted,
+            shared=self.workers is not None,
+        )
 
     def of_batches(
         self, work: BatchWork[T], batches: Iterable[SegmentBatch], at: UnknownValues

@@ -33,10 +33,10 @@ from mjfim.identification.data_parts import part_of_data
 from mjfim.identification.extended_problems import (
     extended_problem,
     extended_system,
-    with_residuals_of,
 )
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.payload_candidates import payload_candidates_of
+from mjfim.identification.score_rows import ScoreRows
 from mjfim.identification.screened_terms import screened_terms
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -263,7 +263,8 @@ def _by_score(
     found: dict[str, MissingTerm] = {}
     of_joints: list[MissingTerm] = []
     untested: list[str] = []
-    parts = (_linearised(problem, recordings, at, group) for group in groups)
+    stated = ScoreRows.of(problem, at)
+    parts = (_linearised(stated, recordings, group) for group in groups)
     for candidates, linearisation in itertools.chain.from_iterable(parts):
         if linearisation is None:
             untested += [candidate.description for candidate in candidates]
@@ -294,55 +295,31 @@ def _of_one_kind(members: Sequence[_Member]) -> list[list[_Member]]:
 
 
 def _linearised(
-    problem: FitProblem,
-    recordings: Sequence[Recording],
-    at: UnknownValues,
-    candidates: Sequence[Candidate],
+    stated: ScoreRows | None, recordings: Sequence[Recording], candidates: Sequence[Candidate]
 ) -> Iterator[tuple[Sequence[Candidate], _Linearisation | None]]:
     """Linearise by a group of candidates, and by parts of it where one of them prevents it.
+
+    One candidate must not hide the others, so that a group that has no linearisation as a whole is
+    divided into halves until the candidate is alone.
+
+    Args:
+        stated: The linearised stated problem; None where the simulation diverges next to its
+            solution, so that no candidate has a linearisation.
+        recordings: All recordings.
+        candidates: The group.
 
     Yields:
         Candidates with their linearisation; None where the model cannot have them, or where the
         simulation diverges.
     """
-    linearisation = _linearise(problem, recordings, at, candidates)
-    if linearisation is not None or not candidates:
+    linearisation = None if stated is None else _linearise(stated, recordings, candidates)
+    if linearisation is not None or stated is None or len(candidates) <= 1:
         yield candidates, linearisation
         return
 
-    # Where the simulation diverges next to the solution without any candidate, no group has a
-    # linearisation, and smaller ones need not be tried.
-    if _linearise(problem, recordings, at, ()) is None:
-        yield candidates, None
-        return
-
-    yield from _linearised_halves(problem, recordings, at, candidates)
-
-
-def _linearised_halves(
-    problem: FitProblem,
-    recordings: Sequence[Recording],
-    at: UnknownValues,
-    candidates: Sequence[Candidate],
-) -> Iterator[tuple[Sequence[Candidate], _Linearisation | None]]:
-    """Linearise by the halves of a group that has no linearisation as a whole.
-
-    One candidate must not hide the others, so that halves are divided until it is alone.
-
-    Yields:
-        As for `_linearised`.
-    """
-    if len(candidates) == 1:
-        yield candidates, None
-        return
-
     middle = len(candidates) // 2
-    for half in (candidates[:middle], candidates[middle:]):
-        linearisation = _linearise(problem, recordings, at, half)
-        if linearisation is not None:
-            yield half, linearisation
-        else:
-            yield from _linearised_halves(problem, recordings, at, half)
+    yield from _linearised(stated, recordings, candidates[:middle])
+    yield from _linearised(stated, recordings, candidates[middle:])
 
 
 def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
@@ -403,10 +380,7 @@ def _by_significance(terms: Sequence[MissingTerm]) -> list[MissingTerm]:
 
 
 def _linearise(
-    problem: FitProblem,
-    recordings: Sequence[Recording],
-    at: UnknownValues,
-    candidates: Sequence[Candidate],
+    stated: ScoreRows, recordings: Sequence[Recording], candidates: Sequence[Candidate]
 ) -> _Linearisation | None:
     """Linearise the residuals by parameters and candidates.
 
@@ -416,20 +390,20 @@ def _linearise(
         [f"?{i}.{k}" for k in range(len(candidate.tested))]
         for i, candidate in enumerate(candidates)
     ]
-    extended = _with_candidates(problem.system, names, candidates)
+    extended = _with_candidates(stated.problem.system, names, candidates)
     if extended is None:
         return None
 
-    # The score is that of the residuals without the terms.
-    wider, begin = extended_problem(problem, recordings, at, extended)
-    shifted = with_residuals_of(problem, at, wider, begin)
-    condensed = None if shifted is None else shifted.condense(begin)
+    wider, begin = extended_problem(stated.problem, recordings, stated.at, extended)
+    place = {name: index for index, name in enumerate(extended.parameters.names)}
+    further = [place[name] for of_candidate in names for name in of_candidate]
+    condensed = stated.beside(wider, begin, further)
     if condensed is None:
         return None
 
-    column_names = np.array(extended.parameters.names)[wider.layout.parameter_of_column]
-    place = {str(name): column for column, name in enumerate(column_names)}
-    columns = [[place[name] for name in of_candidate] for of_candidate in names]
+    # The columns of the candidates follow those of the parameters.
+    column = itertools.count(stated.problem.layout.column_count)
+    columns = [[next(column) for _ in of_candidate] for of_candidate in names]
     return _normal_equations(condensed, columns)
 
 

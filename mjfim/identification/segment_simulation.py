@@ -20,9 +20,15 @@ from mjfim.plant.input_context import InputContext
 from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.trajectory import Trajectory
 
-# Largest number of engine steps of a batch, so that workers share also the batches of few data. On
-# small models it takes about 0.2 s, against some milliseconds for the way to a worker and back.
-STEPS_OF_BATCH = 100_000
+# Largest number of engine steps of a batch that workers share, so that there are several of them
+# also with few data. On small models it takes about 0.2 s, against some milliseconds for the way to
+# a worker and back.
+STEPS_OF_SHARED_BATCH = 100_000
+
+# Largest number of engine steps of other batches. Between two batches, a request to stop is seen.
+# All threads wait for the last simulation of a batch, so that a few simulations of long segments
+# would leave some of them idle.
+STEPS_OF_BATCH = 250_000
 
 # Number of samples that one linearisation simulates, with two-sided differences, above which
 # differences are one-sided.
@@ -123,6 +129,26 @@ class SegmentSimulation:
             The simulation.
         """
         return replace(self, segments=tuple(self.segments[i] for i in indices))
+
+    def from_known_states(self, at: UnknownValues) -> tuple[SegmentSimulation, UnknownValues]:
+        """This simulation with initial states that are no unknowns.
+
+        Args:
+            at: Unknowns with the initial states.
+
+        Returns:
+            The simulation without directions of the initial state, and its unknowns. Deviations of
+            stated initial states remain among them.
+        """
+        known = replace(self, start_directions=self.start_directions[:, :0])
+        if not self.layout.free_starts:
+            return known, at
+
+        segments = tuple(
+            replace(segment, start=self._initial_state(at, i))
+            for i, segment in enumerate(self.segments)
+        )
+        return replace(known, segments=segments), replace(at, private=at.private[:, :0])
 
     @cached_property
     def sample_count(self) -> int:
@@ -238,6 +264,7 @@ class SegmentSimulation:
         central: bool | None = None,
         step: float = SENSITIVITY_STEP,
         wanted: np.ndarray | None = None,
+        shared: bool = False,
     ) -> Iterator[SegmentBatch]:
         """Divide all segments into batches that fit into memory; every segment is in one of them.
 
@@ -247,6 +274,7 @@ class SegmentSimulation:
             step: Relative step of two-sided differences.
             wanted: (p,) True for the parameters by which to differentiate; default: those that have
                 common columns.
+            shared: Whether workers share the batches.
 
         Yields:
             The batches.
@@ -257,7 +285,7 @@ class SegmentSimulation:
         # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count
         if central is None:
-            central = self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
+            central = self.affords_two_sided(directions)
         if not central:
             step = ONE_SIDED_STEP_FACTOR * step
 
@@ -265,7 +293,7 @@ class SegmentSimulation:
         if derivatives:
             simulations += directions * (2 if central else 1)
 
-        for recording, segments in self._batches(self._max_samples(simulations)):
+        for recording, segments in self._batches(self._max_samples(simulations, shared)):
             yield SegmentBatch(
                 recording=recording,
                 segments=tuple(segments),
@@ -274,6 +302,14 @@ class SegmentSimulation:
                 step=step,
                 wanted=wanted,
             )
+
+    def affords_two_sided(self, directions: int) -> bool:
+        """Whether two-sided differences along some directions take little time.
+
+        Args:
+            directions: Number of the directions.
+        """
+        return self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
 
     def rows_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> Iterator[SegmentRows | None]:
         """Simulate a batch over one interval of time after the other.
@@ -310,15 +346,17 @@ class SegmentSimulation:
                 if found is not None:
                     yield found
 
-    def _max_samples(self, simulations: int) -> int:
+    def _max_samples(self, simulations: int, shared: bool) -> int:
         """Largest number of samples of a batch, whose states have to fit into memory.
 
         Args:
             simulations: Number of simulations of every segment.
+            shared: Whether workers share the batches.
         """
         steps_per_sample = simulations * self.system.grid.substeps
         numbers_per_step = 1 + self.system.plant.nominal_initial_state.size
-        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, STEPS_OF_BATCH)
+        most_steps = STEPS_OF_SHARED_BATCH if shared else STEPS_OF_BATCH
+        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, most_steps)
         return max(most // steps_per_sample, 1)
 
     def _batches(self, max_samples: int) -> Iterator[tuple[int, list[int]]]:

@@ -75,7 +75,11 @@ def _condensed_sensitivity(
         work = sensitivities_of_batch
     batches = list(
         problem.simulation.batches(
-            derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted
+            derivatives=True,
+            central=with_error,
+            step=SENSITIVITY_STEP,
+            wanted=wanted,
+            shared=problem.workers is not None,
         )
     )
     condensed: dict[int, Array] = {}

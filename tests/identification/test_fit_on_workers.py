@@ -136,7 +136,7 @@ def in_small_batches(
     monkeypatch: pytest.MonkeyPatch,
 ) -> FitProblem:
     """A problem with many batches, each of which is a task."""
-    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_SHARED_BATCH", 25)
     return problem_of(experiment, recordings, SEGMENTS)
 
 

@@ -674,6 +674,101 @@ def test_the_solver_stays_on_where_friction_is_to_be_identified(tmp_path) -> Non
     assert np.abs(task.plant.derivatives.sensitivity(task.theta, task.initial).psi).max() > 1e-3
 
 
+# One joint with dry friction. The body may be followed by others, and the model by other trees.
+BENCH = """
+<mujoco>
+  <option timestep="0.001" integrator="implicitfast">
+    <flag contact="{contact}" {flag}/>
+  </option>
+  <worldbody>
+    <body>
+      <joint name="a" type="hinge" axis="0 1 0" damping="0.01" armature="0.001"
+        frictionloss="{loss}" {limit}/>
+      <inertial pos="0 0 -0.1" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/>
+      {child}
+    </body>
+    {tree}
+  </worldbody>
+  <actuator><motor joint="a"/></actuator>
+</mujoco>
+"""
+LINK = (
+    '<body pos="0 0 -0.2"><joint type="hinge" axis="0 1 0" frictionloss="0.02"/>'
+    '<inertial pos="0 0 -0.1" mass="0.3" diaginertia="1e-3 1e-3 1e-3"/></body>'
+)
+
+
+def stated_and_lean(folder: Path, **parts: Any) -> tuple[Any, Any]:
+    """A test bench as it is stated, solved exactly, and the copy of it that a plant steps."""
+    defaults = dict.fromkeys(("flag", "limit", "child", "tree"), "")
+    values = {**defaults, "contact": "disable", "loss": 0.05, **parts}
+    spec, path = written(folder, BENCH.format(**values))
+    plain = compile_spec(spec, path)
+    plain.opt.tolerance = 1e-14
+    plain.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+    lean = PlantModel(ModelSource(path, spec), moved_bodies=[], sensors=False, friction=True).model
+    return plain, lean
+
+
+def motion_with_reversals(model: Any) -> Array:
+    """(300, nq + nv) states of a motion in which the joint reverses and sticks."""
+    data, rows = mujoco.MjData(model), []
+    for k in range(300):
+        data.ctrl[:] = 0.6 * np.sin(0.05 * k)
+        mujoco.mj_step(model, data, 10)
+        rows.append(np.concatenate([data.qpos, data.qvel]))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("loss", [1e-6, 0.05, 0.4, 100.0])
+def test_one_row_of_friction_has_the_same_force_by_the_quicker_solver(
+    loss: float, tmp_path
+) -> None:
+    plain, lean = stated_and_lean(tmp_path, loss=loss)
+    assert (plain.opt.solver, lean.opt.solver) == (
+        mujoco.mjtSolver.mjSOL_NEWTON,
+        mujoco.mjtSolver.mjSOL_PGS,
+    )
+    np.testing.assert_allclose(
+        motion_with_reversals(lean), motion_with_reversals(plain), rtol=0.0, atol=1e-12
+    )
+
+
+def test_one_tree_moves_without_a_search_for_islands_to_the_bit(tmp_path) -> None:
+    plain, lean = stated_and_lean(tmp_path, child=LINK)
+    assert lean.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    np.testing.assert_array_equal(motion_with_reversals(lean), motion_with_reversals(plain))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"child": LINK},
+        {"tree": LINK},
+        {"limit": 'limited="true" range="-1 1"'},
+        {
+            "contact": "enable",
+            "tree": '<geom type="plane" size="1 1 1" pos="0 0 -1"/>',
+            "child": '<geom size="0.1" mass="0"/>',
+        },
+    ],
+    ids=["another joint", "another tree", "a limit", "a contact"],
+)
+def test_the_stated_solver_stays_where_there_may_be_more_rows(
+    parts: dict[str, str], tmp_path
+) -> None:
+    _, lean = stated_and_lean(tmp_path, **parts)
+    assert lean.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+
+
+@pytest.mark.parametrize(
+    "parts", [{"tree": LINK}, {"flag": 'sleep="enable"'}], ids=["two trees", "sleeping bodies"]
+)
+def test_islands_are_found_where_there_may_be_several(parts: dict[str, str], tmp_path) -> None:
+    _, lean = stated_and_lean(tmp_path, **parts)
+    assert not lean.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+
+
 def test_private_copies_do_not_change_the_users_spec_and_model(tmp_path) -> None:
     task = body_task(tmp_path)
     before = task.system.source.spec.to_xml()
