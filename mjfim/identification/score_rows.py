@@ -84,10 +84,14 @@ class ScoreRows:
             return None
 
         m = self.problem.simulation.private_count + self.problem.layout.column_count + 1
-        blocks = np.zeros((len(self.problem.segments), m + len(further), m + len(further)))
+        m += len(further)
+        blocks = np.zeros((len(self.problem.segments), m, m))
         for segment, found in self.segments.items():
             weighted = columns[segment] * found.weight[:, None]
-            blocks[segment] = triangle(_inserted(found.rows, weighted))
+            rows = _inserted(found.rows, weighted)
+
+            # A segment may have fewer values than columns; rows of zeros complete its triangle.
+            blocks[segment] = triangle(np.concatenate([np.zeros((m, m)), rows]))
 
         private = self.problem.prior_rows.private(self.at)
         common = self.problem.prior_rows.common(self.at)
