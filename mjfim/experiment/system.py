@@ -264,32 +264,36 @@ class System:
         plant = self.plant.with_substeps(substeps)
         return replace(self, variant=STATED, stated_grid=grid, plant=plant)
 
-    def calibrated(self, theta: Array, ctrl: Array) -> System:
+    def calibrated(self, theta: Array, ctrl: Array, wanted: np.ndarray | None = None) -> System:
         """This system with difference steps that suit the trajectory of a control.
 
         Args:
             theta: (p,) parameter values.
             ctrl: (N, nu) control.
+            wanted: (p,) True for the parameters whose steps are calibrated; None for all.
 
         Returns:
             The calibrated system; this system unchanged if the trajectory diverges.
         """
         try:
-            return self.calibrated_along(theta, self.plant.simulate(theta, ctrl))
+            return self.calibrated_along(theta, self.plant.simulate(theta, ctrl), wanted)
         except SimulationDivergedError:
             return self
 
-    def calibrated_along(self, theta: Array, trajectory: Trajectory) -> System:
+    def calibrated_along(
+        self, theta: Array, trajectory: Trajectory, wanted: np.ndarray | None = None
+    ) -> System:
         """This system with difference steps that suit a trajectory.
 
         Args:
             theta: (p,) parameter values [theta-unit].
             trajectory: A trajectory of the plant at theta.
+            wanted: (p,) True for the parameters whose steps are calibrated; None for all.
 
         Returns:
             The calibrated system.
         """
-        return replace(self, plant=self.plant.calibrated(theta, trajectory))
+        return replace(self, plant=self.plant.calibrated(theta, trajectory, wanted))
 
     @cached_property
     def grid(self) -> TimeGrid:
@@ -420,7 +424,8 @@ class System:
     def model_with_stated_solver(self, theta: Array) -> Any:
         """The user's model with parameters and with the solver settings of the MJCF.
 
-        Other models solve for constraint forces to a private tolerance and without a warm start.
+        Other models solve for constraint forces to a private tolerance and without a warm start,
+        and with a quicker solver where that finds the same forces.
 
         Args:
             theta: (p,) parameter values.
@@ -430,10 +435,11 @@ class System:
         """
         model = self.model_at(theta)
         model.opt.tolerance = self.model.opt.tolerance
+        model.opt.solver = self.model.opt.solver
 
-        warm_start = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
-        stated = self.model.opt.disableflags & warm_start
-        model.opt.disableflags = (model.opt.disableflags & ~warm_start) | stated
+        flags = int(mujoco.mjtDisableBit.mjDSBL_WARMSTART | mujoco.mjtDisableBit.mjDSBL_ISLAND)
+        stated = self.model.opt.disableflags & flags
+        model.opt.disableflags = (model.opt.disableflags & ~flags) | stated
         return model
 
     def impossible(self, theta: Array) -> list[int]:

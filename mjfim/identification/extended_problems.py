@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -45,7 +45,7 @@ def extended_problem(
     at: UnknownValues,
     extended: System,
     *,
-    differentiated: bool = True,
+    differentiated_by: Collection[str],
 ) -> tuple[FitProblem, UnknownValues]:
     """The problem of an extended system, and the solution of the stated one in it.
 
@@ -57,8 +57,11 @@ def extended_problem(
         recordings: All recordings.
         at: Its solution.
         extended: The extended system, which has all parameters of the stated one.
-        differentiated: Whether the problem is linearised, for which its difference steps have to be
-            calibrated.
+        differentiated_by: Names of the parameters by which it is differentiated, for which their
+            difference steps are calibrated.
+
+    Returns:
+        The problem and its unknowns.
     """
     stated, names = problem.system.parameters.names, extended.parameters.names
     theta = np.array(extended.parameters.guess)
@@ -66,7 +69,7 @@ def extended_problem(
 
     # The rows are those of the solution; a delay as a parameter would let the segments begin
     # earlier.
-    wider = FitProblem.of(extended, recordings, calibrated=differentiated)
+    wider = FitProblem.of(extended, recordings, calibrated=differentiated_by)
     simulation = replace(wider.simulation, segments=_extended_segments(problem, wider))
     wider = replace(
         wider,
@@ -114,6 +117,22 @@ def _extended_private(problem: FitProblem, wider: FitProblem, at: UnknownValues)
     private = np.zeros((len(at.private), len(after)))
     private[:, [after.index(name) for name in before]] = at.private
     return private
+
+
+def new_private_columns(problem: FitProblem, wider: FitProblem) -> list[int]:
+    """Private unknowns of the extended problem that the stated one does not have.
+
+    They are initial states of new coordinates.
+
+    Args:
+        problem: The stated problem.
+        wider: The extended problem.
+
+    Returns:
+        Their columns among the private unknowns of the extended problem.
+    """
+    known = _private_names(problem)
+    return [column for column, name in enumerate(_private_names(wider)) if name not in known]
 
 
 def _private_names(problem: FitProblem) -> list[str]:

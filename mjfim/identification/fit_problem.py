@@ -6,7 +6,7 @@ linearised rows are condensed block by block.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -82,7 +82,7 @@ class FitProblem:
         recordings: Sequence[Recording],
         *,
         data_only: bool = False,
-        calibrated: bool = True,
+        calibrated: Collection[str] | None = None,
     ) -> FitProblem:
         """The problem that the `[fit]` table of a system's experiment states.
 
@@ -90,8 +90,9 @@ class FitProblem:
             system: The system.
             recordings: Recordings in SI units.
             data_only: Whether to leave priors and bounds out.
-            calibrated: Whether to calibrate the difference steps; False for a problem that is never
-                linearised, or that gets those of another one.
+            calibrated: Names of the parameters whose difference steps are calibrated; None for all.
+                There are none for a problem that is never linearised, or that gets the steps of
+                another one.
 
         Returns:
             The problem.
@@ -111,10 +112,11 @@ class FitProblem:
         aligned = tuple(align(system, recording) for recording in recordings)
 
         # Difference steps depend on how strongly each parameter changes the recorded motion.
-        if calibrated:
+        if calibrated is None or len(calibrated):
             longest = max(aligned, key=lambda recording: len(recording.ctrl))
             samples = CALIBRATION_SAMPLES * stated_substeps // system.grid.substeps
-            system = _calibrated_along(system, longest, samples)
+            wanted = None if calibrated is None else np.isin(parameters.names, list(calibrated))
+            system = _calibrated_along(system, longest, samples, wanted)
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = has_free_starts(system)
@@ -227,16 +229,14 @@ class FitProblem:
             segments.append(segment.first_part(recording.t, recording.dt, share))
         return replace(self, simulation=replace(self.simulation, segments=tuple(segments)))
 
-    def from_known_states(self, at: UnknownValues) -> tuple[FitProblem, UnknownValues]:
-        """The problem with initial states that are no unknowns, for derivatives by theta alone.
+    def from_known_states(
+        self, at: UnknownValues, unknown: Sequence[int] = ()
+    ) -> tuple[FitProblem, UnknownValues]:
+        """The problem with initial states most of whose components are no unknowns.
 
-        Args:
-            at: Unknowns with the initial states.
-
-        Returns:
-            The problem, and the unknowns without those of initial states that are free.
+        See `SegmentSimulation.from_known_states`.
         """
-        simulation, known = self.simulation.from_known_states(at)
+        simulation, known = self.simulation.from_known_states(at, unknown)
         return replace(self, simulation=simulation), known
 
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
@@ -668,7 +668,7 @@ class FitProblem:
         central: bool | None = None,
         wanted: np.ndarray | None = None,
     ) -> Iterator[SegmentBatch]:
-        """All segments in batches for the workers of this problem, or for this process.
+        """All segments in batches, differentiated with the steps of this problem.
 
         Args:
             derivatives: Whether to compute derivatives.
@@ -684,7 +684,6 @@ class FitProblem:
             central=self.central if central is None else central,
             step=self.difference_step,
             wanted=wanted,
-            shared=self.workers is not None,
         )
 
     def of_batches(
@@ -720,14 +719,19 @@ def have_same_initial_states(problem: FitProblem, other: FitProblem) -> bool:
     return begins == others and width == other.simulation.private_count
 
 
-def _calibrated_along(system: System, recording: AlignedRecording, samples: int) -> System:
-    """The system with difference steps that suit the first samples of a recording."""
+def _calibrated_along(
+    system: System, recording: AlignedRecording, samples: int, wanted: np.ndarray | None
+) -> System:
+    """The system with difference steps that suit the first samples of a recording.
+
+    wanted: (p,) True for the parameters whose steps are calibrated; None for all.
+    """
     guess, control = system.parameters.guess, recording.ctrl[:samples]
     nominal = system.plant.nominal_initial_state
     begun = replace(
         system, plant=system.plant.with_initial_state(recorded_release(system, recording))
     )
-    calibrated = begun.calibrated(guess, control)
+    calibrated = begun.calibrated(guess, control, wanted)
     return replace(calibrated, plant=calibrated.plant.with_initial_state(nominal))
 
 

@@ -4,7 +4,9 @@ Most candidates (`mjfim/identification/candidates.py`) have score tests. Each of
 column of sensitivities at the estimate. With the score g and the information I of the numbers of a
 term, both after the parameters are eliminated, the term would reduce the sum of squared residuals
 by `g' I^-1 g`, which is chi-squared distributed where the model is complete, and its estimated size
-is `-I^-1 g`. One linearisation of one extended model tests all of them.
+is `-I^-1 g`. The columns of the parameters are those of the stated model, which are simulated once;
+those of the candidates are differences of an extended model that has many of them
+(`mjfim/identification/score_rows.py`).
 
 Terms that change the coordinates of the model, such as an elastic joint, have no such test. They
 are screened by simulations with some of their values (`mjfim/identification/screened_terms.py`).
@@ -30,10 +32,7 @@ from mjfim.identification.candidates import (
     load_candidates_of,
 )
 from mjfim.identification.data_parts import part_of_data
-from mjfim.identification.extended_problems import (
-    extended_problem,
-    extended_system,
-)
+from mjfim.identification.extended_problems import extended_problem, extended_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.payload_candidates import payload_candidates_of
 from mjfim.identification.score_rows import ScoreRows
@@ -263,7 +262,7 @@ def _by_score(
     found: dict[str, MissingTerm] = {}
     of_joints: list[MissingTerm] = []
     untested: list[str] = []
-    stated = ScoreRows.of(problem, at)
+    stated = ScoreRows.of(problem, at) if count else None
     parts = (_linearised(stated, recordings, group) for group in groups)
     for candidates, linearisation in itertools.chain.from_iterable(parts):
         if linearisation is None:
@@ -394,10 +393,11 @@ def _linearise(
     if extended is None:
         return None
 
-    wider, begin = extended_problem(stated.problem, recordings, stated.at, extended)
-    place = {name: index for index, name in enumerate(extended.parameters.names)}
-    further = [place[name] for of_candidate in names for name in of_candidate]
-    condensed = stated.beside(wider, begin, further)
+    further = [name for of_candidate in names for name in of_candidate]
+    wider, begin = extended_problem(
+        stated.problem, recordings, stated.at, extended, differentiated_by=further
+    )
+    condensed = stated.condensed_with(wider, begin, further)
     if condensed is None:
         return None
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.identification.extended_problems import new_private_columns
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SegmentBatch
 from mjfim.optimize.condensed_least_squares import Condensed, triangle
@@ -21,15 +22,31 @@ from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WeightedRows:
-    """The values of one segment that count, row by row.
+    """The n values of one segment that count, row by row.
 
     Attributes:
-        rows: (n, m) whitened rows `[J_private, J_common, r]`, weighted by the loss.
-        weight: (n,) their weights.
+        rows: (n, m) whitened rows `[J_private, J_common, r]`, each multiplied by its weight.
+        weight: (n,) weights of the robust loss; 1 for the linear one.
     """
 
     rows: Array
     weight: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FurtherColumns:
+    """Whitened columns of an extended model that the stated one does not have.
+
+    Attributes:
+        private: (n, q) derivatives by the q initial states of new coordinates, by segment.
+        further: (n, k) derivatives by the k further parameters, by segment.
+        private_rows: (P, q, q) rows of the weak priors on these initial states, whose residuals are
+            zero.
+    """
+
+    private: Mapping[int, Array]
+    further: Mapping[int, Array]
+    private_rows: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,69 +82,91 @@ class ScoreRows:
             segments.update(found)
         return cls(problem=problem, at=at, segments=segments)
 
-    def beside(
-        self, extended: FitProblem, begin: UnknownValues, further: Sequence[int]
+    def condensed_with(
+        self, extended: FitProblem, begin: UnknownValues, names: Sequence[str]
     ) -> Condensed | None:
         """Condense these rows with the columns of further parameters.
 
         Args:
             extended: The problem of the extended model, with the same segments and measured values.
             begin: Its unknowns at the solution of the stated problem.
-            further: (k,) indices of the further parameters in theta of the extended model, which
-                all recordings share.
+            names: Names of the k further parameters, which all recordings share.
 
         Returns:
-            Rows `[J_private, J_common, J_further, r]`; None where a perturbed simulation diverges.
+            One block of rows `[J_private, J_new, J_common, J_further, r]` for each of the P
+            segments. Its private unknowns are the n of the stated problem and the q initial states
+            of new coordinates; its common unknowns are the c of the stated problem and the further
+            parameters. None where a perturbed simulation diverges.
         """
-        columns = self._columns(extended, begin, further)
+        columns = self._columns(extended, begin, names)
         if columns is None:
             return None
 
-        m = self.problem.simulation.private_count + self.problem.layout.column_count + 1
-        m += len(further)
-        blocks = np.zeros((len(self.problem.segments), m, m))
+        n, P = self.problem.simulation.private_count, len(self.problem.segments)
+        q, k = columns.private_rows.shape[1], len(names)
+        m = n + q + self.problem.layout.column_count + k + 1
+        blocks = np.zeros((P, m, m))
         for segment, found in self.segments.items():
-            weighted = columns[segment] * found.weight[:, None]
-            rows = _inserted(found.rows, weighted)
+            weight = found.weight[:, None]
+            new, further = columns.private[segment], columns.further[segment]
+            rows = _completed(found.rows, n, weight * new, weight * further)
 
             # A segment may have fewer values than columns; rows of zeros complete its triangle.
             blocks[segment] = triangle(np.concatenate([np.zeros((m, m)), rows]))
 
+        # Priors of the stated unknowns, and weak ones on the initial states of new coordinates.
         private = self.problem.prior_rows.private(self.at)
         common = self.problem.prior_rows.common(self.at)
+        known = _completed(private, n, _zeros(private, q), _zeros(private, k))
+        weak = np.zeros((P, q, m))
+        weak[:, :, n : n + q] = columns.private_rows
         return Condensed(
             blocks=blocks,
-            segment_of_block=np.arange(len(blocks)),
-            private_rows=_inserted(private, np.zeros((*private.shape[:-1], len(further)))),
-            common_rows=_inserted(common, np.zeros((len(common), len(further)))),
+            segment_of_block=np.arange(P),
+            private_rows=np.concatenate([known, weak], axis=1),
+            common_rows=_completed(common, 0, _zeros(common, 0), _zeros(common, k)),
         )
 
     def _columns(
-        self, extended: FitProblem, begin: UnknownValues, further: Sequence[int]
-    ) -> dict[int, Array] | None:
-        """(n, k) whitened columns of the further parameters by segment; None for divergence."""
-        wanted = np.zeros(len(extended.system.parameters), dtype=bool)
-        wanted[list(further)] = True
+        self, extended: FitProblem, begin: UnknownValues, names: Sequence[str]
+    ) -> FurtherColumns | None:
+        """Columns of further parameters and of new coordinates; None where it diverges."""
+        all_names = extended.system.parameters.names
+        wanted = np.isin(all_names, list(names))
+        places = [all_names.index(name) for name in names]
 
-        # The initial states are those of the solution: their columns are known.
-        known, begin = extended.from_known_states(begin)
-        batches = known.batches(derivatives=True, wanted=wanted, central=self._is_central(further))
+        # The other initial states are those of the solution, whose columns are known.
+        new = new_private_columns(self.problem, extended)
+        known, begin = extended.from_known_states(begin, new)
+        batches = known.batches(
+            derivatives=True, wanted=wanted, central=self._is_two_sided(len(new) + len(names))
+        )
 
         parts: dict[int, list[Array]] = {}
-        for found in known.of_batches(sensitivities_of_batch, batches, begin):
+        for found in known.of_batches(sensitivity_of_batch, batches, begin):
             if found is None:
                 return None
             for segment, sensitivity in found:
-                parts.setdefault(segment, []).append(sensitivity[:, list(further)])
-        return {segment: np.concatenate(each) for segment, each in parts.items()}
+                parts.setdefault(segment, []).append(sensitivity)
 
-    def _is_central(self, further: Sequence[int]) -> bool:
-        """Whether differences are two-sided, as for a problem with all columns."""
+        q = len(new)
+        whole = {segment: np.concatenate(each) for segment, each in parts.items()}
+        return FurtherColumns(
+            private={segment: each[:, :q] for segment, each in whole.items()},
+            further={segment: each[:, q:][:, places] for segment, each in whole.items()},
+            private_rows=known.prior_rows.private(begin)[:, :q, :q],
+        )
+
+    def _is_two_sided(self, further: int) -> bool:
+        """Whether differences by further directions are two-sided.
+
+        With much data they are one-sided, as in a linearisation by all parameters at once.
+        """
         if self.problem.central is not None:
             return self.problem.central
         simulation = self.problem.simulation
         stated = int(simulation.layout.estimated.sum()) + simulation.private_count
-        return simulation.affords_two_sided(stated + len(further))
+        return simulation.affords_two_sided(stated + further)
 
 
 def weighted_rows_of_batch(
@@ -160,10 +199,10 @@ def weighted_rows_of_batch(
     }
 
 
-def sensitivities_of_batch(
+def sensitivity_of_batch(
     problem: FitProblem, at: UnknownValues, batch: SegmentBatch
 ) -> list[tuple[int, Array]] | None:
-    """Whitened derivatives by theta of a batch whose initial states are known.
+    """Whitened derivatives of a batch, by the private unknowns and by theta.
 
     Args:
         problem: The problem.
@@ -171,8 +210,8 @@ def sensitivities_of_batch(
         batch: The batch, with derivatives.
 
     Returns:
-        Index of a segment and (n, p) derivatives of some of its values that count, in their order;
-        None where a perturbed simulation diverges.
+        Index of a segment and (n, q + p) derivatives of some of its values that count, in their
+        order; None where a perturbed simulation diverges.
     """
     found = []
     for rows in problem.simulation.rows_of_batch(at, batch):
@@ -182,6 +221,19 @@ def sensitivities_of_batch(
     return found
 
 
-def _inserted(rows: Array, columns: Array) -> Array:
-    """Rows `[J, r]` with further columns before the last one."""
-    return np.concatenate([rows[..., :-1], columns, rows[..., -1:]], axis=-1)
+def _completed(rows: Array, private: int, new: Array, further: Array) -> Array:
+    """Rows with columns after the first ones, and with further columns before the last one.
+
+    Args:
+        rows: (..., private + c + 1) rows `[J_private, J_common, r]`.
+        private: Number of the first columns.
+        new: (..., q) columns that follow them.
+        further: (..., k) columns before the last one.
+    """
+    first, middle, last = rows[..., :private], rows[..., private:-1], rows[..., -1:]
+    return np.concatenate([first, new, middle, further, last], axis=-1)
+
+
+def _zeros(rows: Array, count: int) -> Array:
+    """(..., count) columns of zeros beside some rows."""
+    return np.zeros((*rows.shape[:-1], count))

@@ -130,7 +130,7 @@ def _screened(
     extended = extended_system(system, {NAME: {"target": path}}, {added.name: added.table})
     if extended is None:
         return None
-    wider, begin = extended_problem(problem, recordings, at, extended, differentiated=False)
+    wider, begin = extended_problem(problem, recordings, at, extended, differentiated_by=())
 
     quantity = extended.source.terms[added.name].quantity(screening.field)
     first = (

@@ -263,7 +263,9 @@ def problem_of_segments(
     is_same_model = system is task.system
     try:
         part = FitProblem.of(
-            replace(system, experiment=experiment), task.recordings, calibrated=not is_same_model
+            replace(system, experiment=experiment),
+            task.recordings,
+            calibrated=() if is_same_model else None,
         )
     except RecordingError:
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,15 +20,11 @@ from mjfim.plant.input_context import InputContext
 from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.trajectory import Trajectory
 
-# Largest number of engine steps of a batch that workers share, so that there are several of them
-# also with few data. On small models it takes about 0.2 s, against some milliseconds for the way to
-# a worker and back.
-STEPS_OF_SHARED_BATCH = 100_000
-
-# Largest number of engine steps of other batches. Between two batches, a request to stop is seen.
-# All threads wait for the last simulation of a batch, so that a few simulations of long segments
-# would leave some of them idle.
-STEPS_OF_BATCH = 250_000
+# Largest number of engine steps of a batch. On small models it takes about 0.2 s on two threads. At
+# the end of a batch, all threads wait for its last simulation, so that smaller batches of long
+# segments would leave some threads idle. Larger ones would leave workers idle where there are few
+# data.
+STEPS_OF_BATCH = 200_000
 
 # Number of samples that one linearisation simulates, with two-sided differences, above which
 # differences are one-sided.
@@ -130,17 +126,21 @@ class SegmentSimulation:
         """
         return replace(self, segments=tuple(self.segments[i] for i in indices))
 
-    def from_known_states(self, at: UnknownValues) -> tuple[SegmentSimulation, UnknownValues]:
-        """This simulation with initial states that are no unknowns.
+    def from_known_states(
+        self, at: UnknownValues, unknown: Sequence[int] = ()
+    ) -> tuple[SegmentSimulation, UnknownValues]:
+        """This simulation with initial states most of whose components are no unknowns.
 
         Args:
             at: Unknowns with the initial states.
+            unknown: Columns of `start_directions` that remain private unknowns. There are none
+                where initial states are stated.
 
         Returns:
-            The simulation without directions of the initial state, and its unknowns. Deviations of
-            stated initial states remain among them.
+            The simulation, and its unknowns. Only `batches` and `rows_of_batch` may be used where
+            initial states are stated, because their deviations stay in the unknowns.
         """
-        known = replace(self, start_directions=self.start_directions[:, :0])
+        known = replace(self, start_directions=self.start_directions[:, list(unknown)])
         if not self.layout.free_starts:
             return known, at
 
@@ -148,7 +148,8 @@ class SegmentSimulation:
             replace(segment, start=self._initial_state(at, i))
             for i, segment in enumerate(self.segments)
         )
-        return replace(known, segments=segments), replace(at, private=at.private[:, :0])
+        private = np.zeros((len(segments), len(unknown)))
+        return replace(known, segments=segments), replace(at, private=private)
 
     @cached_property
     def sample_count(self) -> int:
@@ -264,7 +265,6 @@ class SegmentSimulation:
         central: bool | None = None,
         step: float = SENSITIVITY_STEP,
         wanted: np.ndarray | None = None,
-        shared: bool = False,
     ) -> Iterator[SegmentBatch]:
         """Divide all segments into batches that fit into memory; every segment is in one of them.
 
@@ -274,7 +274,6 @@ class SegmentSimulation:
             step: Relative step of two-sided differences.
             wanted: (p,) True for the parameters by which to differentiate; default: those that have
                 common columns.
-            shared: Whether workers share the batches.
 
         Yields:
             The batches.
@@ -293,7 +292,7 @@ class SegmentSimulation:
         if derivatives:
             simulations += directions * (2 if central else 1)
 
-        for recording, segments in self._batches(self._max_samples(simulations, shared)):
+        for recording, segments in self._batches(self._max_samples(simulations)):
             yield SegmentBatch(
                 recording=recording,
                 segments=tuple(segments),
@@ -308,6 +307,9 @@ class SegmentSimulation:
 
         Args:
             directions: Number of the directions.
+
+        Returns:
+            True where they simulate few samples.
         """
         return self.sample_count * 2 * directions < SAMPLES_FOR_ONE_SIDED
 
@@ -346,17 +348,15 @@ class SegmentSimulation:
                 if found is not None:
                     yield found
 
-    def _max_samples(self, simulations: int, shared: bool) -> int:
+    def _max_samples(self, simulations: int) -> int:
         """Largest number of samples of a batch, whose states have to fit into memory.
 
         Args:
             simulations: Number of simulations of every segment.
-            shared: Whether workers share the batches.
         """
         steps_per_sample = simulations * self.system.grid.substeps
         numbers_per_step = 1 + self.system.plant.nominal_initial_state.size
-        most_steps = STEPS_OF_SHARED_BATCH if shared else STEPS_OF_BATCH
-        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, most_steps)
+        most = min(MAX_NUMBERS_AT_ONCE // numbers_per_step, STEPS_OF_BATCH)
         return max(most // steps_per_sample, 1)
 
     def _batches(self, max_samples: int) -> Iterator[tuple[int, list[int]]]:

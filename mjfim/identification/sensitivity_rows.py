@@ -75,11 +75,7 @@ def _condensed_sensitivity(
         work = sensitivities_of_batch
     batches = list(
         problem.simulation.batches(
-            derivatives=True,
-            central=with_error,
-            step=SENSITIVITY_STEP,
-            wanted=wanted,
-            shared=problem.workers is not None,
+            derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted
         )
     )
     condensed: dict[int, Array] = {}

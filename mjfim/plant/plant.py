@@ -134,7 +134,9 @@ class Plant:
             steps += self._smooth.simulator.steps
         return steps
 
-    def calibrated(self, theta: Array, trajectory: Trajectory) -> Plant:
+    def calibrated(
+        self, theta: Array, trajectory: Trajectory, wanted: np.ndarray | None = None
+    ) -> Plant:
         """A plant with difference steps whose effect exceeds the round-off of a trajectory.
 
         Simulator and models are shared.
@@ -142,12 +144,13 @@ class Plant:
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
             trajectory: Trajectory on which the effect of every parameter is measured.
+            wanted: (p,) True for the parameters whose effect is measured; None for all.
 
         Returns:
             The plant with longer difference steps for parameters that hardly move this trajectory,
             or the plant itself if a perturbed rollout diverges.
         """
-        factors = self.derivatives.calibrated_step_factors(theta, trajectory)
+        factors = self.derivatives.calibrated_step_factors(theta, trajectory, wanted)
         return self if factors is None else self.with_step_factors(factors)
 
     @property

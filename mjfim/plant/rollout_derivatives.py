@@ -139,15 +139,19 @@ class RolloutDerivatives(ClosedFormDerivatives):
         lumps_others = without_motion_effect[lumped.lumped].any()
         return not (lumps_others or lumped.probe[without_motion_effect].any())
 
-    def calibrated_step_factors(self, theta: Array, trajectory: Trajectory) -> Array | None:
+    def calibrated_step_factors(
+        self, theta: Array, trajectory: Trajectory, wanted: np.ndarray | None = None
+    ) -> Array | None:
         """Factors of the parameters' difference steps with which their effect exceeds round-off.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
             trajectory: Trajectory on which the effect of every parameter is measured.
+            wanted: (p,) True for the parameters whose effect is measured; None for all.
 
         Returns:
-            (p,) factors of at least 1, or None if a perturbed rollout diverges.
+            (p,) factors of at least 1, which are 1 for the other parameters; None if a perturbed
+            rollout diverges.
         """
         outputs = self.plant.outputs
         states = None if outputs.needs_sensors else trajectory.state
@@ -158,6 +162,7 @@ class RolloutDerivatives(ClosedFormDerivatives):
             SENSITIVITY_STEP,
             states=states,
             closed_form=None if outputs.needs_sensors else trajectory,
+            wanted=wanted,
         )
         # Nothing asks for the gradient along this trajectory on account of a calibration.
         self.plant.closed_form_memory.latest = None
@@ -173,8 +178,8 @@ class RolloutDerivatives(ClosedFormDerivatives):
         sizes = np.concatenate([state_sizes, np.where(largest > 0.0, largest, np.inf)])
         moves = np.concatenate([found.psi, found.G], axis=1) * self.plant.parameters.magnitude
         effect = (np.abs(moves).max(axis=0) / sizes[:, None]).max(axis=0)
-        factors = MIN_PARAMETER_EFFECT / np.maximum(effect, TINY)
-        return np.asarray(np.clip(factors, 1.0, MAX_STEP_FACTOR))
+        factors = np.clip(MIN_PARAMETER_EFFECT / np.maximum(effect, TINY), 1.0, MAX_STEP_FACTOR)
+        return np.asarray(factors if wanted is None else np.where(wanted, factors, 1.0))
 
     def _rollout_differences(
         self,
@@ -187,6 +192,7 @@ class RolloutDerivatives(ClosedFormDerivatives):
         central: bool = True,
         lumped: LumpedParameters | None = None,
         closed_form: Trajectory | None = None,
+        wanted: np.ndarray | None = None,
     ) -> tuple[Array, Sensitivity] | None:
         """Outputs and sensitivities from rollouts at theta +- h.
 
@@ -203,6 +209,8 @@ class RolloutDerivatives(ClosedFormDerivatives):
             lumped: Parameters whose columns follow from those of the others, or None.
             closed_form: The trajectory at theta, whose derivatives are taken in closed form by the
                 parameters for which the plant has one; None for rollouts only.
+            wanted: (p,) True for the parameters that are moved; None for all. The columns of the
+                others are zero. All are moved where some of them are lumped.
 
         Returns:
             y: (N+1, ny) outputs [y-unit] and the sensitivities, or None if a rollout diverges. The
@@ -213,7 +221,7 @@ class RolloutDerivatives(ClosedFormDerivatives):
         needs_values = delay is not None or plant.calibration.scales
         needs_origin = states is None or (needs_values and plant.outputs.needs_sensors)
 
-        moving, directions, h = self._moved_directions(step, lumped)
+        moving, directions, h = self._moved_directions(step, lumped, wanted)
         known = None
         if closed_form is not None:
             known = self.closed_form_sensitivity(theta, closed_form, directions)
@@ -290,13 +298,14 @@ class RolloutDerivatives(ClosedFormDerivatives):
         return delay.apply(y), delay.apply(G) + by_delay
 
     def _moved_directions(
-        self, step: float | Array, lumped: LumpedParameters | None
+        self, step: float | Array, lumped: LumpedParameters | None, wanted: np.ndarray | None
     ) -> tuple[np.ndarray, Array, Array]:
         """Directions of theta along which rollouts are differentiated.
 
         Args:
             step: Difference step relative to `parameter_scale`, one number or (p,).
             lumped: Parameters that are not moved alone, or None. Their probe is the last direction.
+            wanted: (p,) True for the parameters that are moved where none is lumped; None for all.
 
         Returns:
             Indices of the parameters that are moved alone; (n, p) directions [theta-unit]; (n,)
@@ -305,6 +314,8 @@ class RolloutDerivatives(ClosedFormDerivatives):
         steps = step * self.parameter_scale
         moving = np.flatnonzero(self.plant.parameters.changes_motion)
         if lumped is None:
+            if wanted is not None:
+                moving = moving[wanted[moving]]
             return moving, _unit_moves(len(steps), moving), steps[moving]
 
         moving = np.setdiff1d(moving, lumped.lumped)

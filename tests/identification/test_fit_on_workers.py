@@ -136,7 +136,7 @@ def in_small_batches(
     monkeypatch: pytest.MonkeyPatch,
 ) -> FitProblem:
     """A problem with many batches, each of which is a task."""
-    monkeypatch.setattr(segment_simulation, "STEPS_OF_SHARED_BATCH", 25)
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 25)
     return problem_of(experiment, recordings, SEGMENTS)
 
 
@@ -202,8 +202,8 @@ def test_a_request_to_stop_ends_the_pass_that_runs_and_keeps_the_values_of_befor
     stop = StopToken()
 
     # The first pass for the cost and the first linearisation are complete by then.
-    passes = len(list(problem.simulation.batches(derivatives=False, shared=True)))
-    passes += len(list(problem.simulation.batches(derivatives=True, shared=True)))
+    passes = len(list(problem.simulation.batches(derivatives=False)))
+    passes += len(list(problem.simulation.batches(derivatives=True)))
     with StoppingThreads(stop, passes + 1) as threads:
         divided = problem.on_workers(FitWorkers(threads, stop))
         found = minimise(divided, begin, SearchSettings(), Budget(stop=stop))

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+import mjfim
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
 from mjfim.model.loading import ModelSource, compile_spec, load_spec
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.variants import PlantModel, unconstrained
@@ -690,6 +692,7 @@ BENCH = """
     {tree}
   </worldbody>
   <actuator><motor joint="a"/></actuator>
+  {more}
 </mujoco>
 """
 LINK = (
@@ -700,7 +703,7 @@ LINK = (
 
 def stated_and_lean(folder: Path, **parts: Any) -> tuple[Any, Any]:
     """A test bench as it is stated, solved exactly, and the copy of it that a plant steps."""
-    defaults = dict.fromkeys(("flag", "limit", "child", "tree"), "")
+    defaults = dict.fromkeys(("flag", "limit", "child", "tree", "more"), "")
     values = {**defaults, "contact": "disable", "loss": 0.05, **parts}
     spec, path = written(folder, BENCH.format(**values))
     plain = compile_spec(spec, path)
@@ -751,14 +754,53 @@ def test_one_tree_moves_without_a_search_for_islands_to_the_bit(tmp_path) -> Non
             "tree": '<geom type="plane" size="1 1 1" pos="0 0 -1"/>',
             "child": '<geom size="0.1" mass="0"/>',
         },
+        {"more": '<tendon><fixed frictionloss="1"><joint joint="a" coef="1"/></fixed></tendon>'},
+        {"more": '<equality><joint joint1="a"/></equality>'},
+        {"more": '<option iterations="0"/>'},
     ],
-    ids=["another joint", "another tree", "a limit", "a contact"],
+    ids=[
+        "another joint",
+        "another tree",
+        "a limit",
+        "a contact",
+        "a tendon",
+        "an equality",
+        "no iteration",
+    ],
 )
 def test_the_stated_solver_stays_where_there_may_be_more_rows(
     parts: dict[str, str], tmp_path
 ) -> None:
     _, lean = stated_and_lean(tmp_path, **parts)
     assert lean.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+
+
+@pytest.mark.parametrize("solver", ["CG", "Newton"])
+def test_a_design_is_verified_with_the_stated_solver(solver: str, tmp_path) -> None:
+    values = dict.fromkeys(("flag", "limit", "child", "tree"), "")
+    values |= {"contact": "disable", "loss": "0.05", "more": f'<option solver="{solver}"/>'}
+    path = tmp_path / "bench.xml"
+    path.write_text(BENCH.format(**values), encoding="utf-8")
+    system = System.resolve(
+        mjfim.Experiment.model_validate(
+            {
+                "model": str(path),
+                "rate": 100.0,
+                "horizon": 1.0,
+                "noise": {"state": 0.01},
+                "parameters": {"damping": {"target": "joint/a:damping"}},
+            }
+        )
+    )
+    theta = system.parameters.guess
+    assert system.model_at(theta).opt.solver == mujoco.mjtSolver.mjSOL_PGS
+    found = system.model_with_stated_solver(theta).opt
+    assert (
+        found.solver
+        == system.model.opt.solver
+        == getattr(mujoco.mjtSolver, f"mjSOL_{solver.upper()}")
+    )
+    assert found.disableflags == system.model.opt.disableflags
 
 
 @pytest.mark.parametrize(

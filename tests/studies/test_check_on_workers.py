@@ -55,7 +55,7 @@ def test_random_motions_are_the_same_although_tasks_are_lost() -> None:
 def test_recordings_tell_the_same_although_tasks_are_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(segment_simulation, "STEPS_OF_SHARED_BATCH", 200)
+    monkeypatch.setattr(segment_simulation, "STEPS_OF_BATCH", 200)
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=0.5)
     task = DesignTask.resolve(experiment, threads=1)
     recordings = [simulate_system(task.system, task.initial, seed) for seed in range(3)]
