@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
@@ -25,6 +24,7 @@ from mjfim.excitation.observed_numbers import observed_numbers
 from mjfim.excitation.task import DesignTask
 from mjfim.model.geom_distance import GeomDistances
 from mjfim.model.geom_pairs import find_geom_pairs
+from mjfim.model.integrators import is_rk4
 from mjfim.model.sizes import model_length
 from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.plant.batch import SubstepObservations
@@ -305,7 +305,7 @@ def _force_rows(task: DesignTask, kinds: set[str]) -> tuple[int, ...]:
         return ()
 
     substeps = task.system.grid.substeps
-    with_stages = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+    with_stages = is_rk4(model)
     begun = range(substeps) if with_stages else ()
     return (*begun, substeps - 1)
 

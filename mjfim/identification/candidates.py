@@ -18,10 +18,10 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import ScalarJoint, scalar_joints
 from mjfim.model.elements import element_name, names_of
+from mjfim.model.integrators import is_rk4
 from mjfim.model.paths import unit_of
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.terms.drives import SHORT_LAG
-from mjfim.model.terms.friction import is_rk4
 from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import Term, TermTable
 from mjfim.records.missing_term import AddedTerm, TermParameter

@@ -27,6 +27,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.regression_spline import Readings, RegressionSpline, fit_splines
 from mjfim.model.coordinates import dof_names
+from mjfim.model.integrators import is_rk4
 from mjfim.plant.outputs import outputs_by_state
 
 # Number of points of the motion for each interval between the knots of the finest spline.
@@ -178,8 +179,7 @@ def measured_motion(
 
 def engine_lag(model: mujoco.MjModel) -> float:
     """Time by which a velocity of the engine's state is older than the position [s]."""
-    is_smooth = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    return 0.0 if is_smooth else 0.5 * float(model.opt.timestep)
+    return 0.0 if is_rk4(model) else 0.5 * float(model.opt.timestep)
 
 
 # ---- curves

@@ -12,6 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError
+from mjfim.model.integrators import is_rk4
 from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource
 from mjfim.model.smooth_friction import has_dry_friction, smooth_dry_friction
 
@@ -170,7 +171,7 @@ class Relaxation:
         if self.constraints:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-            if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            if is_rk4(model):
                 model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
                 model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
+from mjfim.model.integrators import is_rk4
 from mjfim.model.servos import actuator_gear
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, control_sizes, model_length
 from mjfim.model.terms.changes import Attributes, ChangedElement, MjcfChange
@@ -83,7 +84,7 @@ class ActuatorLag(Term):
         # With `actearly` the actuator acts within the same step, so that a vanishing lag would be
         # the actuator without it. RK4 takes the activation through its stages.
         timestep = float(model.opt.timestep)
-        explicit = int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
+        explicit = is_rk4(model)
         least = (LEAST_LAG_RK4 if explicit else LEAST_LAG) * timestep
         values = resolved_values(cls.kind, table, {"time_constant": SHORT_LAG * timestep})
         if values["time_constant"] < least:

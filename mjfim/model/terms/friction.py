@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
+from mjfim.model.integrators import is_rk4
 from mjfim.model.terms.changes import Attributes, ChangedElement, MjcfChange, NewElement
 from mjfim.model.terms.joint_sizes import JointSizes, rounded
 from mjfim.model.terms.term import (
@@ -414,15 +415,6 @@ def _stribeck_speed(value: float, at: JointSizes, path: str) -> TermQuantity:
         bounds=(LEAST_STRIBECK_SHARE * at.speed, np.inf),
         numbers=((path, 1.0),),
     )
-
-
-def is_rk4(model: Any) -> bool:
-    """Return whether a model is integrated with RK4.
-
-    Args:
-        model: The compiled model (`mujoco.MjModel`).
-    """
-    return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def _with(numbers: Any, changed: Mapping[int, float]) -> np.ndarray:

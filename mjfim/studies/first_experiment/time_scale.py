@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.model.integrators import is_rk4
 
 # Samples in one characteristic period of the motion.
 SAMPLES_PER_PERIOD = 100
@@ -167,7 +168,7 @@ def _eigenvalues(model: Any, data: Any) -> Array:
 
     # MuJoCo does not linearise RK4; the time scale is the same with Euler's method.
     euler = copy(model)
-    if euler.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
+    if is_rk4(euler):
         euler.opt.integrator = int(mujoco.mjtIntegrator.mjINT_EULER)
     mujoco.mjd_transitionFD(euler, data, DIFFERENCE, True, A, None, None, None)
     if not np.isfinite(A).all():
