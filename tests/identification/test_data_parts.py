@@ -125,7 +125,7 @@ def test_terms_that_could_not_be_tested_are_said() -> None:
 def test_a_term_that_the_first_recording_does_not_show_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first recording is at rest; where only it was tested, no term was significant."""
+    """The first recording shows noise alone: where only it is tested, no term is significant."""
     robot = System.resolve(experiment_of(tmp_path, "asymmetric_friction"))
     write_pendulum(tmp_path, joint='frictionloss="0.03"')
     stated = mjfim.Experiment(
@@ -135,9 +135,10 @@ def test_a_term_that_the_first_recording_does_not_show_is_found(
         parameters={"damping": {"target": "joint/pivot:damping"}},
         directory=tmp_path,
     )
-    controls = [np.zeros((150, 1)), *(motor_torque(1.5, RATE, i, size=0.08) for i in (0, 1, 2))]
-    logs = [recorded(robot, ctrl, seed) for seed, ctrl in enumerate(controls)]
-    problem = FitProblem.of(System.resolve(stated), logs)
+    system = System.resolve(stated)
+    moved = [recorded(robot, motor_torque(1.5, RATE, i, size=0.08), i + 1) for i in (0, 1, 2)]
+    logs = [recorded(system, np.zeros((150, 1)), 0), *moved]
+    problem = FitProblem.of(system, logs)
     begin = problem.begin(problem.system.parameters.guess)
     solution = minimise(problem, begin, SearchSettings(max_iterations=6))
     assert solution is not None
