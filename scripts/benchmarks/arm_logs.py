@@ -488,7 +488,8 @@ class Fitted:
         system: The fitted system, with the terms that a selection added.
         theta: (p,) estimate.
         formal: (p, p) formal covariance.
-        covering: (p, p) covariance that allows for residuals that are not white.
+        covering: (p, p) covariance that allows for residuals that are not white. It is zero for
+            parameters that a selection held.
         rms: (n,) residual torques [N m].
         equations: (p,) the fit to the equation of motion; None where it is not asked for.
         misfit: Whether a misfit is raised.
@@ -546,14 +547,13 @@ def _of_estimate(system: System, estimate: Estimate, torques: Sequence[str]) -> 
         estimate: The estimate.
         torques: Names of the measured torques.
     """
-    assert estimate.robust_uncertainty is not None
     added = () if estimate.selection is None else estimate.selection.terms
     by_equation = estimate.inverse_dynamics
     return Fitted(
         system=system,
         theta=estimate.theta,
         formal=estimate.covariance,
-        covering=estimate.robust_uncertainty.covariance,
+        covering=estimate.honest_covariance,
         rms=np.array([estimate.residual_rms[name] for name in torques]),
         equations=None if by_equation is None else by_equation.theta,
         misfit=estimate.misfit,
