@@ -647,10 +647,8 @@ class FitProblem:
             if rows is None:
                 return None
 
-            # A robust loss is linearised by weights (iteratively reweighted least squares).
             found = self.whitened.linearised(rows)
-            weight = self.loss.weight(found.r)
-            weighted = np.concatenate([found.J, found.r[:, None]], axis=1) * weight[:, None]
+            weighted = found.weighted(self.loss).rows
 
             # Values are added to the triangle of the block of their row.
             block = self.blocks.of_rows(rows)[found.row]

@@ -16,21 +16,9 @@ from mjfim.arrays import Array
 from mjfim.identification.extended_problems import new_private_columns
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.segment_simulation import SegmentBatch
+from mjfim.identification.whitened_rows import WeightedRows
 from mjfim.optimize.condensed_least_squares import Condensed, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class WeightedRows:
-    """The n values of one segment that count, row by row.
-
-    Attributes:
-        rows: (n, m) whitened rows `[J_private, J_common, r]`, each multiplied by its weight.
-        weight: (n,) weights of the robust loss; 1 for the linear one.
-    """
-
-    rows: Array
-    weight: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -182,18 +170,16 @@ def weighted_rows_of_batch(
     Returns:
         The rows of every segment by its index; None where a perturbed simulation diverges.
     """
-    parts: dict[int, list[tuple[Array, Array]]] = {}
+    parts: dict[int, list[WeightedRows]] = {}
     for rows in problem.simulation.rows_of_batch(at, batch):
         if rows is None:
             return None
-        linearised = problem.whitened.linearised(rows)
-        weight = problem.loss.weight(linearised.r)
-        values = np.column_stack([linearised.J, linearised.r])
-        parts.setdefault(rows.segment, []).append((values * weight[:, None], weight))
+        weighted = problem.whitened.linearised(rows).weighted(problem.loss)
+        parts.setdefault(rows.segment, []).append(weighted)
     return {
         segment: WeightedRows(
-            rows=np.concatenate([rows for rows, _ in each]),
-            weight=np.concatenate([weight for _, weight in each]),
+            rows=np.concatenate([part.rows for part in each]),
+            weight=np.concatenate([part.weight for part in each]),
         )
         for segment, each in parts.items()
     }

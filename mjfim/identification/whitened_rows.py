@@ -8,7 +8,21 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.identification.segment_simulation import SegmentRows, SegmentSimulation
+from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.plant.noise import Noise
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WeightedRows:
+    """The n values of some rows that count, row by row.
+
+    Attributes:
+        rows: (n, m) whitened rows `[J_private, J_common, r]`, each multiplied by its weight.
+        weight: (n,) weights of the robust loss; 1 for the linear one.
+    """
+
+    rows: Array
+    weight: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,6 +38,18 @@ class LinearisedRows:
     row: np.ndarray
     r: Array
     J: Array
+
+    def weighted(self, loss: RobustLoss) -> WeightedRows:
+        """These values with the weights that linearise a robust loss.
+
+        Their squares are those of iteratively reweighted least squares.
+
+        Args:
+            loss: The loss of a whitened residual.
+        """
+        weight = loss.weight(self.r)
+        rows = np.concatenate([self.J, self.r[:, None]], axis=1) * weight[:, None]
+        return WeightedRows(rows=rows, weight=weight)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -75,6 +75,13 @@ def extended(
     return extended_problem(problem, recordings, at, system, differentiated_by=list(further))
 
 
+def rows_of(problem: FitProblem, at: UnknownValues) -> ScoreRows:
+    """The rows of a problem that does not diverge."""
+    rows = ScoreRows.of(problem, at)
+    assert rows is not None
+    return rows
+
+
 def information(condensed: Condensed, columns: Sequence[int]) -> Array:
     """(c+1, c+1) products of the rows without private unknowns, columns in some order."""
     rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
@@ -118,8 +125,7 @@ def test_they_are_those_of_a_linearisation_by_all_parameters(case: str) -> None:
     at = problem.begin(0.9 * problem.system.parameters.guess)
     wider, begin = extended(problem, recordings, at)
 
-    rows = ScoreRows.of(problem, at)
-    assert rows is not None
+    rows = rows_of(problem, at)
     condensed = rows.condensed_with(wider, begin, list(FURTHER))
     assert condensed is not None
     found = information(condensed, range(condensed.common_count))
@@ -157,8 +163,7 @@ def test_initial_states_of_new_coordinates_are_eliminated(
     wider, begin = extended_problem(problem, recordings, at, wide, differentiated_by=["load"])
     assert wider.simulation.private_count > problem.simulation.private_count
 
-    rows = ScoreRows.of(problem, at)
-    assert rows is not None
+    rows = rows_of(problem, at)
     condensed = rows.condensed_with(wider, begin, ["load"])
     assert condensed is not None
     assert condensed.private_count == wider.simulation.private_count
@@ -180,8 +185,7 @@ def test_initial_states_of_new_coordinates_are_eliminated(
 def test_residuals_are_those_without_a_small_term() -> None:
     problem, recordings = stated("whole")
     at = problem.begin(0.9 * problem.system.parameters.guess)
-    rows = ScoreRows.of(problem, at)
-    assert rows is not None
+    rows = rows_of(problem, at)
 
     small = {"slide_damping": {"target": "joint/slide:damping", "guess": 1e-2, "scale": 0.1}}
     wider, begin = extended(problem, recordings, at, small)
@@ -200,8 +204,7 @@ def test_residuals_are_those_without_a_small_term() -> None:
 def test_the_stated_columns_are_simulated_once() -> None:
     problem, recordings = stated("whole")
     at = problem.begin(problem.system.parameters.guess)
-    rows = ScoreRows.of(problem, at)
-    assert rows is not None
+    rows = rows_of(problem, at)
     wider, begin = extended(problem, recordings, at)
 
     plant = wider.system.plant
@@ -221,8 +224,7 @@ def test_workers_find_the_same_digits(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def condensed(problem: FitProblem) -> Condensed:
         """The rows of a problem beside those of the extended one."""
-        rows = ScoreRows.of(problem, at)
-        assert rows is not None
+        rows = rows_of(problem, at)
         found = rows.condensed_with(wider, begin, list(FURTHER))
         assert found is not None
         return found
@@ -237,8 +239,7 @@ def test_workers_find_the_same_digits(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_model_that_diverges_with_further_parameters_has_no_rows() -> None:
     problem, recordings = stated("whole")
     at = problem.begin(problem.system.parameters.guess)
-    rows = ScoreRows.of(problem, at)
-    assert rows is not None
+    rows = rows_of(problem, at)
     wider, begin = extended(problem, recordings, at)
 
     theta = np.array(begin.theta)

@@ -701,11 +701,16 @@ LINK = (
 )
 
 
-def stated_and_lean(folder: Path, **parts: Any) -> tuple[Any, Any]:
-    """A test bench as it is stated, solved exactly, and the copy of it that a plant steps."""
+def bench(folder: Path, **parts: Any) -> tuple[Any, Path]:
+    """Spec and path of a test bench with some further parts."""
     defaults = dict.fromkeys(("flag", "limit", "child", "tree", "more"), "")
     values = {**defaults, "contact": "disable", "loss": 0.05, **parts}
-    spec, path = written(folder, BENCH.format(**values))
+    return written(folder, BENCH.format(**values))
+
+
+def stated_and_lean(folder: Path, **parts: Any) -> tuple[Any, Any]:
+    """A test bench as it is stated, solved exactly, and the copy of it that a plant steps."""
+    spec, path = bench(folder, **parts)
     plain = compile_spec(spec, path)
     plain.opt.tolerance = 1e-14
     plain.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
@@ -777,10 +782,7 @@ def test_the_stated_solver_stays_where_there_may_be_more_rows(
 
 @pytest.mark.parametrize("solver", ["CG", "Newton"])
 def test_a_design_is_verified_with_the_stated_solver(solver: str, tmp_path) -> None:
-    values = dict.fromkeys(("flag", "limit", "child", "tree"), "")
-    values |= {"contact": "disable", "loss": "0.05", "more": f'<option solver="{solver}"/>'}
-    path = tmp_path / "bench.xml"
-    path.write_text(BENCH.format(**values), encoding="utf-8")
+    _, path = bench(tmp_path, more=f'<option solver="{solver}"/>')
     system = System.resolve(
         mjfim.Experiment.model_validate(
             {
