@@ -11,22 +11,13 @@ import sys
 
 # The benchmarks, each with the question that it answers.
 BENCHMARKS = {
-    "before_and_after": "what became better than at an earlier commit, and is it enough?",
     "start_up": "how long do the command line and the first command of the README take?",
     "benchmark": "where does the time of a design go?",
-    "benchmark_arm": "how does the time of an iteration grow with the number of parameters?",
-    "equal_time": "are designs of an arm better than at an earlier commit in equal time?",
     "benchmark_hour": "how long do reading and fitting an hour of data at 1 kHz take?",
-    "benchmark_limits": "is the design under hard limits better than CasADi + IPOPT in equal time?",
     "casadi_peer": "what do CasADi's solvers find on the hand-derived cart-pendulum?",
-    "casadi_limits": "what do CasADi's solvers find under hard limits?",
     "anytime": "is the design better than its baselines at every budget?",
-    "arms": "which experiments do the robot arms get, and do their designs keep the limits?",
     "arms_table": "is the design of two arms better than Fourier series in equal time?",
     "mjx_oracle": "do the derivatives agree with those of MJX by automatic differentiation?",
-    "scale_recordings": "how much memory and time do workers need that read many logs?",
-    "scale": "do the verbs give the same on a cluster, and how well do they scale?",
-    "rail": "how many passes over its data does a fit with dry friction take?",
     "starts": "how often do fits find the optimum from starts wrong by factors of 3 to 10?",
     "prove_identification": "do the 95 % intervals hold the true values?",
     "selection": "does `identify --select` find the term that a model lacks, and no other?",

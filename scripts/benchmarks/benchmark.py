@@ -2,7 +2,6 @@
 
     python -m scripts.benchmarks benchmark                  # all tables, some minutes
     python -m scripts.benchmarks benchmark --quick          # case a only, few trials
-    python -m scripts.benchmarks benchmark --markdown FILE  # also writes the tables as Markdown
 
 All comparisons are made within one run:
 
@@ -11,12 +10,6 @@ All comparisons are made within one run:
     hand-derived model
 (c) iterations and time to an equal J, beside the metric descent of the paper
 (d) 1500 Monte-Carlo trials at 100 Hz
-(e) seconds per iteration by number of parameters on a seven-joint arm, if its model is installed
-    (benchmark_arm)
-(f) the design under hard limits, beside CasADi + IPOPT with many starts and equal time
-    (benchmark_limits)
-(g) time to read and fit an hour of two joints at 1 kHz, beside the time of the engine
-    (benchmark_hour)
 """
 
 from __future__ import annotations
@@ -26,7 +19,6 @@ import dataclasses
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -40,11 +32,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
 from mjfim.records.design import Design
-from scripts.benchmarks import benchmark_arm, benchmark_hour, benchmark_limits
-from scripts.benchmarks.run_in_subprocess import run_in_subprocess
-
-# Top folder of the repository.
-ROOT = Path(__file__).resolve().parents[2]
+from scripts.benchmarks.child import ROOT, run_code
 
 # Experiment of the study.
 EXPERIMENT = ROOT / "models" / "cart_pendulum.toml"
@@ -202,7 +190,7 @@ def peer_runs(cases: Iterable[str], repeats: int) -> list[Run]:
     Returns:
         One run for each solver and case.
     """
-    rows = run_in_subprocess(PEERS, repeats, "".join(cases))
+    rows = run_code(PEERS, repeats, "".join(cases))
     runs = []
     for row in rows or ():
         history = tuple((t, J) for t, J in row.pop("history"))
@@ -351,89 +339,6 @@ def monte_carlo_table(design: Design, trials: int) -> Table:
     return table
 
 
-def engine_conclusion(designs: list[tuple[Run, Design]], threads: int) -> str:
-    """Summarise table (a) in a sentence; the arguments are those of `engine_table`."""
-    ratios: dict[str, list[float]] = {}
-    for run, design in designs:
-        step = step_seconds(DesignTask.resolve(experiment(run.case)), design.trajectory)
-        ratio = run.seconds * threads / (design.steps * step)
-        ratios.setdefault(run.solver, []).append(ratio)
-
-    parts = []
-    for name, values in ratios.items():
-        span = f"{min(values):.2f} to {max(values):.2f}"
-        parts.append(f"{name} {span}, {target_sentence(max(values), 1.3)}")
-
-    return (
-        f"Ratios: {'; '.join(parts)}. A ratio above 1 has three reasons: the projection runs on "
-        "one thread; Riccati recursions and L-BFGS run in Python; a coarse level has few engine "
-        "steps beside that work."
-    )
-
-
-def target_sentence(worst: float, target: float) -> str:
-    """Return whether the worst case meets a target, and by which factor it misses the target."""
-    if worst <= target:
-        return f"target {target:g} met"
-    return f"target {target:g} missed by a factor {worst / target:.2g}"
-
-
-def peer_conclusion(runs: list[Run]) -> str:
-    """Summarise table (b) in a sentence."""
-    ratios: dict[str, list[float]] = {}
-    for group in by_case(runs).values():
-        goal = best_cost(group)
-        mine = time_of_mjfim(group)
-        for run in group:
-            if run.solver != "mjfim":
-                ratios.setdefault(run.solver, []).append(mine / run.time_to(goal))
-
-    parts = []
-    for name, values in ratios.items():
-        target = 5.0 if "L-BFGS" in name else 1.0
-        span = f"{min(values):.2g} to {max(values):.2g}"
-        parts.append(f"{name} {span}, {target_sentence(max(values), target)}")
-
-    return (
-        f"mjfim's time over theirs: {'; '.join(parts)}. The limit is the engine: a general mj_step "
-        "takes microseconds where a step of the hand-derived model, compiled for this one plant, "
-        "takes a fraction of one."
-    )
-
-
-def markdown(tables: list[Table], conclusions: dict[int, str], threads: int) -> str:
-    """Write the tables as Markdown; the machine is named by its cores alone.
-
-    Args:
-        tables: The tables.
-        conclusions: Sentences below tables, by the index of the table.
-        threads: Number of cores.
-
-    Returns:
-        Text with all tables.
-    """
-    parts = [f"Measured on {threads} cores."]
-
-    for k, table in enumerate(tables):
-        headings = [str(column.header) for column in table.columns]
-        columns = [[str(cell) for cell in column.cells] for column in table.columns]
-        rows = zip(*columns, strict=True)
-
-        lines = [
-            f"**{table.title}**",
-            "",
-            f"| {' | '.join(headings)} |",
-            "|" + "---|" * len(headings),
-        ]
-        lines += [f"| {' | '.join(row)} |" for row in rows]
-        parts.append("\n".join(lines))
-
-        if k in conclusions:
-            parts.append(conclusions[k])
-
-    return "\n\n".join(parts) + "\n"
-
-
 def compare_descents(cases: list[str], flat: list[tuple[Run, Design]]) -> Table:
     """Run the metric descent of the paper and compare it with designs on one level, table (c).
 
@@ -453,68 +358,34 @@ def compare_descents(cases: list[str], flat: list[tuple[Run, Design]]) -> Table:
     return metric_table(pairs)
 
 
-def arm_table() -> Table:
-    """Measure designs of the seven-joint arm, table (e)."""
-    counts = (3, 10, 30, 70)
-    costs = [benchmark_arm.measured(benchmark_arm.ARM, p, 8) for p in counts]
-    return benchmark_arm.cost_table(costs)
-
-
 def main() -> None:
     """Run all comparisons and print their tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="case a only, 100 trials, one repeat")
-    parser.add_argument("--markdown", type=Path, help="also write the tables as Markdown")
     args = parser.parse_args()
 
     console = Console(highlight=False, width=130)
-    threads = cores()
     cases, repeats, trials = (["a"], 1, 100) if args.quick else (list(CASES), 3, 1500)
-    tables: list[Table] = []
-    conclusions: dict[int, str] = {}
-
-    def show(table: Table, conclusion: str = "") -> None:
-        """Print a table with its conclusion, and keep both."""
-        if conclusion:
-            conclusions[len(tables)] = conclusion
-            console.print(table, conclusion)
-        else:
-            console.print(table)
-        tables.append(table)
 
     # (a), after a first design that is not measured.
     mjfim_run(cases[0], "warm-up")
     default = [fastest(repeats, case, "mjfim") for case in cases]
     flat = [fastest(repeats, case, "mjfim, one level", coarse=1) for case in cases]
-    designs = [*default, *flat]
-    show(engine_table(designs, threads), engine_conclusion(designs, threads))
+    console.print(engine_table([*default, *flat], cores()))
 
     # (b)
     runs = [run for run, _ in default]
-    runs += peer_runs(cases, repeats)
-    show(peer_table(runs), peer_conclusion(runs))
+    console.print(peer_table([*runs, *peer_runs(cases, repeats)]))
 
     # (c)
-    show(compare_descents(cases, flat))
+    console.print(compare_descents(cases, flat))
 
     # (d), with the design of case b.
     design = default[-1][1] if args.quick else default[1][1]
-    show(monte_carlo_table(design, trials))
+    console.print(monte_carlo_table(design, trials))
 
-    # (e)
-    if benchmark_arm.ARM.is_file() and not args.quick:
-        show(arm_table())
 
-    # (f)
-    seconds = 10.0 if args.quick else 60.0
-    results = benchmark_limits.run_both(seconds, 0)
-    show(benchmark_limits.limits_table(results, seconds))
-
-    # (g)
-    hours = 0.01 if args.quick else 1.0
-    show(benchmark_hour.hour_table(benchmark_hour.measured(hours, 0)))
-
-    if args.markdown:
-        args.markdown.write_text(markdown(tables, conclusions, threads), encoding="utf-8")
+if __name__ == "__main__":
+    main()

@@ -36,7 +36,7 @@ from mjfim.output.archive import write_recording
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 from mjfim.signals import multisine
-from scripts.benchmarks.checkouts import ROOT, CommandRun, run_command
+from scripts.benchmarks.child import ROOT, CommandRun, run_command
 
 # Experiment of the two joints.
 EXPERIMENT = ROOT / "models" / "two_joint_arm.toml"
@@ -162,13 +162,12 @@ def write_hour(hours: float, seed: int, file: Path) -> int:
     return len(recording.ctrl)
 
 
-def fit_hour(log: Path, folder: Path, package: Path = ROOT) -> tuple[CommandRun, dict[str, Any]]:
+def fit_hour(log: Path, folder: Path) -> tuple[CommandRun, dict[str, Any]]:
     """Fit a recording of the two joints by the command line.
 
     Args:
         log: The recording.
         folder: Folder that receives the results.
-        package: Folder that contains the package.
 
     Returns:
         The command and its `estimate.json`.
@@ -176,7 +175,7 @@ def fit_hour(log: Path, folder: Path, package: Path = ROOT) -> tuple[CommandRun,
     Raises:
         RuntimeError: There is no estimate.
     """
-    run = run_command(package, ["identify", str(EXPERIMENT), str(log), "-o", str(folder)])
+    run = run_command(["identify", str(EXPERIMENT), str(log), "-o", str(folder)])
     estimate = folder / "estimate.json"
     if not estimate.is_file():
         raise RuntimeError(run.messages)
@@ -285,7 +284,7 @@ def short_table() -> Table:
             ("mjfim --version", ["--version"]),
             ("mjfim identify with all pictures", fit),
         ):
-            run = run_command(ROOT, words)
+            run = run_command(words)
             if run.code != 0:
                 raise SystemExit(run.messages)
             table.add_row(label, f"{run.wall:.2f} s", f"{run.processor:.2f} s", "")

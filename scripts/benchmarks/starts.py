@@ -46,7 +46,6 @@ from mjfim.output.sysid.sequences import export, silenced
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 from mjfim.signals import multisine
-from scripts.benchmarks.rail import RAIL, ROBOT
 
 # Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]
@@ -66,6 +65,21 @@ METHODS = ("mjfim", "scipy", "sysid")
 
 # Wanted share of right fits by mjfim.
 WANTED = 0.95
+
+# A carriage on a rail of one axis, with dry friction.
+RAIL = """<mujoco model="rail">
+  <option timestep="0.001" integrator="implicitfast"/>
+  <worldbody>
+    <body name="carriage">
+      <inertial pos="0 0 0" mass="2.4" diaginertia="0.01 0.01 0.01"/>
+      <joint name="x" type="slide" axis="1 0 0" damping="7.0" frictionloss="5.0"
+             stiffness="3.0"/>
+      <geom type="box" size="0.1 0.1 0.1" mass="0" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="x" gear="10"/></actuator>
+</mujoco>
+"""
 
 # A pendulum with a weak motor.
 PENDULUM = """<mujoco model="pendulum">
@@ -201,7 +215,7 @@ def robots() -> tuple[Robot, ...]:
         ),
         Robot(
             name="rail",
-            model=RAIL.format(**ROBOT),
+            model=RAIL,
             rate=1000.0,
             seconds=4.0,
             amplitude=(2.5,),

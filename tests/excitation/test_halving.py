@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -15,20 +15,15 @@ from mjfim.budget import Budget
 from mjfim.excitation.design import design_task
 from mjfim.excitation.halving import HALVING_RATE, HalvingRound, Settled
 from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.judging import JudgeOrder
 from mjfim.excitation.left_starts import starts_without_time
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.limited_searches import LimitedSearches
-from mjfim.excitation.merged_results import continued
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.round_times import LEAST_SHARE, RoundTimes
-from mjfim.excitation.rounds import Judgement
-from mjfim.excitation.run_result import RunResult, consume
+from mjfim.excitation.run_result import RunResult
 from mjfim.excitation.running_rounds import RunningRounds
-from mjfim.excitation.search_slices import SealedState, SearchSlice
 from mjfim.excitation.task import DesignTask
-from mjfim.records.design import Design, Status
-from scripts.benchmarks.simulated_cluster import MeasuredTasks, simulated
+from mjfim.records.design import Design
 from tests.support.executors import LosingExecutor, processes
 from tests.support.limits import cart_inside
 from tests.support.numerics import CART_PARAMETERS
@@ -97,62 +92,6 @@ def multistart_of(task: DesignTask, count: int, executor: Executor) -> Multistar
     searches = LimitedSearches(stated=level, executor=executor, budget=Budget())
     starts = [InitialControl(name=f"{i}", control=task.control) for i in range(count)]
     return Multistart(searches=searches, starts=starts, coarse=level)
-
-
-class InventedTasks(MeasuredTasks):
-    """Slices, two of each search, and judgements whose results and lengths are invented.
-
-    Args:
-        seconds: Length of the searches of a round, by the name of the start and whether the round
-            is the last one.
-    """
-
-    def __init__(self, seconds: Callable[[str, bool], float]) -> None:
-        super().__init__()
-        self._seconds = seconds
-        self.begun: list[tuple[str, bool]] = []
-
-    def done(self, fn: Any, args: tuple[Any, ...]) -> tuple[Any, float]:
-        (order,) = args
-        start = order.begun if isinstance(order, JudgeOrder) else order.search.start
-        name, cost = start.name, float(np.random.default_rng(int(start.name)).uniform())
-        result = RunResult(name=name, control=start.control, cost=cost)
-        if isinstance(order, JudgeOrder):
-            return Judgement(result=result, following=continued(result), cost=cost), 0.1
-
-        is_last = order.search.schedule.first < 0.1
-        seconds = 0.5 * self._seconds(name, is_last)
-        if order.before is None:
-            self.begun.append((name, is_last))
-            return SearchSlice(result=result, state=SealedState.of(0)), seconds
-        return SearchSlice(result=result), seconds
-
-
-def test_no_worker_waits_for_the_end_of_a_round(task: DesignTask) -> None:
-    """One of the first starts takes a third of the whole time."""
-    lengths = np.random.default_rng(0).uniform(50.0, 150.0, 96)
-    lengths[5] = 1000.0
-    tasks = InventedTasks(lambda name, is_last: lengths[int(name)] * (2.0 if is_last else 1.0))
-    with simulated(4, tasks) as cluster:
-        results = consume(multistart_of(task, 96, cluster.workers).run(), None)
-    assert len(results) == 96
-    assert cluster.busy > 0.95 * 4 * cluster.searching
-
-    # Survivors begin before the last start of the first round has ended.
-    places = [place for place, (_, is_last) in enumerate(tasks.begun) if is_last]
-    assert len(places) >= 24
-
-
-def test_invented_results_are_the_same_on_any_number_of_workers(task: DesignTask) -> None:
-    found = []
-    for workers in (1, 3, 16):
-        lengths = np.random.default_rng(workers).uniform(1.0, 100.0, (2, 40))
-        tasks = InventedTasks(lambda name, last, n=lengths: float(n[int(last), int(name)]))
-        with simulated(workers, tasks) as cluster:
-            results = consume(multistart_of(task, 40, cluster.workers).run(), None)
-        found.append([(each.name, each.cost, each.status) for each in results])
-    assert found[0] == found[1] == found[2]
-    assert sum(status is not Status.LEFT for *_, status in found[0]) >= 10
 
 
 # ---- the time of a search
