@@ -37,9 +37,8 @@ if TYPE_CHECKING:
     from mjfim.records.estimate import Estimate
     from mjfim.records.inverse_dynamics import InverseDynamicsFit
     from mjfim.records.monte_carlo import MonteCarloStudy
-    from mjfim.records.recording import Recording
-    from mjfim.records.robot_comparison import RobotComparison
-    from mjfim.records.trajectory import Trajectory
+    from mjfim.records.robots import RobotComparison
+    from mjfim.records.trajectory import Recording, Trajectory
     from mjfim.studies.campaign import run_campaign
     from mjfim.studies.check import check
     from mjfim.studies.compare import compare
@@ -122,8 +121,8 @@ MODULES = {
     "Estimate": "mjfim.records.estimate",
     "InverseDynamicsFit": "mjfim.records.inverse_dynamics",
     "MonteCarloStudy": "mjfim.records.monte_carlo",
-    "Recording": "mjfim.records.recording",
-    "RobotComparison": "mjfim.records.robot_comparison",
+    "Recording": "mjfim.records.trajectory",
+    "RobotComparison": "mjfim.records.robots",
     "Trajectory": "mjfim.records.trajectory",
     "run_campaign": "mjfim.studies.campaign",
     "check": "mjfim.studies.check",
@@ -136,37 +135,11 @@ MODULES = {
     "selected_experiment": "mjfim.studies.selected_models",
 }
 
-# Names of earlier versions, each with its new name.
-RENAMED = {
-    "Study": "MonteCarloStudy",
-    "Shortest": "ShortestExperiment",
-    "design_together": "design_jointly",
-    "evaluate_trajectory": "evaluate",
-    "sequential": "run_campaign",
-    "shortest": "shortest_experiment",
-}
-
-# Names of earlier versions that are replaced by several names.
-REPLACED = {
-    "Setup": "mjfim.experiment.System and mjfim.excitation.DesignTask",
-}
-
 
 def __getattr__(name: str) -> object:
-    """Import a name when it is used first; explain the names of earlier versions.
-
-    Raises:
-        ImportError: The name was renamed; the message states the new one. An AttributeError is not
-            used, because `from mjfim import name` would replace it and its message.
-        AttributeError: The name does not exist and did not exist before.
-    """
+    """Import a name when it is used first."""
     if name in MODULES:
         return getattr(import_module(MODULES[name]), name)
-
-    if name in RENAMED:
-        raise ImportError(f"mjfim.{name} is called mjfim.{RENAMED[name]} now")
-    if name in REPLACED:
-        raise ImportError(f"mjfim.{name} does not exist any more: use {REPLACED[name]}")
 
     raise AttributeError(f"module 'mjfim' has no attribute {name!r}")
 

@@ -2,10 +2,38 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+
+class Stored:
+    """How pydantic reads an array: by the name under which an archive holds it."""
+
+    @staticmethod
+    def __get_pydantic_core_schema__(source: Any, handler: Any) -> Any:
+        """Schema that looks the name up in the arrays of the context."""
+        from pydantic_core import core_schema  # slow, and needed only where a file is read
+
+        return core_schema.with_info_plain_validator_function(_stored_array)
+
+
+def _stored_array(name: Any, info: Any) -> np.ndarray:
+    """The array of numbers that an archive holds under a name; ValueError where there is none."""
+    array = info.context.get(name) if isinstance(name, str) else None
+    if array is None:
+        raise ValueError(f"the array {name!r} is missing")
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"the array {name!r} does not hold numbers")
+    found: np.ndarray = array
+    return found
+
+
+Array = Annotated[NDArray[np.float64], Stored]
+
+# Half width of the 95 % interval of a normal distribution [standard deviations].
+NORMAL_95 = 1.959963984540054
 
 # Lower bound of the diagonal entries by which a matrix is scaled; it avoids a division by zero.
 SMALLEST_DIAGONAL = 1e-300

@@ -2,25 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
-
-# Renamed arguments of public functions, each with its new name and a description of its value.
-RENAMED_ARGUMENTS = {
-    "monitor": ("callback", "which is called with one event"),
-    "tell": ("callback", "which is called with one event"),
-    "progress": ("callback", "which is called with one event"),
-    "report": ("callback", "which is called with one event"),
-    "start": ("initial_control", "an (N, nu) array"),
-}
-
 
 # Longest text of the user that a message repeats as it is, and how much it shows of a longer one
 # [characters].
@@ -160,52 +144,3 @@ def first_ones(phrases: Sequence[str], separator: str = ", ", longest: int = LIS
     count = max(1, sum(length <= longest for length in lengths))
     further = len(phrases) - count
     return separator.join(phrases[:count]) + (f" and {further} more" if further else "")
-
-
-def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Decorate a public function so that an old name of an argument is explained.
-
-    Args:
-        function: The function.
-
-    Returns:
-        The function; it raises a TypeError that names the new argument for an old one.
-    """
-    known = inspect.signature(function).parameters
-
-    @functools.wraps(function)
-    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        """Raise TypeError for an old name of an argument; otherwise call the function."""
-        for old, (new, meaning) in RENAMED_ARGUMENTS.items():
-            # `progress` has a new meaning: it was a function before.
-            is_old = old in kwargs and (old not in known or callable(kwargs[old]))
-            if is_old and new in known:
-                raise TypeError(
-                    f"{function.__name__}() has no argument {old!r} any more: use {new!r}, "
-                    f"{meaning}"
-                )
-        return function(*args, **kwargs)
-
-    return checked
-
-
-class RenamedFields:
-    """Base class of records with renamed fields; the error for an old name states the new one.
-
-    Attributes:
-        renamed_fields: Names of fields in earlier versions, each with its new name.
-    """
-
-    renamed_fields: ClassVar[Mapping[str, str]] = {}
-
-    # Type checkers do not see this method, because they would accept every attribute name.
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """Raise AttributeError; Python calls this only for an attribute that does not exist."""
-            record = type(self).__name__
-            if name in type(self).renamed_fields:
-                new = type(self).renamed_fields[name]
-                raise AttributeError(f"{record}.{name} is called {record}.{new} now")
-
-            raise AttributeError(f"{record!r} object has no attribute {name!r}")

@@ -20,8 +20,8 @@ from queue import Empty, SimpleQueue
 from types import FrameType, TracebackType
 from typing import Any, Protocol
 
-from mjfim.atomic_io import remove_temporary_files
 from mjfim.errors import InterruptedByUserError, UnfinishedError
+from mjfim.files import remove_temporary_files
 
 # Time after the first press at which files are left out that are not necessary [s]. Computations
 # usually end within about 5 s. What is drawn then may take much longer on a busy computer, and can

@@ -22,6 +22,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.labels import labels_of_system
+from mjfim.files import write_json
 from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design
@@ -29,7 +30,6 @@ from mjfim.output.folders import write_tables
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.serialization import write_json
 from mjfim.records.trajectory import Trajectory
 
 # Experiment of the study.

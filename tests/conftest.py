@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mjfim.atomic_io import replacing
+from mjfim.files import replacing
 
 # The tests run side by side on all cores, so one thread of BLAS per process is enough.
 # BLAS reads the variable when NumPy is imported, which is later than this line.

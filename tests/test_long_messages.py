@@ -22,8 +22,14 @@ from mjfim.output.campaign_folder import accuracy_sentence
 from mjfim.output.mjcf import write
 from mjfim.output.summaries.robustness import MAX_MISSED_LIMITS, _limit_sentences
 from mjfim.records.campaign import missed_targets
-from mjfim.records.check import ConfoundedPair, Roughness, SelfTest
-from mjfim.records.combinations import Combination, ParameterGroup, groups_in_words
+from mjfim.records.check import (
+    Combination,
+    ConfoundedPair,
+    ParameterGroup,
+    Roughness,
+    SelfTest,
+    groups_in_words,
+)
 from mjfim.studies.check import _Verdict
 
 # Longest message [characters].

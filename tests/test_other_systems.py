@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from mjfim import atomic_io
+from mjfim import files
 from mjfim.parallel import threads
 from tests.support.paths import ROOT
 
@@ -36,13 +36,11 @@ def test_left_over_files_are_removed_on_windows_without_a_signal(
 
     monkeypatch.setattr(os, "kill", no_signal)
     monkeypatch.setattr(psutil, "pid_exists", lambda process: process == 17)
-    ended, running = (
-        tmp_path / f"{atomic_io.PREFIX}{process}-x.csv" for process in (4_000_000, 17)
-    )
+    ended, running = (tmp_path / f"{files.PREFIX}{process}-x.csv" for process in (4_000_000, 17))
     ended.touch()
     running.touch()
 
-    with atomic_io.replacing(tmp_path / "file.csv") as temporary:
+    with files.replacing(tmp_path / "file.csv") as temporary:
         temporary.write_text("t\n", encoding="utf-8")
     assert not ended.exists()
     assert running.exists()

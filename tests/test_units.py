@@ -18,7 +18,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate
 from mjfim.identification.identify import identify
 from mjfim.records.estimate import Estimate
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.studies.check import check
 from tests.support.rescaling import Rescaled, Units, rescale
 

@@ -12,8 +12,7 @@ from mjfim.excitation.duration import iteration_seconds
 from mjfim.experiment.system import System
 from mjfim.identification.duration import pass_seconds
 from mjfim.parallel import cores
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies.check import MAX_TESTED_SAMPLES
 from mjfim.studies.duration import check_seconds, trials_seconds
 

@@ -27,7 +27,7 @@ from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback, Event, StudyEvent
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.studies.redesign import restate_experiment
 
 

@@ -29,7 +29,6 @@ from typer.core import TyperCommand
 
 import mjfim
 from mjfim.amounts import MAX_THREADS
-from mjfim.atomic_io import observed_by, remove_temporary_files
 from mjfim.cli.inputs import require_inputs
 from mjfim.errors import (
     InterruptedByUserError,
@@ -40,6 +39,7 @@ from mjfim.errors import (
     UndrawnWarning,
     UnfinishedError,
 )
+from mjfim.files import observed_by, remove_temporary_files
 from mjfim.interruption import (
     INTERRUPTED_CODE,
     NOTHING_SENTENCE,
@@ -54,8 +54,14 @@ from mjfim.output.report import OWN_REPORTS, REPORT, is_report
 from mjfim.output.summary_parts import Summary
 from mjfim.output.text import render
 from mjfim.output.video.record import NoVideoError, format_of, require_encoder
-from mjfim.records.events import Callback, DesignEvent, Event, FitEvent, StudyEvent
-from mjfim.records.progress import stages_observed_by
+from mjfim.records.events import (
+    Callback,
+    DesignEvent,
+    Event,
+    FitEvent,
+    StudyEvent,
+    stages_observed_by,
+)
 
 if TYPE_CHECKING:
     from mjfim.experiment.system import System
@@ -959,7 +965,7 @@ def print_result(
         verbose: True for all tables and sentences, False for a screen of text at most.
     """
     if as_json:
-        from mjfim.records.serialization import as_json as json_of
+        from mjfim.files import as_json as json_of
 
         typer.echo(json_of(values), nl=False)
     else:

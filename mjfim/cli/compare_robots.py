@@ -104,7 +104,7 @@ def _relative(path: Path, folder: Path) -> str:
 def _differences_of_files(first: Path, second: Path) -> Iterator[str]:
     """Yield sentences on experiments and models that differ between two estimates."""
     from mjfim.errors import RecordingError
-    from mjfim.records.serialization import read_json
+    from mjfim.files import read_json
 
     try:
         stated = [read_json(_folder_of(path) / "estimate.json") for path in (first, second)]

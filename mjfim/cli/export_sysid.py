@@ -41,7 +41,7 @@ def export_sysid(
     from mjfim.output.sysid import comparison as sysid_comparison
     from mjfim.output.sysid.sequences import require_extra
     from mjfim.recordings.read import read_recording, recording_paths
-    from mjfim.records.progress import begin_stage
+    from mjfim.records.events import begin_stage
 
     require_extra()
     system = System.resolve(mjfim.Experiment.from_file(experiment))

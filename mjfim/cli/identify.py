@@ -43,8 +43,7 @@ from mjfim.output.picture_format import PictureFormat
 
 if TYPE_CHECKING:
     from mjfim.experiment.system import System
-    from mjfim.records.estimate import Estimate
-    from mjfim.records.parameter_draws import ParameterDraws
+    from mjfim.records.estimate import Estimate, ParameterDraws
 
 
 @verb

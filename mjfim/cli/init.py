@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mjfim.atomic_io import replacing
 from mjfim.cli.common import Force, ModelFile, claim_file, errors, out, progress, verb
 from mjfim.errors import ExperimentError
+from mjfim.files import replacing
 from mjfim.studies.first_experiment.groups import GROUPS, Group
 
 if TYPE_CHECKING:

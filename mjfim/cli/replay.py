@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.atomic_io import replacing
 from mjfim.cli.common import Force, claim_file, errors, verb
 from mjfim.errors import RecordingError
+from mjfim.files import replacing
 
 
 @verb

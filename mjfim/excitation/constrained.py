@@ -33,9 +33,8 @@ from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import RELAXED, ModelVariant
 from mjfim.parallel import offer_result, one_blas_thread
 from mjfim.parallel.kept import KeptPerThread
-from mjfim.records.design import HistoryRow, Status, extended
+from mjfim.records.design import HistoryRow, IterateMotion, Status, extended
 from mjfim.records.events import DesignEvent
-from mjfim.records.iterates import IterateMotion
 from mjfim.signals import independent_curves
 
 # Power of the smooth E-criterion. The criterion is always smoothed here, because under hard limits

@@ -8,7 +8,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, explain_renamed_arguments
+from mjfim.errors import ExperimentError
 from mjfim.excitation.control_search import ControlSearch, choose
 from mjfim.excitation.controls_within_limits import keeps_limits, limited_cost_of
 from mjfim.excitation.design_report import DesignReport
@@ -29,11 +29,9 @@ from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
-from mjfim.records.events import DesignCallback
-from mjfim.records.progress import shown_progress
+from mjfim.records.events import DesignCallback, shown_progress
 
 
-@explain_renamed_arguments
 def design(
     experiment: Experiment,
     *,

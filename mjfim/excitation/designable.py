@@ -10,7 +10,7 @@ from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.combinations import GROUPS_TEXT, ParameterGroup, groups_in_words
+from mjfim.records.check import GROUPS_TEXT, ParameterGroup, groups_in_words
 
 
 def identifiability_along(task: DesignTask, begin: DesignPoint) -> Identifiability:

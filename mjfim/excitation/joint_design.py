@@ -12,7 +12,6 @@ from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import (
     ExperimentError,
     SimulationDivergedError,
-    explain_renamed_arguments,
     first_ones,
     listed,
 )
@@ -24,11 +23,9 @@ from mjfim.information.marginal import shared
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
-from mjfim.records.events import DesignCallback
-from mjfim.records.progress import shown_progress
+from mjfim.records.events import DesignCallback, shown_progress
 
 
-@explain_renamed_arguments
 def design_jointly(
     experiments: Sequence[Experiment],
     *,

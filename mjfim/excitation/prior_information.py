@@ -10,8 +10,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, listed
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
+from mjfim.files import read_json
 from mjfim.information.marginal import marginal
-from mjfim.records.saved_information import SavedInformation
 
 
 def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
@@ -33,23 +33,42 @@ def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
     total = np.zeros((len(names), len(names)))
     for path in paths:
         try:
-            saved = SavedInformation.load(path)
+            known, data, prior = _information_in(path)
         except RecordingError as error:
             raise ExperimentError(f"earlier: {error}") from None
 
         # Deviations of the initial state have equal names in all experiments, but different values.
         common = [
-            name
-            for name in names
-            if name in saved.parameters and not name.startswith(INITIAL_STATE_PREFIX)
+            name for name in names if name in known and not name.startswith(INITIAL_STATE_PREFIX)
         ]
         if not common:
             raise ExperimentError(
-                f"earlier: {path}: it has information about {listed(saved.parameters)}, but not "
+                f"earlier: {path}: it has information about {listed(known)}, but not "
                 f"about any of the parameters {listed(names)}"
             )
 
         here = [list(names).index(name) for name in common]
-        there = np.array([saved.parameters.index(name) for name in common])
-        total[np.ix_(here, here)] += marginal(saved.data, saved.prior, there)
+        there = np.array([known.index(name) for name in common])
+        total[np.ix_(here, here)] += marginal(data, prior, there)
     return total
+
+
+def _information_in(path: Path) -> tuple[list[str], Array, Array]:
+    """Names of the p parameters of a design or an estimate, information and prior: (p, p).
+
+    Raises:
+        RecordingError: The file has another content, or numbers that are not finite.
+    """
+    values = read_json(path)
+    try:
+        names = [str(name) for name in values["parameters"]]
+        data, prior = (np.array(values[key], dtype=np.float64) for key in ("data", "prior"))
+    except (ValueError, KeyError, TypeError):
+        raise RecordingError(f"{path}: neither a design.json nor an estimate.json") from None
+
+    for matrix in (data, prior):
+        if matrix.shape != (len(names), len(names)) or not np.isfinite(matrix).all():
+            raise RecordingError(
+                f"{path}: its information is not {len(names)} x {len(names)} finite numbers"
+            )
+    return names, data, prior

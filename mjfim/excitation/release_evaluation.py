@@ -16,7 +16,7 @@ from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.optimize.lq import largest_amplification
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.plant.plant import Plant
-from mjfim.records.iterates import IterateMotion
+from mjfim.records.design import IterateMotion
 from mjfim.records.trajectory import Trajectory
 
 # Name of the growth of a small disturbance among the margins.

@@ -9,13 +9,13 @@ that is shorter by the tolerance does not.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, MjfimError, NoResultError, explain_renamed_arguments
+from mjfim.errors import ExperimentError, MjfimError, NoResultError
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.levels import AUTO_COARSE_FACTOR, MIN_COARSE_SAMPLES
 from mjfim.excitation.target_accuracy import (
@@ -31,11 +31,10 @@ from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.recordings import formats
+from mjfim.records.base import SavedRecord
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
-from mjfim.records.events import Callback, StudyEvent
-from mjfim.records.progress import shown_progress
-from mjfim.records.serialization import SavedRecord
+from mjfim.records.events import Callback, StudyEvent, shown_progress
 
 # Ratio of the longest horizon that is tried by default to the stated one.
 MAX_HORIZON_FACTOR = 4.0
@@ -100,8 +99,8 @@ class ShortestExperiment(SavedRecord):
     tolerance: float
     closed: bool
 
-    file_stem: ClassVar[str] = "shortest"
-    made_by: ClassVar[str] = "`mjfim design EXPERIMENT -o DIR --shortest`"
+    file_stem = "shortest"
+    made_by = "`mjfim design EXPERIMENT -o DIR --shortest`"
 
     @property
     def horizon(self) -> float:
@@ -154,7 +153,6 @@ class ShortestExperiment(SavedRecord):
         return f"shortest horizon: {self.horizon:g} s ({below}){ending}"
 
 
-@explain_renamed_arguments
 def shortest_experiment(
     experiment: Experiment,
     *,

@@ -31,9 +31,8 @@ from mjfim.optimize.projection_operator import (
     optimize,
 )
 from mjfim.parallel import offer_result
-from mjfim.records.design import HistoryRow, Status, extended
+from mjfim.records.design import HistoryRow, IterateMotion, Status, extended
 from mjfim.records.events import DesignEvent
-from mjfim.records.iterates import IterateMotion
 
 # Growth of a small deviation along the trajectory above which the projection uses feedback. It is
 # measured in the best units of the state, see `amplification_in_best_units`.

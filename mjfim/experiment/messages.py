@@ -78,12 +78,6 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
     if fault["type"] == "extra_forbidden":
         keys, _ = _walk(table, fault["loc"])
         _, parent = _walk(table, fault["loc"][:-1])
-
-        # For a key of an earlier version, the message states its present name.
-        present = getattr(parent, "renamed_keys", {}).get(keys[-1])
-        if present is not None:
-            return f"this key is called {present!r} now"
-
         return unknown("key", keys[-1], valid_keys(parent, hidden))
 
     if fault["type"] == "missing":

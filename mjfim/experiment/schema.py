@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, InstanceOf, ValidationError
 from pydantic.json_schema import SkipJsonSchema
+from pydantic_core import PydanticSerializationError
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
@@ -226,6 +227,18 @@ class Experiment(Section):
         """
         place = {"directory": self.directory, "source": self.source, "files": self.files}
         return Experiment(**{**place, **values})
+
+    def stated(self) -> dict[str, Any]:
+        """All keys that are stated, with the folder and the name, as JSON holds them.
+
+        Raises:
+            TypeError: A parameter is a Python function, which no file can hold.
+        """
+        try:
+            values = self.model_dump(mode="json", exclude_unset=True)
+        except PydanticSerializationError:
+            raise TypeError("a parameter that is a Python function cannot be saved") from None
+        return {**values, "directory": str(self.directory), "source": self.source}
 
     def packed(self) -> Experiment:
         """Make a copy that contains all its files, for a process that has none of them.

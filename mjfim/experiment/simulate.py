@@ -8,8 +8,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 
 
 def simulate(

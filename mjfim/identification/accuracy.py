@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.experiment.system import System
 from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.fit_problem import FitProblem
@@ -19,10 +19,8 @@ from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution
-from mjfim.records.combinations import ParameterGroup
-from mjfim.records.estimate import Uncertainty
-from mjfim.records.intervals import NORMAL_95
-from mjfim.records.prior_directions import PriorDirections
+from mjfim.records.check import ParameterGroup
+from mjfim.records.estimate import PriorDirections, Uncertainty
 
 # Half width of an interval over the size of the value (an entry of a vector or tensor has the size
 # of the whole), above which a parameter is poorly known.

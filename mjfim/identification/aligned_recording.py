@@ -20,8 +20,7 @@ from mjfim.identification.law_inputs import inputs_of_laws
 from mjfim.model.variants import STATED
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.recordings.log_file import LogFile, file_of
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 
 # Largest distance from the grid [sample periods] at which a time stamp counts as lying on it.
 GRID_TOLERANCE = 0.01

@@ -24,7 +24,7 @@ from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
 from mjfim.model.terms.drives import SHORT_LAG
 from mjfim.model.terms.library import KINDS
 from mjfim.model.terms.term import Term, TermTable
-from mjfim.records.missing_term import AddedTerm, TermParameter
+from mjfim.records.terms import AddedTerm, TermParameter
 
 # Size at which the sensitivity of a term is taken where it is zero in the model, relative to the
 # inertia of its joint and the natural time of the motion.

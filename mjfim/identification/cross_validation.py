@@ -35,8 +35,8 @@ from mjfim.identification.left_out_parts import (
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Prediction, PredictionErrors
-from mjfim.records.progress import begin_stage
-from mjfim.records.recording import Recording
+from mjfim.records.events import begin_stage
+from mjfim.records.trajectory import Recording
 
 T = TypeVar("T")
 

@@ -9,7 +9,7 @@ from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.sensitivity_rows import sensitivity_rows
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 
 def pass_seconds(system: System, recordings: Sequence[Recording]) -> float | None:

@@ -16,7 +16,7 @@ from mjfim.identification.known_activations import KnownActivations
 from mjfim.identification.segments import Segment
 from mjfim.model.coordinates import state_names, tangent_names
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 
 def extended_system(

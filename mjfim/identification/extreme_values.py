@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # A value is extreme if it exceeds the typical magnitude of its column by this factor.
 EXTREME_RATIO = 1e6

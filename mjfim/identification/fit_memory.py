@@ -8,7 +8,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.segments import free_release
 from mjfim.memory import NUMBER_BYTES, require_memory
 from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Peak of a block of simulations over the numbers of its states, as measured: in a fit, which tests
 # its residuals, and in a check.

@@ -37,8 +37,7 @@ from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.plant.noise import Noise
 from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 
 T = TypeVar("T")
 

@@ -26,8 +26,8 @@ from mjfim.identification.task import FitTask
 from mjfim.optimize.levenberg_marquardt import completed
 from mjfim.plant.divergence import NO_WARNING, explain_divergence, find_divergence
 from mjfim.plant.plant import UNSTABLE_LOOP
+from mjfim.records.events import begin_stage
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
-from mjfim.records.progress import begin_stage
 
 # Starts instead of that at which the model diverges, in words.
 AT_EQUATION = "at a fit to the equation of motion"

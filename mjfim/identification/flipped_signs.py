@@ -19,8 +19,8 @@ from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.plant.noise import Noise
-from mjfim.records.combinations import join_names
-from mjfim.records.recording import Recording
+from mjfim.records.check import join_names
+from mjfim.records.trajectory import Recording
 
 # Sum of squared residuals per degree of freedom above which signs are looked at.
 POOR_FIT = 4.0

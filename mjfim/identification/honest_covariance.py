@@ -23,13 +23,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.identification.jackknife import jackknife_deviations, student_quantile
 from mjfim.identification.robust_covariance import LEVEL, covering_covariance
 from mjfim.model.parameters import ParameterSet
-from mjfim.records.estimate import Estimate, Uncertainty
-from mjfim.records.horizons import HorizonStudy
-from mjfim.records.intervals import NORMAL_95
+from mjfim.records.estimate import Estimate, HorizonStudy, Uncertainty
 
 # Distance of the end of an interval from a bound, relative to the width of the interval, at which
 # the bound has cut the interval off.

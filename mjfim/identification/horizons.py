@@ -33,8 +33,8 @@ from mjfim.identification.segment_fits import problem_of_segments, segment_lengt
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution
-from mjfim.records.horizons import HorizonStudy
-from mjfim.records.progress import begin_stage
+from mjfim.records.estimate import HorizonStudy
+from mjfim.records.events import begin_stage
 
 # Number of samples of a fit, and of the predictions over one horizon; of more data, segments that
 # are spread over them are used.

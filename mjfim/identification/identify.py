@@ -16,7 +16,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import SimulationDivergedError, explain_renamed_arguments
+from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.cad_prior import CadPrior
@@ -53,9 +53,8 @@ from mjfim.optimize.levenberg_marquardt import (
 )
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.records.estimate import Estimate
-from mjfim.records.events import FitEvent
-from mjfim.records.progress import begin_stage, shown_progress
-from mjfim.records.recording import Recording
+from mjfim.records.events import FitEvent, begin_stage, shown_progress
+from mjfim.records.trajectory import Recording
 
 # Shares of the segments, or of each one of few, on which combinations without effect are searched
 # for in turn with one-sided differences. Only where all data leave a doubt, differences of two
@@ -73,7 +72,6 @@ STOPPED = "the search was stopped before the fit over this length was complete"
 Callback = Callable[[FitEvent], None]
 
 
-@explain_renamed_arguments
 def identify(
     experiment: Experiment,
     recordings: Sequence[Recording],

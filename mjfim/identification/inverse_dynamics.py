@@ -28,7 +28,7 @@ from mjfim.identification.motion_equations import MotionEquations
 from mjfim.identification.residual_tests import whiteness_of
 from mjfim.parallel import one_blas_thread
 from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Largest number of averages of an equation that a record holds.
 SHOWN_ROWS = 1500

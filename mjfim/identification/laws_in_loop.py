@@ -10,7 +10,7 @@ from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import FIELDS, ControlLaw, law_unit
 from mjfim.model.units import FORCE_UNITS, control_unit
-from mjfim.records.control_law import ControlLawInLoop
+from mjfim.records.estimate import ControlLawInLoop
 
 # Numbers with which a law is more than a position servo, unless they have no effect.
 BEYOND_SERVOS = (

@@ -39,8 +39,8 @@ from mjfim.identification.score_rows import ScoreRows
 from mjfim.identification.screened_terms import screened_terms
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.records.missing_term import MissingTerm, TermParameter, TermTestData
-from mjfim.records.recording import Recording
+from mjfim.records.terms import MissingTerm, TermParameter, TermTestData
+from mjfim.records.trajectory import Recording
 
 # Probability, over all candidates, that one is reported although the model is complete.
 SIGNIFICANCE = 1e-3

@@ -22,7 +22,7 @@ from mjfim.identification.random_effects import (
     total_of,
 )
 from mjfim.identification.recording_views import TOLERANCE, RecordingViews
-from mjfim.records.recording_comparison import OddParameter, OddRecording
+from mjfim.records.robots import OddParameter, OddRecording
 
 # Probability to name an odd recording where all are equal.
 ODD_LEVEL = 0.01

@@ -30,9 +30,8 @@ from mjfim.identification.truncated_normal import MatrixBound, draw_truncated_no
 from mjfim.model.inertia_distance import BARYCENTRIC_DERIVATIVES, pseudo_inertia_of
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.targets import ModelField
-from mjfim.records.estimate import Estimate
-from mjfim.records.parameter_draws import ParameterDraws
-from mjfim.records.progress import begin_stage
+from mjfim.records.estimate import Estimate, ParameterDraws
+from mjfim.records.events import begin_stage
 
 # Number of times that draws with an unphysical inertia are replaced before the search for physical
 # ones is given up.

@@ -26,7 +26,7 @@ from mjfim.model.elements import element_name
 from mjfim.model.sizes import model_length
 from mjfim.model.terms.base import AXES
 from mjfim.model.terms.library import KINDS
-from mjfim.records.missing_term import TermParameter
+from mjfim.records.terms import TermParameter
 
 # Kind of the term in the library.
 KIND = "payload"

@@ -11,7 +11,7 @@ from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.identification.cad_prior import CadPrior
 from mjfim.information.marginal import marginal
 from mjfim.model.parameters import ParameterSet
-from mjfim.records.prior_directions import PriorDirections
+from mjfim.records.estimate import PriorDirections
 
 # A combination is determined by the recordings where these leave at most this share of the standard
 # deviation of the prior.

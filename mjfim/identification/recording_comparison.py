@@ -34,7 +34,7 @@ from mjfim.information.marginal import standard_deviations
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Uncertainty
-from mjfim.records.recording_comparison import RecordingComparison
+from mjfim.records.robots import RecordingComparison
 
 
 def compare_recordings(

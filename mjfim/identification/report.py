@@ -44,14 +44,14 @@ from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
     Estimate,
+    HorizonStudy,
     Prediction,
     Restart,
 )
-from mjfim.records.horizons import HorizonStudy
+from mjfim.records.events import begin_stage
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
-from mjfim.records.progress import begin_stage
-from mjfim.records.recording import Recording
-from mjfim.records.recording_comparison import RecordingComparison
+from mjfim.records.robots import RecordingComparison
+from mjfim.records.trajectory import Recording
 
 # Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
 IMPLAUSIBLE_PRIOR_DISTANCE = 4.0

@@ -8,7 +8,7 @@ from itertools import chain, combinations
 import numpy as np
 
 from mjfim.errors import RecordingError
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Largest difference of two clocks that count as the same [mean sample periods]. Copies of a log in
 # other formats have rounded times.

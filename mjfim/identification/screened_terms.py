@@ -28,8 +28,8 @@ from mjfim.model.coordinates import ScalarJoint
 from mjfim.model.elements import element_name
 from mjfim.model.terms.library import KINDS
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.records.missing_term import AddedTerm, MissingTerm, TermParameter
-from mjfim.records.recording import Recording
+from mjfim.records.terms import AddedTerm, MissingTerm, TermParameter
+from mjfim.records.trajectory import Recording
 
 # Name of the parameter in an extended model, which no experiment has.
 NAME = "?"

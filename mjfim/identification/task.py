@@ -16,7 +16,7 @@ from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.fit_memory import require_memory_for_recordings
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.same_data import refuse_same_data
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Method of the search. `least_squares` is Levenberg-Marquardt inside the bounds; `newton` is the
 # paper's Newton-Raphson iteration without bounds.

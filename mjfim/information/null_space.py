@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.records.combinations import Combination, ParameterGroup
+from mjfim.records.check import Combination, ParameterGroup
 
 # Ratio of the second difference step to the first one; the change of G between them is its error.
 COARSER_STEP_FACTOR = 4.0

@@ -1,6 +1,6 @@
 """Files of designs, recordings and controls, for robot controllers and other programs.
 
-`mjfim.records.serialization` saves and loads the records; this module adds the tables that need the
+`mjfim.records.base` saves and loads the records; this module adds the tables that need the
 experiment: design.csv, reference.csv, recordings and controls as CSV.
 """
 
@@ -13,15 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
+from mjfim.files import read_arrays, replacing, write_json
 from mjfim.output.playback import design_columns, reference_columns, simulate_playback
+from mjfim.records.base import ShownRecord
 from mjfim.records.design import TRAJECTORY_ARRAYS, Design
-from mjfim.records.recording import Recording
-from mjfim.records.serialization import read_arrays, write_json
-from mjfim.records.shown import ShownRecord
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 
 # Fewest rows of a trajectory that a design can have.
 MIN_ROWS = 3

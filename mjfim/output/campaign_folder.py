@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, RecordingError, first_ones, listed
 from mjfim.experiment.system import System
+from mjfim.files import read_json, replacing, write_json
 from mjfim.output import plots
 from mjfim.output.archive import check_fits, origin_of, write_design
 from mjfim.output.campaign_parameters import CampaignParameters
@@ -38,7 +38,6 @@ from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound, Round
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.serialization import read_json, write_json
 
 if TYPE_CHECKING:
     from mjfim.output.plots.pictures import Pictures

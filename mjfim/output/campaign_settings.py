@@ -11,8 +11,8 @@ from typing import Any
 from mjfim.errors import RecordingError
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.schema import Experiment
+from mjfim.files import as_json, read_json, write_json
 from mjfim.output.manifest import Fingerprint
-from mjfim.records.serialization import as_json, read_json, write_json
 
 # File with the settings, in the folder of the campaign.
 SETTINGS_FILE = "settings.json"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mjfim.output.picture_format import PictureFormat
-    from mjfim.records.shown import ShownRecord
+    from mjfim.records.base import ShownRecord
 
 # Messages for developers, which a user does not see.
 _log = logging.getLogger(__name__)

@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mjfim.atomic_io import remove_earlier_result, replacing
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
+from mjfim.files import read_json, remove_earlier_result, replacing, write_json
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.interruption import current_interruption
 from mjfim.output import archive, latex, markdown, plots, video
@@ -29,16 +29,15 @@ from mjfim.output.report import REPORT
 from mjfim.output.report.build import records_in, write_report
 from mjfim.output.robot_samples import clear_samples, write_samples
 from mjfim.output.urdf.write import urdf_files, write_identified_urdfs
+from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.events import begin_stage
 from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.progress import begin_stage
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import Robustness
-from mjfim.records.serialization import read_json, write_json
-from mjfim.records.shown import ShownRecord
 
 if TYPE_CHECKING:
     from mjfim.output.plots.pictures import DrawPicture, Pictures

@@ -17,10 +17,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from mjfim import atomic_io
 from mjfim.errors import OutputError, RecordingError
+from mjfim.files import guarded_by, read_json, replacing
 from mjfim.output.file_lock import FileLock
-from mjfim.records.serialization import read_json
 
 # Name of the manifest, and of the locks of a manifest and of a folder.
 MANIFEST = ".mjfim.json"
@@ -142,7 +141,7 @@ class Manifest:
         }
 
         # Readable JSON would take most of the time in a folder with many files.
-        with atomic_io.replacing(self.folder / MANIFEST) as temporary:
+        with replacing(self.folder / MANIFEST) as temporary:
             temporary.write_text(json.dumps({"format": FORMAT, "files": table}), encoding="utf-8")
 
 
@@ -238,7 +237,7 @@ def claimed(folder: Path, guard: OutputGuard, *, exclusive: bool) -> Iterator[No
         OutputError: The folder cannot be created, or another process writes into it.
     """
     if not exclusive:
-        with atomic_io.guarded_by(guard):
+        with guarded_by(guard):
             yield
         return
 
@@ -257,7 +256,7 @@ def claimed(folder: Path, guard: OutputGuard, *, exclusive: bool) -> Iterator[No
         )
 
     try:
-        with atomic_io.guarded_by(guard):
+        with guarded_by(guard):
             yield
     finally:
         lock.release()

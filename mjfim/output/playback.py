@@ -18,8 +18,7 @@ from mjfim.experiment.system import System
 from mjfim.model.coordinates import dof_names, gain_names, state_components, state_names
 from mjfim.plant.active_constraints import forward_samples
 from mjfim.plant.batch import BatchSimulator
-from mjfim.records.playback import Playback
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Playback, Trajectory
 
 # When a controller should use the gains. It is the name of the last column of design.csv, so it has
 # neither commas nor quotation marks; the column holds zeros.

@@ -1,6 +1,6 @@
 """How a notebook shows the results of verbs: as tables and sentences in HTML.
 
-The records call `as_html`, see `mjfim.records.shown`.
+The records call `as_html`, see `mjfim.records.base`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from mjfim.output.summaries.robot_comparison import describe_robots
 from mjfim.output.summaries.robustness import describe_robustness
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
 from mjfim.output.summary_parts import Emphasis, Paragraph, Summary, capitalised
+from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
@@ -30,9 +31,8 @@ from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import Robustness
-from mjfim.records.shown import ShownRecord
 
 # How strongly a verdict stands out.
 EMPHASIS = {

@@ -9,17 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import remove_earlier_result
 from mjfim.errors import ModelError
 from mjfim.experiment.system import System
+from mjfim.files import remove_earlier_result
 from mjfim.identification.parameter_draws import complete_theta
 from mjfim.output.archive import write_table
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.mjcf.edited_files import copies_of_included_files
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.urdf.write import urdf_files, write_identified_urdfs
-from mjfim.records.estimate import Estimate
-from mjfim.records.parameter_draws import ParameterDraws
+from mjfim.records.estimate import Estimate, ParameterDraws
 
 # Table of the drawn robots, and folder of their models.
 SAMPLES_TABLE = "samples.csv"

@@ -12,7 +12,7 @@ from mjfim.errors import RecordingError
 from mjfim.model.coordinates import gain_names, state_names
 from mjfim.recordings import formats
 from mjfim.recordings.channels import Channels
-from mjfim.records.playback import Playback
+from mjfim.records.trajectory import Playback
 
 # Smallest number of rows of a playback.
 MIN_ROWS = 3

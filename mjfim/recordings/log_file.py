@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 from mjfim.errors import RecordingError
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.spec import RecordingSpec
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Number of files whose hashes a process remembers.
 KNOWN_HASHES = 10_000

@@ -13,7 +13,7 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.model.coordinates import scalar_joints
 from mjfim.recordings.channels import Channels
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Only the first rows of a long recording are inspected.
 MAX_ROWS = 200_000

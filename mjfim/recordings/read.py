@@ -37,7 +37,7 @@ from mjfim.recordings.validity import (
     check_measured,
     hold_last_value,
 )
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Endings of the names in a LeRobot dataset: of measured states, with the coordinates that they are,
 # and of controls.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -63,15 +63,9 @@ INPUT_PREFIXES = ("ctrl:", *LAW_PREFIXES)
 
 
 class Section(BaseModel):
-    """A table of the experiment file; it is immutable and refuses unknown keys.
-
-    Attributes:
-        renamed_keys: Keys of earlier versions, each with the name that it has now.
-    """
+    """A table of the experiment file; it is immutable and refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-    renamed_keys: ClassVar[dict[str, str]] = {}
 
 
 class ColumnSpec(Section):
@@ -79,8 +73,6 @@ class ColumnSpec(Section):
 
     The value is `(scale * unit * raw + offset)` times the product of the columns in `multiply_by`.
     """
-
-    renamed_keys = {"times": "multiply_by"}
 
     column: str = Field(description="Name of the column in the log.")
     unit: LogUnit | None = Field(

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import Enum
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, freeze
+from mjfim.arrays import Array
 from mjfim.errors import first_ones
+from mjfim.records.base import NamedEnum, Record, ShownRecord, record
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.recording import Recording
-from mjfim.records.shown import ShownRecord
+from mjfim.records.trajectory import Recording
 
 
-class CampaignStatus(Enum):
+class CampaignStatus(NamedEnum):
     """Outcome of a campaign; the value is a sentence for the user."""
 
     REACHED = "reached: every parameter is known as accurately as wanted"
@@ -31,8 +29,8 @@ class CampaignStatus(Enum):
     INTERRUPTED = "interrupted by the user; the rounds so far are complete"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class EarlierRound:
+@record
+class EarlierRound(Record):
     """Recordings that existed before this session of a campaign began.
 
     They belong to a round of an earlier session, or were made without a design.
@@ -52,8 +50,8 @@ class EarlierRound:
     design: Design | None = None
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Round:
+@record
+class Round(Record):
     """One round of a campaign.
 
     Attributes:
@@ -77,8 +75,18 @@ class Round:
     design: Design | None = None
     warnings: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        freeze(self, "theta", "predicted", "control")
+    in_json = (
+        "number",
+        "theta",
+        "predicted",
+        "estimate.theta",
+        "attained",
+        "estimate.chi2",
+        "estimate.dof",
+        "estimate.misfit",
+        "warnings",
+    )
+    json_names = {"theta": "designed_at", "attained": "std"}
 
     @property
     def attained(self) -> Array:
@@ -86,22 +94,14 @@ class Round:
         return self.estimate.std
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `rounds` in campaign.json."""
+        """The contents of the record in JSON."""
         return {
-            "number": self.number,
-            "designed_at": self.theta,
-            "predicted": self.predicted,
+            **super().summary(),
             "recordings": len(self.recordings),
-            "theta": self.estimate.theta,
-            "std": self.attained,
-            "chi2": self.estimate.chi2,
-            "dof": self.estimate.dof,
-            "misfit": self.estimate.misfit,
-            "warnings": list(self.warnings),
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class Campaign(ShownRecord):
     """Result of a campaign: all rounds.
 
@@ -122,11 +122,18 @@ class Campaign(ShownRecord):
     pending: Design | None = None
     warnings: tuple[str, ...] = ()
 
-    file_stem: ClassVar[str] = "campaign"
-    made_by: ClassVar[str] = "`mjfim campaign EXPERIMENT -o DIR`"
-
-    def __post_init__(self) -> None:
-        freeze(self, "wanted")
+    file_stem = "campaign"
+    made_by = "`mjfim campaign EXPERIMENT -o DIR`"
+    in_json = (
+        "status",
+        "words",
+        "reached",
+        "parameters",
+        "wanted",
+        "rounds",
+        "warnings",
+    )
+    json_names = {"words": "message"}
 
     @property
     def reached(self) -> bool:
@@ -162,18 +169,6 @@ class Campaign(ShownRecord):
         count = len(self.rounds)
         rounds = "1 round" if count == 1 else f"{count} rounds"
         return f"{self.status.value}{missed}; {rounds}"
-
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of campaign.json."""
-        return {
-            "status": self.status.name.lower(),
-            "message": str(self),
-            "reached": self.reached,
-            "parameters": list(self.parameters),
-            "wanted": self.wanted,
-            "rounds": [r.summary() for r in self.rounds],
-            "warnings": list(self.warnings),
-        }
 
 
 def missed_targets(names: Sequence[str], std: Array, wanted: Array) -> str:

@@ -2,32 +2,184 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, freeze
-from mjfim.errors import first_ones
-from mjfim.records.combinations import ParameterGroup
+from mjfim.arrays import Array
+from mjfim.errors import first_ones, shortened
+from mjfim.records.base import Record, ShownRecord, record
 from mjfim.records.design import CombinationAccuracy, LimitViolation
-from mjfim.records.shown import ShownRecord
+
+# A coefficient that differs from 1 by less than this number is not written.
+UNIT_COEFFICIENT_TOLERANCE = 1e-6
+
+
+# Longest list of the members of a group in a message [characters].
+MEMBERS_TEXT = 120
+
+
+# Longest text of a combination, and of all combinations of a group, in a message [characters].
+COMBINATION_TEXT = 90
+
+
+COMBINATIONS_TEXT = 180
+
+
+# Longest text of several groups in a message [characters].
+GROUPS_TEXT = 320
+
+
+@record
+class Combination(Record):
+    """An identifiable linear combination `sum_i coefficients_i * parameter_i`.
+
+    Attributes:
+        members: Names of the parameters.
+        coefficients: Coefficient of each parameter; the first one is 1.
+    """
+
+    members: tuple[str, ...]
+    coefficients: tuple[float, ...]
+
+    def __str__(self) -> str:
+        return " ".join(self._terms(self.members))
+
+    @property
+    def short(self) -> str:
+        """The combination in a message; of many terms the first ones and the number of the others.
+
+        Very long names are shortened.
+        """
+        terms = self._terms([shortened(name) for name in self.members])
+        return first_ones(terms, " ", COMBINATION_TEXT)
+
+    def _terms(self, names: Sequence[str]) -> list[str]:
+        """Return the terms with given names of the members."""
+        terms = [names[0]]
+        for name, coefficient in zip(names[1:], self.coefficients[1:], strict=True):
+            sign = "+" if coefficient > 0 else "-"
+            terms.append(f"{sign} {_factor(abs(coefficient))}{name}")
+        return terms
+
+
+@record
+class ParameterGroup(Record):
+    """Parameters that are identifiable only together.
+
+    Attributes:
+        members: Names of the parameters.
+        combinations: The identifiable combinations, fewer than members; empty if no member has an
+            effect.
+    """
+
+    members: tuple[str, ...]
+    combinations: tuple[Combination, ...]
+
+    in_json = (
+        "members",
+        "words",
+    )
+
+    def __str__(self) -> str:
+        names = join_names(self.members)
+        if not self.combinations:
+            return f"{names}: no effect on any measured output"
+        return f"{names} only as {', '.join(str(c) for c in self.combinations)}"
+
+    @property
+    def short(self) -> str:
+        """The group in a message; of many names and terms the first ones are shown."""
+        if len(str(self)) <= COMBINATIONS_TEXT:
+            return str(self)
+
+        names = self.short_names
+        if not self.combinations:
+            return f"{names}: no effect on any measured output"
+        combinations = [combination.short for combination in self.combinations]
+        return f"{names} only as {first_ones(combinations, longest=COMBINATIONS_TEXT)}"
+
+    @property
+    def short_names(self) -> str:
+        """The members in a message; of many members the first ones and the number of the others."""
+        names = join_names(self.members)
+        return (
+            names
+            if len(names) <= MEMBERS_TEXT
+            else first_ones([shortened(name) for name in self.members], longest=MEMBERS_TEXT)
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        identifiable = [
+            dict(zip(c.members, c.coefficients, strict=True)) for c in self.combinations
+        ]
+        return {
+            **super().summary(),
+            "identifiable": identifiable,
+        }
+
+
+def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -> Array:
+    """Return the coefficients of all combinations of several groups as a matrix.
+
+    Args:
+        groups: Groups of parameters.
+        names: Names of the t parameters, one per column.
+
+    Returns:
+        (c, t) coefficients, one row per combination.
+    """
+    combinations = [c for group in groups for c in group.combinations]
+    column_of = {name: j for j, name in enumerate(names)}
+
+    matrix = np.zeros((len(combinations), len(names)))
+    for row, combination in zip(matrix, combinations, strict=True):
+        for member, coefficient in zip(combination.members, combination.coefficients, strict=True):
+            row[column_of[member]] = coefficient
+    return matrix
+
+
+def groups_in_words(groups: Sequence[ParameterGroup]) -> str:
+    """Describe groups in a message; of many groups the first ones and the number of the others.
+
+    Args:
+        groups: The groups.
+    """
+    return first_ones([group.short for group in groups], "; ", GROUPS_TEXT)
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Return names as a list in a sentence: `a, b and c`."""
+    if len(names) == 1:
+        return names[0]
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _factor(coefficient: float) -> str:
+    """Return the text of a coefficient in front of a name; empty if the coefficient is 1."""
+    if abs(coefficient - 1.0) < UNIT_COEFFICIENT_TOLERANCE:
+        return ""
+    return f"{coefficient:.4g} "
+
 
 # Two parameters are confounded if the absolute correlation of their estimates exceeds this number.
 CONFOUNDED_CORRELATION = 0.95
 
+
 # The self-test fails if psi by rollouts and psi by the linear recursion differ by more than this
 # number (relative).
 RECURSION_TOLERANCE = 1e-3
+
 
 # The self-test fails if the analytic slope of the cost and finite differences differ by more than
 # this number (relative).
 SLOPE_TOLERANCE = 1e-2
 
 
-@dataclass(frozen=True, kw_only=True)
-class ParameterCheck:
+@record
+class ParameterCheck(Record):
     """Predicted accuracy of one parameter.
 
     Attributes:
@@ -58,24 +210,22 @@ class ParameterCheck:
     repetitions: int
     seconds: float
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `parameters` in check.json."""
-        return {
-            "name": self.name,
-            "unit": self.unit,
-            "value": self.value,
-            "size": self.size,
-            "nuisance": self.nuisance,
-            "std": self.std,
-            "relative": self.relative,
-            "wanted": self.wanted,
-            "repetitions": self.repetitions,
-            "seconds": self.seconds,
-        }
+    in_json = (
+        "name",
+        "unit",
+        "value",
+        "size",
+        "nuisance",
+        "std",
+        "relative",
+        "wanted",
+        "repetitions",
+        "seconds",
+    )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ConfoundedPair:
+@record
+class ConfoundedPair(Record):
     """Two parameters whose estimates are strongly correlated.
 
     Attributes:
@@ -89,8 +239,8 @@ class ConfoundedPair:
     correlation: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class Roughness:
+@record
+class Roughness(Record):
     """Disagreement of dy/dtheta between two difference steps, because the motion is not smooth.
 
     Attributes:
@@ -126,16 +276,6 @@ class Roughness:
             "derivatives"
         )
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of `rough` in check.json."""
-        return {
-            "error": self.error,
-            "parameter": self.parameter,
-            "sample": self.sample,
-            "time": self.time,
-            "causes": list(self.causes),
-        }
-
 
 def _grouped(causes: Iterable[str]) -> list[str]:
     """Return causes such as `dry friction of Jaw`, each kind once with all of its names."""
@@ -146,8 +286,8 @@ def _grouped(causes: Iterable[str]) -> list[str]:
     return [kind + first_ones(found) for kind, found in names.items()]
 
 
-@dataclass(frozen=True, kw_only=True)
-class SelfTest:
+@record
+class SelfTest(Record):
     """Test of the derivatives along a trajectory.
 
     Errors are relative. They are infinite if a perturbed motion diverges, and NaN if the criterion
@@ -167,6 +307,16 @@ class SelfTest:
     likely_cause: str = ""
     finished: bool = True
 
+    in_json = (
+        "passed",
+        "finished",
+        "recursion",
+        "slope",
+        "likely_cause",
+        "roughness",
+    )
+    json_names = {"likely_cause": "suspect", "roughness": "rough"}
+
     @property
     def passed(self) -> bool:
         """True if all derivatives agree."""
@@ -177,19 +327,8 @@ class SelfTest:
             and not self.slope > SLOPE_TOLERANCE
         )
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of `self_test` in check.json."""
-        return {
-            "passed": self.passed,
-            "finished": self.finished,
-            "recursion": self.recursion,
-            "slope": self.slope,
-            "suspect": self.likely_cause,
-            "rough": None if self.roughness is None else self.roughness.summary(),
-        }
 
-
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class Check(ShownRecord):
     """Result of `mjfim.check`: which parameters can be identified, and how well.
 
@@ -233,15 +372,30 @@ class Check(ShownRecord):
     refused: tuple[str, ...] = ()
     violations: tuple[LimitViolation, ...] = ()
 
-    file_stem: ClassVar[str] = "check"
-    made_by: ClassVar[str] = "`mjfim check EXPERIMENT -o DIR`"
-    renamed_fields: ClassVar[Mapping[str, str]] = {
-        "never": "not_separable",
-        "not_here": "not_excited",
+    file_stem = "check"
+    made_by = "`mjfim check EXPERIMENT -o DIR`"
+    in_json = (
+        "ok",
+        "missing",
+        "refused",
+        "violations",
+        "verdict",
+        "source",
+        "horizon",
+        "rows",
+        "eigenvalues",
+        "condition",
+        "information",
+        "wanted",
+        "correlation",
+        "not_separable",
+        "not_excited",
+        "self_test",
+    )
+    json_names = {
+        "rows": "parameters",
+        "not_separable": "combinations",
     }
-
-    def __post_init__(self) -> None:
-        freeze(self, "information", "eigenvalues", "correlation")
 
     @property
     def condition(self) -> float:
@@ -271,7 +425,7 @@ class Check(ShownRecord):
         return passed and separable and not self.not_excited and reached
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of check.json."""
+        """The contents of the record in JSON."""
         confounded = [
             {"a": pair.first, "b": pair.second, "correlation": pair.correlation}
             for pair in self.confounded
@@ -280,23 +434,8 @@ class Check(ShownRecord):
             {"words": c.expression, "value": c.value, "std": c.std_final} for c in self.combined
         ]
         return {
-            "ok": self.ok,
+            **super().summary(),
             "complete": not self.missing,
-            "missing": list(self.missing),
-            "refused": list(self.refused),
-            "violations": [violation.summary() for violation in self.violations],
-            "verdict": list(self.verdict),
-            "source": self.source,
-            "horizon": self.horizon,
-            "parameters": [row.summary() for row in self.rows],
-            "eigenvalues": self.eigenvalues,
-            "condition": self.condition,
-            "information": self.information,
-            "wanted": list(self.wanted),
-            "correlation": self.correlation,
             "confounded": confounded,
-            "combinations": [group.summary() for group in self.not_separable],
             "combined": combined,
-            "not_excited": [group.summary() for group in self.not_excited],
-            "self_test": self.self_test.summary(),
         }

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from enum import Enum
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array, freeze
-from mjfim.errors import RenamedFields
-from mjfim.records.shown import ShownRecord
+from mjfim.records.base import NamedEnum, Record, ShownRecord, record
 
 # Key of mjfim's own design among the methods.
 DESIGN = "design"
+
 
 # Relative difference of two costs J below which they count as equal.
 TIE_TOLERANCE = 1e-3
 
 
-class MethodOutcome(Enum):
+class MethodOutcome(NamedEnum):
     """Outcome of a method; the value is a verb phrase for the user."""
 
     INSIDE = "keeps all limits"
@@ -30,8 +27,8 @@ class MethodOutcome(Enum):
     NONE = "had no time for a single evaluation"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MethodResult(RenamedFields):
+@record
+class MethodResult(Record):
     """The best control that one method found. All numbers are NaN if it found none.
 
     Attributes:
@@ -69,14 +66,26 @@ class MethodResult(RenamedFields):
     found_by: str = ""
     note: str = ""
 
-    renamed_fields: ClassVar[Mapping[str, str]] = {
-        "smallest": "min_eigenvalue",
-        "worst": "worst_relative_std",
-        "shares": "relative_margins",
+    in_json = (
+        "method",
+        "title",
+        "outcome",
+        "cost",
+        "criterion",
+        "min_eigenvalue",
+        "worst_relative_std",
+        "std",
+        "seconds",
+        "steps",
+        "found_by",
+        "note",
+    )
+    json_names = {
+        "min_eigenvalue": "smallest_eigenvalue",
+        "worst_relative_std": "worst_relative_sigma",
     }
 
     def __post_init__(self) -> None:
-        freeze(self, "std")
         if self.control is not None:
             freeze(self, "control")
 
@@ -91,26 +100,15 @@ class MethodResult(RenamedFields):
         return min(self.relative_margins.items(), key=lambda item: item[1], default=("", np.inf))
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `methods` in compare.json."""
+        """The contents of the record in JSON."""
         return {
-            "method": self.method,
-            "title": self.title,
-            "outcome": self.outcome.name.lower(),
+            **super().summary(),
             "message": self.outcome.value,
-            "cost": self.cost,
-            "criterion": self.criterion,
-            "smallest_eigenvalue": self.min_eigenvalue,
-            "worst_relative_sigma": self.worst_relative_std,
-            "std": self.std,
-            "seconds": self.seconds,
-            "steps": self.steps,
             "limits": {"margins": self.margins, "shares": self.relative_margins},
-            "found_by": self.found_by,
-            "note": self.note,
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class Comparison(ShownRecord):
     """Result of `mjfim.compare`: methods in the order in which they ran, all with equal budgets.
 
@@ -145,11 +143,21 @@ class Comparison(ShownRecord):
     weighted: bool
     interrupted: bool = False
 
-    file_stem: ClassVar[str] = "compare"
-    made_by: ClassVar[str] = "`mjfim compare EXPERIMENT -o DIR`"
-
-    def __post_init__(self) -> None:
-        freeze(self, "scale")
+    file_stem = "compare"
+    made_by = "`mjfim compare EXPERIMENT -o DIR`"
+    in_json = (
+        "ok",
+        "verdict",
+        "interrupted",
+        "criterion",
+        "seed",
+        "parameters",
+        "units",
+        "scale",
+        "nuisance",
+        "rows",
+    )
+    json_names = {"rows": "methods"}
 
     @property
     def wanted(self) -> tuple[int, ...]:
@@ -219,21 +227,12 @@ class Comparison(ShownRecord):
         return tuple(sentences)
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of compare.json."""
+        """The contents of the record in JSON."""
         return {
-            "ok": self.ok,
-            "verdict": list(self.verdict),
-            "interrupted": self.interrupted,
-            "criterion": self.criterion,
+            **super().summary(),
             "budget": {"seconds": self.seconds, "steps": self.steps},
-            "seed": self.seed,
-            "parameters": list(self.parameters),
-            "units": list(self.units),
-            "scale": self.scale,
-            "nuisance": list(self.nuisance),
             "best": None if self.best is None else self.best.method,
             "beating": [row.method for row in self.beating],
-            "methods": [row.summary() for row in self.rows],
         }
 
 

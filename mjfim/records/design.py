@@ -2,32 +2,136 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from typing import Any, ClassVar
+from collections.abc import Iterable, Sequence
+from dataclasses import field, replace
+from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, freeze
-from mjfim.errors import RenamedFields
-from mjfim.records.iterates import IterateMotion, IterateMotions, superfluous
+from mjfim.arrays import Array
+from mjfim.records.base import NamedEnum, Record, SavedRecord, ShownRecord, record
 from mjfim.records.labels import Labels
-from mjfim.records.serialization import SavedRecord
-from mjfim.records.shown import ShownRecord
 from mjfim.records.trajectory import Trajectory
+
+# Largest number of iterates of one search whose motions are kept, and number of samples of each.
+MAX_MOTIONS, MOTION_SAMPLES = 40, 200
+
+
+@record
+class IterateMotion(Record):
+    """Motion of one iterate at `MOTION_SAMPLES` evenly spread samples, n in all.
+
+    Attributes:
+        t: (n,) times [s].
+        qpos: (n, nq) positions [m or rad; unit quaternions for ball and free joints].
+        ctrl: (n, nu) controls; the last one is repeated at the end [unit of the actuator].
+    """
+
+    t: Array
+    qpos: Array
+    ctrl: Array
+
+    @classmethod
+    def of(cls, trajectory: Trajectory | None) -> IterateMotion | None:
+        """Thin a trajectory.
+
+        Args:
+            trajectory: The trajectory; None for an iterate whose simulation diverged.
+
+        Returns:
+            The motion; None without a trajectory, and where it is not finite.
+        """
+        if trajectory is None or not np.isfinite(trajectory.qpos).all():
+            return None
+
+        # A trajectory with fewer samples repeats some, so that all motions have the same size.
+        last = trajectory.samples
+        rows = np.linspace(0, last, MOTION_SAMPLES).round().astype(np.intp)
+        held = np.minimum(rows, last - 1)
+        return cls(
+            t=_drawn(trajectory.t[rows]),
+            qpos=_drawn(trajectory.qpos[rows]),
+            ctrl=_drawn(trajectory.ctrl[held]),
+        )
+
+
+def _drawn(values: Array) -> Array:
+    """Values with the digits that a picture needs, so that files are small."""
+    # What is too large for this type is drawn nowhere.
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32).astype(np.float64)
+
+
+@record
+class IterateMotions(Record):
+    """Motions of m iterates of a design, with n samples each.
+
+    Attributes:
+        iteration: (m,) ascending numbers of the iterates.
+        t: (m, n) times [s].
+        qpos: (m, n, nq) positions [m or rad; unit quaternions for ball and free joints].
+        ctrl: (m, n, nu) controls [unit of the actuator].
+    """
+
+    iteration: Array
+    t: Array
+    qpos: Array
+    ctrl: Array
+
+    @classmethod
+    def of(cls, motions: Sequence[tuple[int, IterateMotion]]) -> IterateMotions | None:
+        """Join motions.
+
+        Args:
+            motions: Number and motion of each iterate, ascending.
+
+        Returns:
+            The motions; None if there are none.
+        """
+        if not motions:
+            return None
+        return cls(
+            iteration=np.array([iteration for iteration, _ in motions], dtype=np.float64),
+            t=np.stack([motion.t for _, motion in motions]),
+            qpos=np.stack([motion.qpos for _, motion in motions]),
+            ctrl=np.stack([motion.ctrl for _, motion in motions]),
+        )
+
+
+def superfluous(iterations: Sequence[int], limit: int = MAX_MOTIONS) -> set[int]:
+    """Choose iterates whose motions are dropped, so that at most `limit` remain.
+
+    One after the other the iterate is dropped whose neighbours are nearest to each other. The first
+    and the last one stay.
+
+    Args:
+        iterations: Ascending numbers of the iterates that have a motion.
+        limit: Largest number that remains, at least 2.
+
+    Returns:
+        Places in `iterations` of those that are dropped.
+    """
+    kept = list(range(len(iterations)))
+    while len(kept) > limit:
+        numbers = np.array([iterations[place] for place in kept])
+        gaps = numbers[2:] - numbers[:-2]
+        del kept[1 + int(np.argmin(gaps))]
+    return set(range(len(iterations))) - set(kept)
+
 
 # Number of iterations at the end of a search over which its improvement is measured.
 IMPROVEMENT_WINDOW = 10
 
+
 # Smallest improvement per iteration that is stated as a number.
 LEAST_IMPROVEMENT = 1e-4
+
 
 # Fields of a trajectory whose names are also names of arrays in design.npz.
 TRAJECTORY_ARRAYS = ("t", "qpos", "qvel", "act", "ctrl")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class Evaluation(SavedRecord):
     """A trajectory and the information that it gives about the parameters.
 
@@ -60,25 +164,19 @@ class Evaluation(SavedRecord):
     cost: float
     growth: float = float("nan")
 
-    file_stem: ClassVar[str] = "evaluation"
-    made_by: ClassVar[str] = "Evaluation.save"
-
-    def __post_init__(self) -> None:
-        freeze(self, "gain", "sensitivity", "information", "eigenvalues", "std", "min_eigenvalue")
-
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of `initial` and of `final` in design.json."""
-        return {
-            "cost": self.cost,
-            "criterion": self.criterion,
-            "growth": self.growth,
-            "information": self.information,
-            "eigenvalues": self.eigenvalues,
-            "std": self.std,
-        }
+    file_stem = "evaluation"
+    made_by = "Evaluation.save"
+    in_json = (
+        "cost",
+        "criterion",
+        "growth",
+        "information",
+        "eigenvalues",
+        "std",
+    )
 
 
-class Status(Enum):
+class Status(NamedEnum):
     """Outcome of an optimisation; the value is a sentence for the user."""
 
     CONVERGED = "converged: the slope fell below tolerance × cost (a local optimum)"
@@ -124,8 +222,8 @@ class Status(Enum):
         return self.success or self in (Status.MAX_ITERATIONS, Status.BEST_SEEN)
 
 
-@dataclass(frozen=True, kw_only=True)
-class HistoryRow:
+@record
+class HistoryRow(Record):
     """One iterate of a design.
 
     Attributes:
@@ -233,8 +331,8 @@ def _last_run_inside(history: Iterable[HistoryRow]) -> list[HistoryRow]:
     return runs[-1] or runs[max(len(runs) - 2, 0)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class StartResult:
+@record
+class StartResult(Record):
     """Result of one initial control of a multistart design.
 
     Attributes:
@@ -249,18 +347,9 @@ class StartResult:
     status: Status
     iterations: int
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `starts` in design.json."""
-        return {
-            "name": self.name,
-            "cost": self.cost,
-            "status": self.status.name.lower(),
-            "iterations": self.iterations,
-        }
 
-
-@dataclass(frozen=True, kw_only=True)
-class CombinationAccuracy(RenamedFields):
+@record
+class CombinationAccuracy(Record):
     """Accuracy of an identifiable combination of parameters that are not identifiable alone.
 
     Attributes:
@@ -275,15 +364,9 @@ class CombinationAccuracy(RenamedFields):
     std_initial: float
     std_final: float
 
-    renamed_fields: ClassVar[Mapping[str, str]] = {
-        "words": "expression",
-        "initial": "std_initial",
-        "final": "std_final",
-    }
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LimitUsage:
+@record
+class LimitUsage(Record):
     """Position of a trajectory between the two bounds of one limit.
 
     Attributes:
@@ -303,12 +386,9 @@ class LimitUsage:
     lower: float = -np.inf
     upper: float = np.inf
 
-    def __post_init__(self) -> None:
-        freeze(self, "t", "share")
 
-
-@dataclass(frozen=True, kw_only=True)
-class LimitViolation:
+@record
+class LimitViolation(Record):
     """A limit that a trajectory violates.
 
     Attributes:
@@ -347,23 +427,9 @@ class LimitViolation:
             f"{clamp}, {side} {limit} (first at {self.since:.4g} s)"
         )
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `limits.initial` in design.json."""
-        return {
-            "kind": self.kind,
-            "name": self.name,
-            "since": self.since,
-            "t": self.t,
-            "value": self.value,
-            "lower": self.lower,
-            "upper": self.upper,
-            "unit": self.unit,
-            "clamped": self.clamped,
-        }
 
-
-@dataclass(frozen=True, kw_only=True)
-class ScaledStart:
+@record
+class ScaledStart(Record):
     """The largest share of an initial control outside limits that keeps all of them.
 
     The initial control is scaled about a control that holds the start, or nearly does.
@@ -378,14 +444,6 @@ class ScaledStart:
     cost: float
     min_eigenvalue: float
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of `scaled_start` in design.json."""
-        return {
-            "share": self.share,
-            "cost": self.cost,
-            "min_eigenvalue": self.min_eigenvalue,
-        }
-
 
 def _npz_names() -> dict[str, str]:
     """Return the short names of arrays in design.npz, by path in the record."""
@@ -398,7 +456,7 @@ def _npz_names() -> dict[str, str]:
     return names
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class Design(ShownRecord):
     """Result of `mjfim.design`: the designed trajectory and the initial one.
 
@@ -466,14 +524,36 @@ class Design(ShownRecord):
     motions: IterateMotions | None = None
     improvement: float = float("nan")
 
-    file_stem: ClassVar[str] = "design"
-    made_by: ClassVar[str] = "`mjfim design EXPERIMENT -o DIR`"
-    array_names: ClassVar[Mapping[str, str]] = _npz_names()
+    file_stem = "design"
+    made_by = "`mjfim design EXPERIMENT -o DIR`"
+    array_names = _npz_names()
+    in_json = (
+        "status",
+        "outcome",
+        "improvement",
+        "iterations",
+        "seconds",
+        "slope",
+        "steps",
+        "parameters",
+        "theta",
+        "sizes",
+        "initial",
+        "final",
+        "scaled_start",
+        "found_by",
+        "starts",
+        "warnings",
+        "nuisance",
+        "combinations",
+        "prior",
+        "data",
+    )
+    json_names = {"outcome": "message"}
 
     def __post_init__(self) -> None:
         if not len(self.sizes):
             object.__setattr__(self, "sizes", np.abs(self.theta))
-        freeze(self, "theta", "prior", "data", "sizes")
 
     @property
     def wanted(self) -> tuple[int, ...]:
@@ -536,31 +616,14 @@ class Design(ShownRecord):
         return self.final.trajectory
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of design.json, except for the name of the experiment file."""
+        """The contents of the record in JSON."""
         return {
-            "status": self.status.name.lower(),
-            "message": self.outcome,
-            "improvement": self.improvement,
-            "iterations": self.iterations,
-            "seconds": self.seconds,
-            "slope": self.slope,
-            "steps": self.steps,
-            "parameters": list(self.parameters),
-            "theta": self.theta,
-            "sizes": self.sizes,
-            "initial": self.initial.summary(),
-            "final": self.final.summary(),
+            **super().summary(),
             "limits": {
                 "margins": self.limits,
                 "satisfied": self.within_limits,
                 "initial": [violation.summary() for violation in self.initial_violations],
             },
-            "scaled_start": None if self.scaled_start is None else self.scaled_start.summary(),
-            "found_by": self.found_by,
-            "starts": [start.summary() for start in self.starts],
-            "warnings": list(self.warnings),
-            "nuisance": list(self.nuisance),
-            "combinations": list(self.combinations),
             "combined": [
                 {
                     "words": combination.expression,
@@ -570,6 +633,4 @@ class Design(ShownRecord):
                 }
                 for combination in self.combined
             ],
-            "prior": self.prior,
-            "data": self.data,
         }

@@ -2,36 +2,392 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+import math
+from dataclasses import asdict, field
+from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, freeze
-from mjfim.records.combinations import join_names
-from mjfim.records.control_law import ControlLawInLoop
-from mjfim.records.horizons import HorizonStudy
-from mjfim.records.intervals import NORMAL_95
+from mjfim.arrays import NORMAL_95, Array
+from mjfim.errors import first_ones
+from mjfim.records.base import Record, SavedRecord, ShownRecord, record
+from mjfim.records.check import join_names
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
-from mjfim.records.missing_term import MissingTerm, TermTestData
-from mjfim.records.parameter_draws import ParameterDraws
 from mjfim.records.payload import PayloadEstimate
-from mjfim.records.prior_directions import PriorDirections
-from mjfim.records.recording import Recording
-from mjfim.records.recording_comparison import RecordingComparison
-from mjfim.records.selection import Selection
-from mjfim.records.serialization import SavedRecord
-from mjfim.records.shown import ShownRecord
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.robots import RecordingComparison
+from mjfim.records.terms import MissingTerm, Selection, TermTestData
+from mjfim.records.trajectory import Recording, Trajectory
+
+# Ratio of the errors over the longest and the shortest horizon above which they grow.
+GROWTH = 1.2
+
+
+# Smallest error in a denominator.
+SMALLEST_ERROR = 1e-150
+
+
+@record
+class HorizonStudy(Record):
+    """Fits over segments of different lengths, and how well each predicts left-out data.
+
+    Each fit predicts parts of the data from the others, over times of each length. The longest
+    length is chosen whose predictions over all these times are not clearly worse than the best
+    ones, because longer segments give more accurate estimates.
+
+    Attributes:
+        lengths: (L,) lengths of the segments, which are the prediction horizons as well [s]. The
+            last one is that of whole recordings, if these were fitted.
+        errors: (L, L) error of left-out data of the fit over each length, in each horizon [standard
+            deviations of the noise].
+        chosen: Index of the chosen length.
+        is_whole: Whether the last length is that of whole recordings.
+        parameters: Names of the p parameters.
+        units: (p,) their units.
+        theta: (L, p) estimates by each fit [theta-unit].
+        half_widths: (L, p) half widths of their 95 % intervals, by the scatter between the
+            estimates without each part of the data [theta-unit].
+        is_apart: (L, p) whether an estimate differs from that of the chosen length by more than
+            chance explains.
+        why_not_used: Why the estimate is over whole recordings although segments were chosen, in
+            words; empty where it is over the chosen length.
+    """
+
+    lengths: Array
+    errors: Array
+    chosen: int
+    is_whole: bool
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    theta: Array
+    half_widths: Array
+    is_apart: Array
+    why_not_used: str = ""
+
+    in_json = (
+        "words",
+        "lengths",
+        "errors",
+        "chosen",
+        "is_used",
+        "is_whole",
+        "theta",
+        "half_widths",
+        "dependent",
+    )
+    json_names = {"dependent": "depends_on_length"}
+
+    @property
+    def chosen_whole(self) -> bool:
+        """Whether whole recordings were chosen."""
+        return self.is_whole and self.chosen == len(self.lengths) - 1
+
+    @property
+    def dependent(self) -> tuple[str, ...]:
+        """Names of the parameters whose estimate depends on the length of the segments."""
+        columns = np.flatnonzero(np.asarray(self.is_apart, dtype=bool).any(axis=0))
+        return tuple(self.parameters[j] for j in columns)
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the estimate is over the chosen length."""
+        return not self.why_not_used
+
+    @property
+    def relative_errors(self) -> Array:
+        """(L,) error of each fit over the smallest one in each horizon, as root mean square."""
+        errors = np.asarray(self.errors)
+        least = np.where(np.isfinite(errors), errors, np.inf).min(axis=0)
+        ratios = errors / np.maximum(least, SMALLEST_ERROR)
+        return np.asarray(np.sqrt(np.mean(ratios**2, axis=1)))
+
+    def name_of(self, index: int) -> str:
+        """A length in words.
+
+        Args:
+            index: Index of the length.
+        """
+        if self.is_whole and index == len(self.lengths) - 1:
+            return "whole recordings"
+        return f"segments of {self.lengths[index]:.2g} s"
+
+    def widened(self, interval: Array) -> Array:
+        """Intervals that also hold the estimates of other lengths that chance does not explain.
+
+        Where the estimate is not over the chosen length, they hold the one over it as well.
+
+        Args:
+            interval: (p, 2) intervals of the estimate [theta-unit].
+
+        Returns:
+            (p, 2) intervals.
+        """
+        apart = np.array(self.is_apart, dtype=bool)
+        if not self.is_used:
+            apart[self.chosen] = apart.any(axis=0)
+        low = np.where(apart, self.theta, np.inf).min(axis=0)
+        high = np.where(apart, self.theta, -np.inf).max(axis=0)
+        return np.column_stack([np.minimum(interval[:, 0], low), np.maximum(interval[:, 1], high)])
+
+    def __str__(self) -> str:
+        uses = () if self.is_used else (self.about_use,)
+        return " ".join([self.about_choice, *uses, self.about_growth, *self.findings])
+
+    @property
+    def about_choice(self) -> str:
+        """Sentence that says which length was chosen."""
+        first, last = self.lengths[0], self.lengths[-1]
+        ratios = self.relative_errors
+        text = (
+            "The model does not explain the recordings, so the length of the segments matters: "
+            f"{self.name_of(self.chosen)} were chosen, the longest ones whose predictions of "
+            f"left-out data over times of {first:.2g} to {last:.2g} s are not clearly worse than "
+            f"the best (error over the smallest one for each time: {ratios[self.chosen]:.3g}"
+        )
+        others = [i for i in range(len(self.lengths)) if i != self.chosen]
+        listed = [f"{ratios[i]:.3g} with {self.name_of(i)}" for i in others]
+        return f"{text}, {join_names(listed)})."
+
+    @property
+    def about_use(self) -> str:
+        """Sentence that says why the estimate is over whole recordings; empty where it is not."""
+        if self.is_used:
+            return ""
+        return (
+            f"The estimate is over whole recordings, not over {self.name_of(self.chosen)}: "
+            f"{self.why_not_used}."
+        )
+
+    @property
+    def about_growth(self) -> str:
+        """Sentence that says what the error against the horizon means."""
+        errors = self.errors[self.chosen]
+        if errors[-1] > GROWTH * errors[0]:
+            return (
+                f"The error grows from {errors[0]:.3g} σ over {self.lengths[0]:.2g} s to "
+                f"{errors[-1]:.3g} σ over {self.lengths[-1]:.2g} s: the model misses an effect "
+                "that adds up with time."
+            )
+        return (
+            f"The error is {errors[0]:.3g} σ over {self.lengths[0]:.2g} s and {errors[-1]:.3g} σ "
+            f"over {self.lengths[-1]:.2g} s: the model misses an effect that does not add up with "
+            "time, or the noise is larger than stated."
+        )
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """A sentence for each parameter whose estimate depends on the length of the segments."""
+        found = []
+        for name in self.dependent:
+            j = self.parameters.index(name)
+            unit = f" {self.units[j]}" if self.units[j] else ""
+            values = [
+                f"{self.theta[i, j]:.4g}{unit} with {self.name_of(i)}"
+                for i in range(len(self.lengths))
+                if self.is_apart[i, j] or i == self.chosen
+            ]
+            found.append(
+                f"{name} depends on the length: {join_names(values)}; this is more than chance "
+                "explains, so the model misses something, and the interval covers these values."
+            )
+        return tuple(found)
+
+
+# Longest list of names in a sentence [characters].
+NAMES_TEXT = 120
+
+
+@record
+class PriorDirections(Record):
+    """How many combinations of the inertial parameters the recordings determine.
+
+    The others are determined by the prior that the inertias of the model are (`cad_prior`). No
+    motion of a fixed-base arm shows them, for example the mass of its first link.
+
+    Attributes:
+        bodies: Names of the groups of parameters, one for each body.
+        count: Number of coordinates of these bodies.
+        determined: Number of combinations of which the recordings leave at most half of the
+            standard deviation of the prior.
+        parameters: Names of the parameters whose standard deviation is more than half of that of
+            the prior: their intervals are those of the prior.
+    """
+
+    bodies: tuple[str, ...]
+    count: int
+    determined: int
+    parameters: tuple[str, ...]
+
+    in_json = (
+        "bodies",
+        "count",
+        "determined",
+        "parameters",
+        "words",
+    )
+
+    def __str__(self) -> str:
+        bodies = first_ones(self.bodies, ", ", NAMES_TEXT)
+        text = (
+            f"The recordings determine {self.determined} of {self.count} combinations of the "
+            f"inertial parameters of {bodies}. The other "
+            f"{self.count - self.determined} keep the values of the model within `cad_prior`, "
+            "which is an assumption and no measurement"
+        )
+        if not self.parameters:
+            return f"{text}."
+        names = first_ones(self.parameters, ", ", NAMES_TEXT)
+        return f"{text}: it gives most of the intervals of {names}."
+
+
+# Share of clipped samples below which it is not worth a word.
+RARELY = 1e-3
+
+
+# Range of a control without limits.
+NO_RANGE = [-math.inf, math.inf]
+
+
+@record
+class ControlLawInLoop(Record):
+    """Law with which the driver of an actuator computes the control.
+
+    Attributes:
+        actuator: Name of the actuator.
+        joint: Name of the joint whose position it controls.
+        rate: Rate at which it is evaluated [Hz].
+        columns: Columns of the log that it reads.
+        numbers: Its numbers by the keys of the experiment file, those without effect left out; both
+            ends of a range have an index, as in `saturation[0]`.
+        units: Unit of each of these numbers; may be empty.
+        estimated: Keys of the numbers that are parameters.
+        clipped: Share of the samples at which the limits of the law clip its control, 0 to 1.
+        is_servo: Whether a position servo of MJCF is the same law, but for its rate.
+    """
+
+    actuator: str
+    joint: str
+    rate: float
+    columns: tuple[str, ...]
+    numbers: dict[str, float]
+    units: dict[str, str]
+    estimated: tuple[str, ...]
+    clipped: float
+    is_servo: bool
+
+    @property
+    def numbers_in_words(self) -> str:
+        """The numbers with their units; both ends of the range of the control stand together."""
+        words = [
+            f"{key} = {value:.5g} {self.units[key]}".rstrip()
+            for key, value in self.numbers.items()
+            if not key.endswith("]")
+        ]
+        ends = [self.numbers.get(f"saturation[{i}]", side) for i, side in enumerate(NO_RANGE)]
+        if ends != NO_RANGE:
+            low, high = (f"{end:.5g}" for end in ends)
+            unit = next(unit for key, unit in self.units.items() if key.endswith("]"))
+            words.append(f"saturation = {low} to {high} {unit}".rstrip())
+        return ", ".join(words)
+
+    def __str__(self) -> str:
+        sentence = (
+            f"The control of {self.actuator} is that of its law in the loop, evaluated at "
+            f"{self.rate:g} Hz: {self.numbers_in_words}"
+        )
+        if self.clipped > RARELY:
+            sentence += f"; its limits clip it at {100.0 * self.clipped:.2g} % of the samples"
+        if self.is_servo:
+            sentence += "; but for its rate, it is the law of <position> in MJCF with kv = kd"
+        return f"{sentence}."
+
+    @property
+    def toml(self) -> str:
+        """The numbers as a line of an experiment file, with all their digits."""
+        entries = [
+            f"{key} = {value!r}" for key, value in self.numbers.items() if not key.endswith("]")
+        ]
+        ends = [self.numbers.get(f"saturation[{i}]", side) for i, side in enumerate(NO_RANGE)]
+        if ends != NO_RANGE:
+            entries.append(f"saturation = [{ends[0]!r}, {ends[1]!r}]")
+        return f"controllers.{self.actuator} = {{ {', '.join(entries)} }}"
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of an entry of `controllers` in estimate.json."""
+        return {**asdict(self), "words": str(self), "toml": self.toml}
+
+
+@record
+class ParameterDraws(Record):
+    """Robots that are compatible with an identification.
+
+    They are drawn from a normal distribution about the estimate that is truncated at the bounds of
+    the parameters. Deviations of initial states, which are no properties of a robot, are left out.
+
+    Attributes:
+        parameters: Names of the q drawn parameters.
+        units: Unit of each parameter; may be empty.
+        values: (n, q) a robot in each row [theta-unit].
+        centre: (q,) centre of the distribution: the estimate, and the mean over the recordings for
+            parameters that differ between them [theta-unit].
+        std: (q,) standard deviations of the distribution before truncation [theta-unit].
+        replaced: Number of draws that were replaced because a body had an unphysical inertia.
+        held_combinations: Number of combinations of inertias that stay at the estimate, because the
+            recordings do not determine them.
+        seed: Seed of the draws; None where the caller has made the generator.
+    """
+
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    centre: Array
+    std: Array
+    replaced: int = 0
+    held_combinations: int = 0
+    seed: int | None = None
+
+    in_json = (
+        "words",
+        "seed",
+        "parameters",
+        "centre",
+        "std",
+        "replaced",
+        "held_combinations",
+    )
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __str__(self) -> str:
+        count = len(self)
+        drawn = "1 robot was" if count == 1 else f"{count} robots were"
+        text = f"{drawn} drawn from the uncertainty of the estimate, inside the bounds"
+        if self.held_combinations:
+            count = self.held_combinations
+            noun = "combination" if count == 1 else "combinations"
+            text += (
+                f"; {count} {noun} of inertias that the recordings do not determine stayed there"
+            )
+        if not self.replaced:
+            return text
+        times = "once" if self.replaced == 1 else f"{self.replaced} times"
+        return f"{text}; a draw with an unphysical inertia was replaced {times}"
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        return {
+            **super().summary(),
+            "count": len(self),
+        }
+
 
 # Number of rows of all recordings above which an estimate does not hold the outputs of the model at
 # the initial guess.
 MAX_NOMINAL_ROWS = 1_000_000
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class Estimate(ShownRecord):
     """Result of `mjfim.identify`: parameters estimated from recordings.
 
@@ -171,15 +527,59 @@ class Estimate(ShownRecord):
     tested_data: TermTestData | None = None
     honest_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
-    file_stem: ClassVar[str] = "estimate"
-    made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
-    renamed_fields: ClassVar[Mapping[str, str]] = {
-        "suspects": "missing_terms",
-        "worst": "worst_residual",
-        "sandwich": "std_sandwich",
-        "between": "between_recordings",
-        "each": "per_recording",
-        "detail": "robust_uncertainty",
+    file_stem = "estimate"
+    made_by = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
+    in_json = (
+        "parameters",
+        "units",
+        "theta",
+        "std",
+        "covariance",
+        "honest_covariance",
+        "initial_theta",
+        "sizes",
+        "chi2",
+        "dof",
+        "status",
+        "success",
+        "interrupted",
+        "iterations",
+        "residual_rms",
+        "sigma",
+        "misfit",
+        "reasons",
+        "worst_residual",
+        "whiteness",
+        "per_recording",
+        "missing_terms",
+        "tested_data",
+        "std_sandwich",
+        "interval",
+        "between_recordings",
+        "predictions",
+        "seconds",
+        "steps",
+        "sloppy",
+        "at_bound",
+        "warnings",
+        "prior",
+        "data",
+        "combinations",
+        "restart",
+        "selection",
+        "controllers",
+        "held",
+        "horizons",
+        "inverse_dynamics",
+        "draws",
+        "payload",
+        "recording_comparison",
+        "prior_directions",
+    )
+    json_names = {
+        "worst_residual": "worst",
+        "missing_terms": "suspects",
+        "tested_data": "suspects_tested",
     }
 
     def __post_init__(self) -> None:
@@ -201,10 +601,6 @@ class Estimate(ShownRecord):
             object.__setattr__(self, "sizes", np.abs(self.theta))
         if len(self.units) != count:
             object.__setattr__(self, "units", ("",) * count)
-
-        freeze(self, "theta", "std", "covariance", "initial_theta", "data", "prior")
-        freeze(self, "std_sandwich", "interval", "between_recordings", "trace", "sizes")
-        freeze(self, "honest_covariance")
 
     @property
     def guess_sizes(self) -> Array:
@@ -232,66 +628,15 @@ class Estimate(ShownRecord):
         return "The nominal model is not drawn: its simulation diverges."
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of estimate.json."""
-        worst = None if self.worst_residual is None else self.worst_residual.summary()
+        """The contents of the record in JSON."""
         return {
-            "parameters": list(self.parameters),
-            "units": list(self.units),
-            "theta": self.theta,
-            "std": self.std,
-            "covariance": self.covariance,
-            "honest_covariance": self.honest_covariance,
-            "initial_theta": self.initial_theta,
-            "sizes": self.sizes,
-            "chi2": self.chi2,
-            "dof": self.dof,
-            "status": self.status,
-            "success": self.success,
-            "interrupted": self.interrupted,
-            "iterations": self.iterations,
-            "residual_rms": self.residual_rms,
-            "sigma": self.sigma,
-            "misfit": self.misfit,
-            "reasons": list(self.reasons),
-            "worst": worst,
-            "whiteness": [test.summary() for test in self.whiteness],
-            "per_recording": self.per_recording,
-            "suspects": [term.summary() for term in self.missing_terms],
-            "suspects_tested": None if self.tested_data is None else self.tested_data.summary(),
-            "std_sandwich": self.std_sandwich,
-            "interval": self.interval,
-            "between_recordings": self.between_recordings,
-            "predictions": [prediction.summary() for prediction in self.predictions],
-            "seconds": self.seconds,
-            "steps": self.steps,
-            "sloppy": list(self.sloppy),
-            "at_bound": list(self.at_bound),
+            **super().summary(),
             "recordings": [recording.name for recording in self.recordings],
-            "warnings": list(self.warnings),
-            "prior": self.prior,
-            "data": self.data,
-            "combinations": list(self.combinations),
-            "restart": None if self.restart is None else self.restart.summary(),
-            "selection": None if self.selection is None else self.selection.summary(),
-            "controllers": [law.summary() for law in self.controllers],
-            "held": list(self.held),
-            "horizons": None if self.horizons is None else self.horizons.summary(),
-            "inverse_dynamics": (
-                None if self.inverse_dynamics is None else self.inverse_dynamics.summary()
-            ),
-            "draws": None if self.draws is None else self.draws.summary(),
-            "payload": None if self.payload is None else self.payload.summary(),
-            "recording_comparison": (
-                None if self.recording_comparison is None else self.recording_comparison.summary()
-            ),
-            "prior_directions": (
-                None if self.prior_directions is None else self.prior_directions.summary()
-            ),
         }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Restart:
+@record
+class Restart(Record):
     """Repetition of a fit that did not explain the recordings, from fits over short segments.
 
     Attributes:
@@ -310,6 +655,15 @@ class Restart:
     by_dynamics: bool = False
     starts: int = 1
 
+    in_json = (
+        "lengths",
+        "cost_before",
+        "cost",
+        "by_dynamics",
+        "starts",
+        "words",
+    )
+
     def __str__(self) -> str:
         lengths = join_names([f"{length:.2g}" for length in self.lengths])
         begin = (
@@ -327,20 +681,9 @@ class Restart:
             f"{self.cost:.6g}."
         )
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of `restart` in estimate.json."""
-        return {
-            "lengths": list(self.lengths),
-            "cost_before": self.cost_before,
-            "cost": self.cost,
-            "by_dynamics": self.by_dynamics,
-            "starts": self.starts,
-            "words": str(self),
-        }
 
-
-@dataclass(frozen=True, kw_only=True)
-class WorstResidual:
+@record
+class WorstResidual(Record):
     """Interval of a recording in which residuals are largest.
 
     Attributes:
@@ -365,19 +708,8 @@ class WorstResidual:
         size = f"{self.size:.2g} σ, {percent:.0f} % of the sum of squares"
         return f"largest residuals in {self.output}, {interval}: {size}"
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of `worst` in estimate.json."""
-        return {
-            "output": self.output,
-            "recording": self.recording,
-            "begin": self.begin,
-            "end": self.end,
-            "size": self.size,
-            "share": self.share,
-        }
 
-
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class PredictionErrors(SavedRecord):
     """Differences between a model's outputs and a recording.
 
@@ -394,11 +726,8 @@ class PredictionErrors(SavedRecord):
     rms: Array
     mae: Array
 
-    file_stem: ClassVar[str] = "prediction_errors"
-    made_by: ClassVar[str] = "PredictionErrors.save"
-
-    def __post_init__(self) -> None:
-        freeze(self, "rms", "mae")
+    file_stem = "prediction_errors"
+    made_by = "PredictionErrors.save"
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of prediction_errors.json."""
@@ -413,8 +742,8 @@ class PredictionErrors(SavedRecord):
         return dict(zip(self.outputs, errors.tolist(), strict=True))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Prediction:
+@record
+class Prediction(Record):
     """Prediction errors of the identified and of the nominal model on data that were not fitted.
 
     Attributes:
@@ -438,8 +767,11 @@ class Prediction:
     identified_outputs: Array = field(default_factory=lambda: np.zeros((0, 0)))
     nominal_outputs: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
-    def __post_init__(self) -> None:
-        freeze(self, "identified_outputs", "nominal_outputs")
+    in_json = (
+        "name",
+        "held_out",
+        "ratio",
+    )
 
     @property
     def ratio(self) -> float:
@@ -458,20 +790,18 @@ class Prediction:
         return float(np.exp(np.mean(log_ratios)))
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `predictions` in estimate.json."""
+        """The contents of the record in JSON."""
         return {
-            "name": self.name,
-            "held_out": self.held_out,
+            **super().summary(),
             "rms": self.identified.by_output(self.identified.rms),
             "mae": self.identified.by_output(self.identified.mae),
             "nominal_rms": self.nominal.by_output(self.nominal.rms),
             "nominal_mae": self.nominal.by_output(self.nominal.mae),
-            "ratio": self.ratio,
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Uncertainty:
+@record
+class Uncertainty(Record):
     """Robust uncertainty of the c unknowns that all recordings have in common [theta-unit].
 
     It allows for autocorrelated residuals and for recordings that disagree.
@@ -501,8 +831,8 @@ class Uncertainty:
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Whiteness:
+@record
+class Whiteness(Record):
     """Tests whether the whitened residuals of one output are white noise of unit variance.
 
     Attributes:
@@ -523,15 +853,3 @@ class Whiteness:
     p: float
     inflation: float
     time: float
-
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `whiteness` in estimate.json."""
-        return {
-            "output": self.output,
-            "count": self.count,
-            "variance": self.variance,
-            "correlation": self.correlation,
-            "p": self.p,
-            "inflation": self.inflation,
-            "time": self.time,
-        }

@@ -1,17 +1,20 @@
-"""Records of what a model offers to an experiment file: paths, names, values and units."""
+"""Records of what a model offers to an experiment file, and of what a correct file states."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import Any
+
+from mjfim.records.base import Record, record
+from mjfim.records.estimate import ControlLawInLoop
 
 # Kinds of entries, the names of the fields of `Inventory` that hold them.
 KINDS = ("parameters", "outputs", "actuators", "keyframes", "limits", "terms")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ListedParameter:
+@record
+class ListedParameter(Record):
     """A number of the model that a parameter can set.
 
     Attributes:
@@ -25,8 +28,8 @@ class ListedParameter:
     unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class ListedOutput:
+@record
+class ListedOutput(Record):
     """A number that can be measured.
 
     Attributes:
@@ -42,8 +45,8 @@ class ListedOutput:
     noise: float
 
 
-@dataclass(frozen=True, kw_only=True)
-class ListedActuator:
+@record
+class ListedActuator(Record):
     """An actuator.
 
     Attributes:
@@ -57,8 +60,8 @@ class ListedActuator:
     unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class ListedKeyframe:
+@record
+class ListedKeyframe(Record):
     """A keyframe, a possible initial state.
 
     Attributes:
@@ -74,8 +77,8 @@ class ListedKeyframe:
     ctrl: tuple[float, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class ListedLimit:
+@record
+class ListedLimit(Record):
     """A range of the MJCF, which a design keeps.
 
     Attributes:
@@ -93,8 +96,8 @@ class ListedLimit:
     unit: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class ListedTerm:
+@record
+class ListedTerm(Record):
     """A kind of physical term that an experiment file can add to the model.
 
     Attributes:
@@ -111,8 +114,8 @@ class ListedTerm:
     fields: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Inventory:
+@record
+class Inventory(Record):
     """Everything that an experiment file can name in a model.
 
     Attributes:
@@ -173,6 +176,88 @@ class Inventory:
         """Number of entries."""
         return sum(len(getattr(self, kind)) for kind in KINDS)
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of `mjfim list --json`."""
-        return asdict(self)
+
+@record
+class StatedParameter(Record):
+    """One unknown parameter.
+
+    Attributes:
+        name: Name of the parameter.
+        unit: Its unit; may be empty.
+        guess: Value for which designs are made [unit].
+        lower: Lower bound of the estimate, -inf without one [unit].
+        upper: Upper bound of the estimate, inf without one [unit].
+        nuisance: True where its accuracy is not optimised.
+    """
+
+    name: str
+    unit: str
+    guess: float
+    lower: float
+    upper: float
+    nuisance: bool
+
+
+@record
+class StatedOutput(Record):
+    """One measured output.
+
+    Attributes:
+        name: Column of recordings.
+        unit: Its unit; may be empty.
+        sigma: Standard deviation of its noise [unit].
+    """
+
+    name: str
+    unit: str
+    sigma: float
+
+
+@record
+class StatedLimit(Record):
+    """One limit that a design keeps.
+
+    Attributes:
+        quantity: What is limited, as the key of the table `limits`.
+        name: Name of the joint, the actuator or the tendon.
+        lower: Lower bound [unit of the quantity].
+        upper: Upper bound [unit of the quantity].
+        unit: Unit of the quantity; empty where the model does not determine it.
+    """
+
+    quantity: str
+    name: str
+    lower: float
+    upper: float
+    unit: str = ""
+
+
+@record
+class StatedExperiment(Record):
+    """Contents of a correct experiment file.
+
+    Attributes:
+        source: Path of the experiment file.
+        model: Path of the model file.
+        rate: Rate of the samples [Hz].
+        horizon: Duration of a designed experiment [s]; None where it is not stated.
+        parameters: The unknown parameters.
+        outputs: The measured outputs.
+        controls: Names of the controls.
+        limits: The limits of a design, the ranges of the MJCF among them.
+        controllers: The control laws, at the guess.
+        missing: Keys that `check` and `design` need and that the file does not state.
+        warnings: Numbers that are possible but probably not meant, in words.
+    """
+
+    source: str
+    model: str
+    rate: float
+    horizon: float | None
+    parameters: tuple[StatedParameter, ...]
+    outputs: tuple[StatedOutput, ...]
+    controls: tuple[str, ...]
+    limits: tuple[StatedLimit, ...]
+    controllers: tuple[ControlLawInLoop, ...]
+    missing: tuple[str, ...]
+    warnings: tuple[str, ...]

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import field
 
 import numpy as np
 
-from mjfim.arrays import Array, freeze
-from mjfim.records.shown import ShownRecord
+from mjfim.arrays import Array
+from mjfim.records.base import Record, ShownRecord, record
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EquationFit:
+@record
+class EquationFit(Record):
     """How well the fitted model explains one equation.
 
     Attributes:
@@ -44,30 +43,25 @@ class EquationFit:
     measured: Array
     explained: Array
 
-    def __post_init__(self) -> None:
-        freeze(self, "t", "measured", "explained")
+    in_json = (
+        "name",
+        "unit",
+        "residual",
+        "size",
+        "share",
+        "rows",
+        "cutoff",
+        "sigma",
+        "correlation",
+    )
 
     @property
     def share(self) -> float:
         """Residuals over the forces; NaN without any force."""
         return self.residual / self.size if self.size > 0.0 else float("nan")
 
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `equations` in inverse_dynamics.json."""
-        return {
-            "name": self.name,
-            "unit": self.unit,
-            "residual": self.residual,
-            "size": self.size,
-            "share": self.share,
-            "rows": self.rows,
-            "cutoff": self.cutoff,
-            "sigma": self.sigma,
-            "correlation": self.correlation,
-        }
 
-
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+@record
 class InverseDynamicsFit(ShownRecord):
     """Result of `mjfim.inverse_dynamics`: parameters fitted to the equation of motion.
 
@@ -114,35 +108,29 @@ class InverseDynamicsFit(ShownRecord):
     steps: int = 0
     sizes: Array = field(default_factory=lambda: np.zeros(0))
 
-    file_stem: ClassVar[str] = "inverse_dynamics"
-    made_by: ClassVar[str] = "`InverseDynamicsFit.save`"
-
-    def __post_init__(self) -> None:
-        freeze(self, "theta", "std", "covariance", "start", "sizes")
+    file_stem = "inverse_dynamics"
+    made_by = "`InverseDynamicsFit.save`"
+    in_json = (
+        "parameters",
+        "units",
+        "theta",
+        "std",
+        "covariance",
+        "start",
+        "equations",
+        "determined",
+        "undetermined",
+        "absent",
+        "condition",
+        "iterations",
+        "success",
+        "status",
+        "recording",
+        "seconds",
+        "steps",
+    )
 
     @property
     def degrees_of_freedom(self) -> tuple[EquationFit, ...]:
         """Equations of the degrees of freedom, without the laws of actuators."""
         return tuple(each for each in self.equations if not each.name.startswith("law of "))
-
-    def summary(self) -> dict[str, Any]:
-        """Return the contents of inverse_dynamics.json, and of this key in estimate.json."""
-        return {
-            "parameters": list(self.parameters),
-            "units": list(self.units),
-            "theta": self.theta,
-            "std": self.std,
-            "covariance": self.covariance,
-            "start": self.start,
-            "equations": [each.summary() for each in self.equations],
-            "determined": self.determined,
-            "undetermined": list(self.undetermined),
-            "absent": list(self.absent),
-            "condition": self.condition,
-            "iterations": self.iterations,
-            "success": self.success,
-            "status": self.status,
-            "recording": self.recording,
-            "seconds": self.seconds,
-            "steps": self.steps,
-        }

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from mjfim.errors import MjfimError
+from mjfim.records.base import Record, record
 
 
 def with_unit(name: str, unit: str) -> str:
@@ -17,8 +18,8 @@ def with_unit(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-@dataclass(frozen=True, kw_only=True)
-class Labels:
+@record
+class Labels(Record):
     """Labels of all columns that are shown, `<name> [<unit>]` unless stated otherwise.
 
     Attributes:

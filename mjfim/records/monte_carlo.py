@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
-from mjfim.arrays import Array, freeze
+from mjfim.arrays import Array
+from mjfim.records.base import Record, ShownRecord, record
 from mjfim.records.labels import Labels
-from mjfim.records.shown import ShownRecord
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class TrialStatistics:
+@record
+class TrialStatistics(Record):
     """Estimates from simulated recordings of one trajectory, and the Cramér-Rao bound.
 
     Attributes:
@@ -37,11 +36,8 @@ class TrialStatistics:
     failed: int
     seconds: float = 0.0
 
-    def __post_init__(self) -> None:
-        freeze(self, "estimates", "mean", "covariance", "crlb", "efficiency", "efficiency_interval")
 
-
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class MonteCarloStudy(ShownRecord):
     """Result of `mjfim.monte_carlo`: statistics of estimates along one or more trajectories.
 
@@ -61,11 +57,8 @@ class MonteCarloStudy(ShownRecord):
     information: dict[str, Array]
     labels: Labels | None = None
 
-    file_stem: ClassVar[str] = "montecarlo"
-    made_by: ClassVar[str] = "`mjfim montecarlo EXPERIMENT DESIGN.npz -o DIR`"
-
-    def __post_init__(self) -> None:
-        freeze(self, "theta")
+    file_stem = "montecarlo"
+    made_by = "`mjfim montecarlo EXPERIMENT DESIGN.npz -o DIR`"
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of montecarlo.json."""

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, freeze
-from mjfim.records.combinations import join_names
+from mjfim.arrays import Array
+from mjfim.records.base import Record, record
+from mjfim.records.check import join_names
 
 # Axes of the frame of a body.
 AXES = ("x", "y", "z")
+
 
 # Largest number of decimal places that are shown; smaller numbers have an exponent.
 MOST_PLACES = 5
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PayloadEstimate:
+@record
+class PayloadEstimate(Record):
     """Mass, centre of mass and rotational inertia of a payload. Intervals are those of 95 %.
 
     Attributes:
@@ -51,8 +52,21 @@ class PayloadEstimate:
     held: tuple[str, ...] = ()
     source: str = ""
 
-    def __post_init__(self) -> None:
-        freeze(self, "mass_interval", "centre", "centre_interval", "inertia_interval")
+    in_json = (
+        "body",
+        "is_seen",
+        "mass",
+        "mass_interval",
+        "centre",
+        "centre_interval",
+        "undetermined",
+        "inertia",
+        "inertia_interval",
+        "edge",
+        "known",
+        "held",
+        "source",
+    )
 
     @property
     def is_seen(self) -> bool:
@@ -125,23 +139,11 @@ class PayloadEstimate:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of `payload` in estimate.json."""
+        """The contents of the record in JSON."""
         return {
+            **super().summary(),
             "words": f"{self}.",
-            "body": self.body,
-            "is_seen": self.is_seen,
-            "mass": self.mass,
-            "mass_interval": self.mass_interval,
-            "centre": self.centre,
-            "centre_interval": self.centre_interval,
-            "undetermined": list(self.undetermined),
-            "inertia": self.inertia,
-            "inertia_interval": self.inertia_interval,
             "inertia_is_assumed": self.edge is not None,
-            "edge": self.edge,
-            "known": list(self.known),
-            "held": list(self.held),
-            "source": self.source,
         }
 
 

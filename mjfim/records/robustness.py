@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from mjfim.amounts import MAX_NOISE, MAX_WRONG
-from mjfim.arrays import Array, freeze
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import ExperimentError
-from mjfim.records.intervals import NORMAL_95
-from mjfim.records.shown import ShownRecord
+from mjfim.records.base import Record, ShownRecord, record
 
 # Probability with which the intervals and joint regions should hold the true values.
 CONFIDENCE = 0.95
 
+
 # Required fraction of robots whose interval contains the true value, for every parameter.
 REQUIRED_COVERAGE = 0.90
 
+
 # Default delay of the control of a simulated robot [s]; it is rounded up to whole timesteps.
 LATENCY = 5e-3
+
 
 # Smallest reserve, as a fraction of half a range; smaller values are round-off.
 MIN_RESERVE = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotConditions:
+@record
+class RobotConditions(Record):
     """Differences between the simulated robots and the model.
 
     Attributes:
@@ -61,8 +62,8 @@ class RobotConditions:
             raise ExperimentError(f"latency: {self.latency:g} is not a finite number of at least 0")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RobotRun:
+@record
+class RobotRun(Record):
     """One simulated robot on which the design was played, and the estimate from its recording.
 
     Attributes:
@@ -86,9 +87,6 @@ class RobotRun:
     restarted: bool = False
     trouble: str = ""
 
-    def __post_init__(self) -> None:
-        freeze(self, "theta", "estimate", "covariance", "margins")
-
     @property
     def std(self) -> Array:
         """(p,) formal standard deviations of the estimate [theta-unit]."""
@@ -110,8 +108,8 @@ class RobotRun:
         return float(error @ np.linalg.solve(covariance, error))
 
 
-@dataclass(frozen=True, kw_only=True)
-class AssessedLimit:
+@record
+class AssessedLimit(Record):
     """A limit whose margin is evaluated on every robot.
 
     Attributes:
@@ -131,7 +129,7 @@ class AssessedLimit:
     scale: float
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class Robustness(ShownRecord):
     """Result of a robustness study with n robots, g of which could be identified.
 
@@ -174,11 +172,22 @@ class Robustness(ShownRecord):
     restarted: int
     troubles: dict[str, int]
 
-    file_stem: ClassVar[str] = "playback"
-    made_by: ClassVar[str] = "`mjfim robustness EXPERIMENT -o DIR`"
-
-    def __post_init__(self) -> None:
-        freeze(self, "wrong", "z", "error", "std", "predicted", "margins", "planned")
+    file_stem = "playback"
+    made_by = "`mjfim robustness EXPERIMENT -o DIR`"
+    in_json = (
+        "ok",
+        "conditions",
+        "runs",
+        "fit",
+        "misfits",
+        "restarted",
+        "troubles",
+        "all_kept",
+    )
+    json_names = {
+        "restarted": "begun_again",
+        "all_kept": "all_limits_kept",
+    }
 
     @property
     def runs(self) -> int:
@@ -255,18 +264,11 @@ class Robustness(ShownRecord):
         return {kind: float(np.ceil(100.0 * share) / 100.0) for kind, share in needed.items()}
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of playback.json."""
+        """The contents of the record in JSON."""
         return {
-            "ok": self.ok,
-            "conditions": asdict(self.conditions),
-            "runs": self.runs,
+            **super().summary(),
             "parameters": [self._parameter_summary(j) for j in range(len(self.names))],
             "joint": {"parameters": self.joint[0], "all": self.joint[1]},
-            "fit": self.fit,
-            "misfits": self.misfits,
-            "begun_again": self.restarted,
-            "troubles": self.troubles,
-            "all_limits_kept": self.all_kept,
             "limits": [self._limit_summary(i) for i in range(len(self.limits))],
             "reserve": self.reserve(),
         }

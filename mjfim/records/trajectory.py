@@ -1,23 +1,19 @@
-"""Records of a trajectory, its linearisation, and its sensitivity to the parameters.
-
-The letters are those of the paper: `x` state, `u` control, `theta` parameters, `psi` sensitivity
-dx/dtheta, `I` Fisher information. The sizes are N samples; nq, nv, na and nu as in MuJoCo;
-`nx = 2 nv + na` for the tangent space; ny outputs; p parameters. Arrays are read-only.
-"""
+"""Records of trajectories, their derivatives, and measurements along them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array, freeze
-from mjfim.records.serialization import SavedRecord
+from mjfim.arrays import Array
+from mjfim.errors import RecordingError
+from mjfim.records.base import Record, SavedRecord, record
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+@record
 class Trajectory(SavedRecord):
     """A feasible curve (x, u) of the plant: `x_{k+1} = F(x_k, u_k, theta)`.
 
@@ -35,11 +31,12 @@ class Trajectory(SavedRecord):
     act: Array
     ctrl: Array
 
-    file_stem: ClassVar[str] = "trajectory"
-    made_by: ClassVar[str] = "Trajectory.save"
-
-    def __post_init__(self) -> None:
-        freeze(self, "t", "qpos", "qvel", "act", "ctrl")
+    file_stem = "trajectory"
+    made_by = "Trajectory.save"
+    in_json = (
+        "samples",
+        "dt",
+    )
 
     @property
     def samples(self) -> int:
@@ -67,10 +64,9 @@ class Trajectory(SavedRecord):
         return same_control and np.array_equal(self.state, other.state)
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of trajectory.json."""
+        """The contents of the record in JSON."""
         return {
-            "samples": self.samples,
-            "dt": self.dt,
+            **super().summary(),
             "nq": self.qpos.shape[1],
             "nv": self.qvel.shape[1],
             "na": self.act.shape[1],
@@ -78,8 +74,8 @@ class Trajectory(SavedRecord):
         }
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Linearization:
+@record
+class Linearization(Record):
     """First derivatives along a trajectory, in the tangent space of the state.
 
     Attributes:
@@ -98,12 +94,9 @@ class Linearization:
     D: Array
     H: Array
 
-    def __post_init__(self) -> None:
-        freeze(self, "A", "B", "E", "C", "D", "H")
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Sensitivity:
+@record
+class Sensitivity(Record):
     """First derivatives of a trajectory with respect to the parameters, at fixed control.
 
     Attributes:
@@ -116,9 +109,6 @@ class Sensitivity:
     G: Array
     is_lumped: bool = False
 
-    def __post_init__(self) -> None:
-        freeze(self, "psi", "G")
-
     def of_parameters(self, chosen: Sequence[int]) -> Sensitivity:
         """The derivatives with respect to some of the parameters.
 
@@ -126,3 +116,78 @@ class Sensitivity:
             chosen: Indices of the parameters, in their new order.
         """
         return Sensitivity(psi=self.psi[:, :, chosen], G=self.G[:, :, chosen])
+
+
+@record
+class Recording(SavedRecord):
+    """Measured or simulated outputs under a known control, at the times of the log.
+
+    Attributes:
+        t: (M,) increasing times [s]; the intervals may differ.
+        ctrl: (M-1, nu) controls, held from each row to the next [unit of the actuator].
+        y: (M, ny) measured outputs in the order of `outputs` [unit of the output]; NaN where an
+            output was not measured.
+        outputs: Names of the ny outputs: `qpos:<joint>`, `qvel:<joint>` or the name of a sensor.
+        name: Name of the recording in messages, usually its file.
+    """
+
+    t: Array
+    ctrl: Array
+    y: Array
+    outputs: tuple[str, ...]
+    name: str = "recording"
+
+    file_stem = "recording"
+    made_by = "Recording.save"
+    in_json = (
+        "name",
+        "outputs",
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("t", "y"):
+            if np.asarray(getattr(self, name)).dtype == np.bool_:
+                raise RecordingError(
+                    f"{self.name}: {name!r} holds truth values (True and False), which are no "
+                    "measurement; give an array of numbers"
+                )
+
+    def first_rows(self, count: int) -> Recording:
+        """The recording without the rows after the first ones.
+
+        Args:
+            count: Number of rows that remain, at least 2; a shorter recording is unchanged.
+        """
+        if len(self.t) <= count:
+            return self
+        return replace(self, t=self.t[:count], ctrl=self.ctrl[: count - 1], y=self.y[:count])
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON."""
+        return {
+            **super().summary(),
+            "rows": len(self.t),
+            "nu": self.ctrl.shape[1],
+        }
+
+
+@record
+class Playback(Record):
+    """A design at the controller's rate, with M rows of control and the final state.
+
+    Attributes:
+        t: (M+1,) times [s].
+        state: (M+1, nq+nv+na) planned positions, velocities and activations.
+        ctrl: (M, nu) controls, held over each row [unit of the actuator].
+        gain: (M, nu, nx) feedback gains K, held over each sample of the design [u-unit / x-unit].
+    """
+
+    t: Array
+    state: Array
+    ctrl: Array
+    gain: Array
+
+    @property
+    def period(self) -> float:
+        """Sample period of the controller [s]."""
+        return float(self.t[-1] - self.t[0]) / len(self.ctrl)

@@ -17,7 +17,6 @@ from mjfim.errors import (
     ExperimentError,
     MjfimError,
     SimulationDivergedError,
-    explain_renamed_arguments,
     listed,
 )
 from mjfim.excitation.design import design_budget, design_task
@@ -33,9 +32,8 @@ from mjfim.parallel import ExecutorLike, Workers
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
-from mjfim.records.events import Callback, StudyEvent
-from mjfim.records.progress import shown_progress
-from mjfim.records.recording import Recording
+from mjfim.records.events import Callback, StudyEvent, shown_progress
+from mjfim.records.trajectory import Recording
 from mjfim.studies.redesign import CampaignHistory, redesign, restate_experiment
 
 # A round makes no progress where the largest ratio of sigma to target stays above this share of the
@@ -50,7 +48,6 @@ SUSPICIOUS_CHANGE = 4.0
 Measure = Callable[[Design, int], Recording | Sequence[Recording] | None]
 
 
-@explain_renamed_arguments
 def run_campaign(
     experiment: Experiment,
     measure: Measure,

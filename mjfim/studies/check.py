@@ -39,13 +39,14 @@ from mjfim.records.check import (
     Check,
     ConfoundedPair,
     ParameterCheck,
+    ParameterGroup,
     SelfTest,
+    groups_in_words,
+    join_names,
 )
-from mjfim.records.combinations import ParameterGroup, groups_in_words, join_names
 from mjfim.records.design import CombinationAccuracy
-from mjfim.records.progress import begin_stage, shown_progress
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.events import begin_stage, shown_progress
+from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies.derivative_test import self_test
 from mjfim.studies.design_outlook import DesignOutlook
 from mjfim.studies.probe_workers import ProbeWorkers

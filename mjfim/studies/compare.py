@@ -13,7 +13,6 @@ from mjfim.errors import (
     ExperimentError,
     NoResultError,
     SimulationDivergedError,
-    explain_renamed_arguments,
     listed,
     unknown,
 )
@@ -32,8 +31,7 @@ from mjfim.information.identifiability import Identifiability
 from mjfim.parallel import ExecutorLike, Workers
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
-from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
-from mjfim.records.progress import shown_progress
+from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.baselines.methods import METHODS, run_baseline
 from mjfim.studies.baselines.parts import PartsOfBaseline
@@ -57,7 +55,6 @@ UNLIMITED_ITERATIONS = 100_000
 Progress = Callable[[float, float], None]
 
 
-@explain_renamed_arguments
 def compare(
     experiment: Experiment,
     *,

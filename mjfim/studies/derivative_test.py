@@ -23,7 +23,7 @@ from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.records.check import SelfTest
-from mjfim.records.progress import begin_stage
+from mjfim.records.events import begin_stage
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 # Steps along the tested curve, in units of the plant's difference steps. The smaller error of the

@@ -16,16 +16,15 @@ import scipy
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, explain_renamed_arguments
+from mjfim.errors import ExperimentError
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.information.identifiability import require_visible
 from mjfim.memory import NUMBER_BYTES, require_memory
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
-from mjfim.records.events import Callback, StudyEvent
+from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
-from mjfim.records.progress import shown_progress
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.trial_chunks import (
     TrialSet,
@@ -60,7 +59,6 @@ CHUNKS = 10
 CHUNK_STEPS = 1e6
 
 
-@explain_renamed_arguments
 def monte_carlo(
     experiment: Experiment,
     trajectory: Trajectory | Mapping[str, Trajectory],

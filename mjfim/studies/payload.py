@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, explain_renamed_arguments, listed
+from mjfim.errors import ExperimentError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.honest_covariance import honest_covariance
@@ -29,10 +29,9 @@ from mjfim.identification.task import FitTask
 from mjfim.model.terms.base import AXES
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Estimate
-from mjfim.records.intervals import NORMAL_95
+from mjfim.records.events import begin_stage, shown_progress
 from mjfim.records.payload import PayloadEstimate
-from mjfim.records.progress import begin_stage, shown_progress
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.studies.payload_experiment import (
     KIND,
     PayloadPlace,
@@ -85,7 +84,6 @@ class IdentifiedPayload:
     system: System
 
 
-@explain_renamed_arguments
 def identify_payload(
     experiment: Experiment,
     recordings: Sequence[Recording],

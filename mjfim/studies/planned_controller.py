@@ -12,7 +12,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
 from mjfim.plant.state_space import StateSpace
-from mjfim.records.playback import Playback
+from mjfim.records.trajectory import Playback
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -28,8 +28,8 @@ from mjfim.model.coordinates import tangent_names
 from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.estimate import Estimate
-from mjfim.records.recording import Recording
 from mjfim.records.robustness import RobotConditions, RobotRun
+from mjfim.records.trajectory import Recording
 from mjfim.studies.planned_controller import PlannedController, sensed_entries
 
 # Largest number of attempts to draw a robot whose bodies are physical.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from mjfim.arrays import Array
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.errors import ExperimentError, first_ones
 from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.identification.honest_covariance import (
@@ -21,11 +21,10 @@ from mjfim.identification.honest_covariance import (
     stretched_formal_covariance,
 )
 from mjfim.identification.random_effects import between_variance, f_tail, satterthwaite
-from mjfim.records.combinations import join_names
+from mjfim.records.check import join_names
 from mjfim.records.estimate import Estimate
-from mjfim.records.intervals import NORMAL_95
-from mjfim.records.recording import Recording
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
+from mjfim.records.trajectory import Recording
 
 # Probability to find any difference where there is none.
 LEVEL = 0.05

@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import (
     NoResultError,
-    explain_renamed_arguments,
 )
 from mjfim.excitation.limits import Limit
 from mjfim.experiment.packing import for_workers
@@ -28,8 +27,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.parallel import ExecutorLike, pool_stop_token, results_or_here
 from mjfim.parallel.kept import KeptPerThread
-from mjfim.records.events import Callback, StudyEvent
-from mjfim.records.progress import shown_progress
+from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.robustness import (
     CONFIDENCE,
     LATENCY,
@@ -41,7 +39,6 @@ from mjfim.records.robustness import (
 from mjfim.studies.robot_bench import RobotBench
 
 
-@explain_renamed_arguments
 def assess_robustness(
     experiment: Experiment,
     design: str | Path,

@@ -19,13 +19,14 @@ from mjfim.identification.missing_terms import TermTests
 from mjfim.identification.report import FitResult
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate
-from mjfim.records.missing_term import MissingTerm, TermParameter
-from mjfim.records.selection import (
+from mjfim.records.terms import (
     Decision,
+    MissingTerm,
     PooledParameter,
     SelectedTerm,
     Selection,
     SelectionStep,
+    TermParameter,
 )
 from mjfim.studies.simplification import simplified_experiment
 

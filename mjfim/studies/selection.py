@@ -34,17 +34,17 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.records.estimate import Estimate
-from mjfim.records.missing_term import MissingTerm
-from mjfim.records.progress import begin_stage, shown_progress
-from mjfim.records.recording import Recording
-from mjfim.records.selection import (
+from mjfim.records.events import begin_stage, shown_progress
+from mjfim.records.terms import (
     AlternativeTerm,
     Decision,
     HeldOutRefit,
+    MissingTerm,
     SelectedTerm,
     Selection,
     SelectionStep,
 )
+from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import (
     FittedModel,
     as_recorded,

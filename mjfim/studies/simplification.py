@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.experiment.schema import Experiment
 from mjfim.model.parameters import Parameter, ParameterSet
 from mjfim.model.paths import ParameterPath
-from mjfim.records.selection import PooledParameter
+from mjfim.records.terms import PooledParameter
 
 # Smallest number of parameters that are pooled.
 MIN_MEMBERS = 2

@@ -8,7 +8,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
 from mjfim.identification.laws_in_loop import laws_in_loop
-from mjfim.records.stated_experiment import (
+from mjfim.records.inventory import (
     StatedExperiment,
     StatedLimit,
     StatedOutput,

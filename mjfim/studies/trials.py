@@ -27,7 +27,7 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares, newton_raphson
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Length of the last step, in standard deviations, below which a trial has converged.
 CONVERGED_STEP = 0.03

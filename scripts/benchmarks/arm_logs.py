@@ -50,10 +50,10 @@ from rich.console import Console
 from rich.progress import track
 
 import mjfim
-from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.budget import Budget
 from mjfim.experiment.system import System
+from mjfim.files import replacing
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import fit_task, identify_system
 from mjfim.identification.linear_coordinates import LinearCoordinates
@@ -64,8 +64,7 @@ from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.inertia_distance import barycentric_of, logcholesky_factor
 from mjfim.parallel import cores, one_blas_thread
 from mjfim.records.estimate import Estimate, Whiteness
-from mjfim.records.intervals import NORMAL_95
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.studies.selection import select_terms_system
 from scripts.benchmarks.arm_models import LAWS, TIMESTEP, Arm, panda, ur5e
 

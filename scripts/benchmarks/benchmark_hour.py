@@ -34,7 +34,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output.archive import write_recording
 from mjfim.parallel import cores
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.signals import multisine
 from scripts.benchmarks.child import ROOT, CommandRun, run_command
 

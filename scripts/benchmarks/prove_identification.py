@@ -28,13 +28,12 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.excitation.task import DesignTask
+from mjfim.files import replacing
 from mjfim.identification.identify import identify_system
 from mjfim.parallel import cores
-from mjfim.records.intervals import NORMAL_95
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]

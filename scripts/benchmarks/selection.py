@@ -32,9 +32,9 @@ from rich.progress import track
 from rich.table import Table
 
 import mjfim
-from mjfim.atomic_io import replacing
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.files import replacing
 from mjfim.parallel import cores
 from mjfim.records.estimate import Estimate
 

@@ -37,14 +37,14 @@ from rich.table import Table
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
+from mjfim.files import replacing
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system, least_squares
 from mjfim.output.sysid.sequences import export, silenced
 from mjfim.parallel import cores
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.signals import multisine
 
 # Top folder of the repository.

@@ -23,7 +23,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import stated_control
 from mjfim.experiment.system import System
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.cli import write_experiment
 
 START = '{ kind = "sine" }'

@@ -23,8 +23,7 @@ from mjfim.cli.common import (
 from mjfim.excitation.task import DesignTask
 from mjfim.output.progress_text import design_stage, design_text
 from mjfim.records.design import HistoryRow
-from mjfim.records.events import DesignEvent, StudyEvent
-from mjfim.records.progress import begin_stage, stages_observed_by
+from mjfim.records.events import DesignEvent, StudyEvent, begin_stage, stages_observed_by
 from mjfim.studies.check import check_task
 from tests.support.paths import MODELS
 

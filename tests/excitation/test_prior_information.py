@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,20 +23,17 @@ def information(seed: int, size: int) -> Array:
 
 def design_file(path: Path, names: list[str], matrix: Array, prior: Array | None = None) -> Path:
     """A design.json with the entries that `earlier` reads."""
-    values: dict[str, Any] = {"parameters": names, "final": {"information": matrix.tolist()}}
-    if prior is not None:
-        values["prior"] = prior.tolist()
+    prior = np.zeros_like(matrix) if prior is None else prior
+    values = {"parameters": names, "data": (matrix - prior).tolist(), "prior": prior.tolist()}
     path.write_text(json.dumps(values), encoding="utf-8")
     return path
 
 
 def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
-    """The names may be in any order; a design has its information, an estimate its covariance."""
+    """The names may be in any order."""
     first, second = information(0, 2), information(1, 2)
     design = design_file(tmp_path / "design.json", ["b", "a"], first)
-    estimate = tmp_path / "estimate.json"
-    values = {"parameters": ["c", "a"], "covariance": np.linalg.inv(second).tolist()}
-    estimate.write_text(json.dumps(values), encoding="utf-8")
+    estimate = design_file(tmp_path / "estimate.json", ["c", "a"], second)
     wanted = np.zeros((3, 3))
     wanted[np.ix_([1, 0], [1, 0])] += first
     wanted[np.ix_([2, 0], [2, 0])] += second
@@ -92,49 +88,18 @@ def test_deviations_of_the_initial_state_belong_to_one_experiment(tmp_path: Path
     np.testing.assert_allclose(found[np.ix_([0, 2], [0, 2])], marginal, rtol=1e-11)
 
 
-FAULTS: dict[str, tuple[str, str]] = {
-    "not JSON": ("{", "neither a design.json nor an estimate.json"),
-    "a list": ("[1, 2]", "neither a design.json nor an estimate.json"),
-    "no parameters": ('{"covariance": [[1.0]]}', "neither a design.json nor an estimate.json"),
-    "a study": (
-        '{"parameters": ["a"], "theta": [1.0]}',
-        "neither a design.json nor an estimate.json",
-    ),
-    "no information": (
-        '{"parameters": ["a"], "final": {}}',
-        "neither a design.json nor an estimate.json",
-    ),
-    "final is no table": (
-        '{"parameters": ["a"], "final": 3}',
-        "neither a design.json nor an estimate.json",
-    ),
-    "singular covariance": (
-        '{"parameters": ["a"], "covariance": [[0.0]]}',
-        "neither a design.json nor an estimate",
-    ),
-    "text": (
-        '{"parameters": ["a"], "final": {"information": [["many"]]}}',
-        "neither a design.json nor",
-    ),
-    "ragged": (
-        '{"parameters": ["a", "b"], "final": {"information": [[1.0], [1.0, 2.0]]}}',
-        "neither a design.json",
-    ),
-    "unknown": ('{"parameters": ["a"], "covariance": [[null]]}', "not 1 x 1 finite numbers"),
-    "infinite": (
-        '{"parameters": ["a"], "final": {"information": [[null]]}}',
-        "not 1 x 1 finite numbers",
-    ),
-    "wrong size": (
-        '{"parameters": ["a", "b"], "final": {"information": [[1.0]]}}',
-        "not 2 x 2 finite numbers",
-    ),
-    "wrong prior": (
-        '{"parameters": ["a"], "final": {"information": [[1.0]]}, "prior": [1, 2]}',
-        "not 1 x 1 finite",
-    ),
+FAULTS = {
+    "not JSON": ("{", "not a JSON file"),
+    "a list": ("[1, 2]", "not a JSON object"),
+    "no parameters": ('{"data": [[1.0]], "prior": [[0.0]]}', "neither a design.json nor"),
+    "no information": ('{"parameters": ["a"], "prior": [[0.0]]}', "neither a design.json nor"),
+    "text": ('{"parameters": ["a"], "data": [["many"]], "prior": [[0]]}', "neither a design.json"),
+    "ragged": ('{"parameters": ["a", "b"], "data": [[1], [1, 2]], "prior": []}', "neither a"),
+    "infinite": ('{"parameters": ["a"], "data": [[null]], "prior": [[0]]}', "not 1 x 1 finite"),
+    "wrong size": ('{"parameters": ["a", "b"], "data": [[1]], "prior": [[0]]}', "not 2 x 2"),
+    "wrong prior": ('{"parameters": ["a"], "data": [[1.0]], "prior": [1, 2]}', "not 1 x 1 finite"),
     "strangers": (
-        '{"parameters": ["x", "y"], "final": {"information": [[1, 0], [0, 1]]}}',
+        '{"parameters": ["x", "y"], "data": [[1, 0], [0, 1]], "prior": [[0, 0], [0, 0]]}',
         r"information about x, y, but .* a, b",
     ),
 }

@@ -890,7 +890,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "earlier that is no file of ours": (
         'earlier = ["cart_pendulum.csv"]\n' + SHORT,
         E,
-        [HOME, "earlier", "cart_pendulum.csv", "neither a design.json"],
+        [HOME, "earlier", "cart_pendulum.csv", "not a JSON file"],
     ),
     # limits
     "position limits inverted": (

@@ -14,7 +14,7 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from mjfim.atomic_io import replacing
+from mjfim.files import replacing
 from mjfim.output import plots
 from tests.fuzz.bad_inputs import Call, bad_input
 from tests.fuzz.faults import fault

@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-# Temporary files of `mjfim.atomic_io`: a dot, the stem of the final name, a dash, random letters.
+# Temporary files of `mjfim.files`: a dot, the stem of the final name, a dash, random letters.
 TEMPORARY = re.compile(r"^\..+[-_][a-z0-9_]{8}(\.[a-z.]+)?$")
 
 # A picture of one pixel, which stands for the figures where drawing them takes too long.

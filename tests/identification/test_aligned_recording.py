@@ -21,7 +21,7 @@ from mjfim.identification.aligned_recording import (
     resample_control,
 )
 from mjfim.plant.delay import OutputDelay
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array, body_task, cart_task
 
 DT = 0.01

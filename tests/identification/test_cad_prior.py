@@ -22,7 +22,7 @@ from mjfim.identification.report import _implausible_estimates
 from mjfim.identification.task import FitTask
 from mjfim.model.inertia_distance import logcholesky_factor
 from mjfim.optimize.condensed_least_squares import Step
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.hinged_arm import arm_experiment, arm_log
 from tests.support.numerics import Array
 

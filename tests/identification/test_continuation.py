@@ -33,7 +33,7 @@ from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution, minimis
 from mjfim.plant.noise import Noise
 from mjfim.records.estimate import Estimate, Restart
 from mjfim.records.events import FitEvent
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # A pendulum that swings about once per second, measured with an error of 0.01 rad.
 PENDULUM = """<mujoco>

@@ -21,7 +21,7 @@ from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import least_squares
 from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings.read import read_recording
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
 from tests.support.executors import LosingThreads
 from tests.support.paths import MODELS, SHARED_DATA, SHARED_MODELS

@@ -15,7 +15,7 @@ from mjfim.identification.data_parts import DataPart, part_of_data
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
-from mjfim.records.missing_term import TermTestData
+from mjfim.records.terms import TermTestData
 from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum
 
 RATE = 100.0

@@ -13,7 +13,7 @@ from mjfim.experiment.system import System
 from mjfim.output.report.build import page_of
 from mjfim.output.summaries.estimate import describe_estimate
 from mjfim.records.estimate import Estimate
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.identification.test_inverse_dynamics import STATE, cart, cart_log
 
 

@@ -19,7 +19,7 @@ from mjfim.identification.fit_quality import fit_quality
 from mjfim.identification.task import FitTask
 from mjfim.output.archive import write_recording
 from mjfim.recordings.read import read_recording
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.paths import MODELS
 
 

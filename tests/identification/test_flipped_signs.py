@@ -12,7 +12,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT
 
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.arrays import NORMAL_95
 from mjfim.excitation import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification.honest_covariance import (
@@ -20,9 +21,7 @@ from mjfim.identification.honest_covariance import (
     stretched_formal_covariance,
     with_honest_covariance,
 )
-from mjfim.records.estimate import Uncertainty
-from mjfim.records.horizons import HorizonStudy
-from mjfim.records.intervals import NORMAL_95
+from mjfim.records.estimate import HorizonStudy, Uncertainty
 from tests.identification.test_parameter_draws import COVARIANCE, STD, estimated, stated
 from tests.support.numerics import Array
 

@@ -18,8 +18,8 @@ from mjfim.identification.horizons import HorizonChoice, _chosen, choose_horizon
 from mjfim.identification.identify import DIVERGED
 from mjfim.identification.searches import FitSearch
 from mjfim.output.summaries.horizons import describe_horizons
-from mjfim.records.horizons import HorizonStudy
-from mjfim.records.recording import Recording
+from mjfim.records.estimate import HorizonStudy
+from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT
 
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}

@@ -27,7 +27,7 @@ from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.output.summaries.verdicts import verdict_of
 from mjfim.records.events import FitEvent
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.studies.campaign import identify_all
 from tests.support.dense_residuals import dense_residuals
 from tests.support.numerics import make_task

@@ -15,7 +15,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.inverse_dynamics import inverse_dynamics
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.signals import multisine
 from tests.support.hinged_arm import arm_experiment, arm_log
 from tests.support.numerics import CART_PENDULUM, Array

@@ -16,7 +16,7 @@ from mjfim.identification import missing_terms
 from mjfim.identification.candidates import Candidate, CandidateParameter
 from mjfim.identification.identify import identify_system
 from mjfim.identification.task import FitTask
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array
 from tests.support.paths import ROOT
 from tests.support.terms import experiment_of, motor_torque, recorded, write_pendulum

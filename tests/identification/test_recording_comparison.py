@@ -16,8 +16,8 @@ from mjfim.identification.independent_blocks import (
     recording_evidence,
 )
 from mjfim.identification.recording_comparison import compare_evidence
-from mjfim.records.recording import Recording
-from mjfim.records.recording_comparison import RecordingComparison
+from mjfim.records.robots import RecordingComparison
+from mjfim.records.trajectory import Recording
 from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
 from tests.support.numerics import Array
 from tests.support.paths import MODELS

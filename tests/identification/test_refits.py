@@ -19,7 +19,7 @@ from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.searches import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.records.events import FitEvent
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT
 from tests.support.terms import experiment_of, motor_torque, recorded
 

@@ -9,7 +9,7 @@ import pytest
 
 from mjfim.errors import RecordingError
 from mjfim.identification.same_data import refuse_same_data
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 
 def recording(seed: int = 0, name: str = "a.csv") -> Recording:

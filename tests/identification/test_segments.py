@@ -20,7 +20,7 @@ from mjfim.identification.segments import (
     measured_initial_states,
     whole_recordings,
 )
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array, body_task, cart_task
 
 HORIZON = 2.0

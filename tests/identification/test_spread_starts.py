@@ -11,7 +11,7 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.spread_starts import SPREAD_STARTS, spread_starts
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.identification.test_inverse_dynamics import CART, cart, cart_log
 
 # The angle alone tells enough of the motion, but there is no equation of motion without the cart.

@@ -16,7 +16,7 @@ from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedErro
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_task
 from mjfim.identification.task import FitTask
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.paths import MODELS
 
 MINIMAL = f"""

@@ -21,8 +21,8 @@ from mjfim.identification.missing_terms import (
     in_groups,
 )
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
-from mjfim.records.missing_term import MissingTerm, TermParameter
-from mjfim.records.recording import Recording
+from mjfim.records.terms import MissingTerm, TermParameter
+from mjfim.records.trajectory import Recording
 from mjfim.signals import multisine
 from mjfim.studies.selected_models import selected_term
 from tests.support.numerics import Array

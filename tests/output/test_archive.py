@@ -20,20 +20,17 @@ import pytest
 from numpy.typing import NDArray
 
 import mjfim
-from mjfim.atomic_io import PREFIX, replacing
 from mjfim.errors import ModelError, RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.files import PREFIX, as_json, replacing
 from mjfim.identification.identify import identify_system
 from mjfim.output import archive
 from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings import read as logs
-from mjfim.records.design import Design
-from mjfim.records.iterates import MAX_MOTIONS, MOTION_SAMPLES
-from mjfim.records.recording import Recording
-from mjfim.records.serialization import as_json
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.design import MAX_MOTIONS, MOTION_SAMPLES, Design
+from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies.monte_carlo import monte_carlo_system
 from tests.support.paths import MODELS
 
@@ -117,7 +114,7 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
         "record": (),
     }
     assert kinds == {np.dtype("float64")}
-    assert kinds_of_motions == {np.dtype("float32")}
+    assert kinds_of_motions == {np.dtype("float64")}
     assert np.array_equal(psi, design.initial.sensitivity)
 
 

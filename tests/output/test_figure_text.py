@@ -19,14 +19,19 @@ from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.check import Check, ParameterCheck, SelfTest
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome
 from mjfim.records.design import CombinationAccuracy, Design, LimitUsage
-from mjfim.records.estimate import Estimate, Prediction, PredictionErrors, Whiteness
-from mjfim.records.horizons import HorizonStudy
+from mjfim.records.estimate import (
+    Estimate,
+    HorizonStudy,
+    ParameterDraws,
+    Prediction,
+    PredictionErrors,
+    Whiteness,
+)
 from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
 from mjfim.records.labels import Labels
-from mjfim.records.parameter_draws import ParameterDraws
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
-from mjfim.records.selection import Decision, Selection, SelectionStep
+from mjfim.records.terms import Decision, Selection, SelectionStep
 from tests.support.figure_text import misplaced_texts
 from tests.support.made_records import (
     make_comparison,

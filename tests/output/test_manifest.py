@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mjfim.atomic_io import remove_earlier_result, replacing
 from mjfim.errors import OutputError
+from mjfim.files import remove_earlier_result, replacing
 from mjfim.output.file_lock import FileLock
 from mjfim.output.manifest import (
     FOLDER_LOCK,

@@ -13,7 +13,7 @@ import pytest
 import mjfim
 from mjfim.output import notebook_progress
 from mjfim.output.notebook_progress import NotebookProgress
-from mjfim.records import progress
+from mjfim.records import events
 from mjfim.records.events import Event, FitEvent, StudyEvent
 from tests.support.paths import MODELS
 
@@ -38,7 +38,7 @@ def places(monkeypatch: pytest.MonkeyPatch) -> list[Shown]:
         found.append(Shown([data["text/html"]]))
         return found[-1]
 
-    monkeypatch.setattr(progress, "in_notebook", lambda: True)
+    monkeypatch.setattr(events, "in_notebook", lambda: True)
     monkeypatch.setattr(notebook_progress, "display", display)
     monkeypatch.setattr(notebook_progress, "UPDATE_SECONDS", 0.0)
     return found
@@ -98,7 +98,7 @@ def test_a_callback_replaces_the_bar(experiment: mjfim.Experiment, places: list[
 def test_a_program_that_is_no_notebook_shows_nothing(
     experiment: mjfim.Experiment, places: list[Shown], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress, "in_notebook", lambda: False)
+    monkeypatch.setattr(events, "in_notebook", lambda: False)
     mjfim.design(experiment)
     assert places == []
 
@@ -143,8 +143,8 @@ def test_a_notebook_is_known_by_its_kernel(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
     monkeypatch.setitem(sys.modules, "IPython", shell(kernel=object()))
-    assert progress.in_notebook()
+    assert events.in_notebook()
     monkeypatch.setitem(sys.modules, "IPython", shell())
-    assert not progress.in_notebook()
+    assert not events.in_notebook()
     monkeypatch.delitem(sys.modules, "IPython")
-    assert not progress.in_notebook()
+    assert not events.in_notebook()

@@ -31,9 +31,9 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
+from mjfim.records.base import ShownRecord
 from mjfim.records.design import Design
 from mjfim.records.robustness import RobotConditions, Robustness
-from mjfim.records.shown import ShownRecord
 from tests.support.paths import MODELS
 
 # A name that would change a page, if it were not escaped.

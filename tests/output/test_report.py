@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import MjfimError, RecordingError
+from mjfim.files import write_json
 from mjfim.output.report import REPORT, VERBS
 from mjfim.output.report.build import KINDS, page_of, rewrite_reports, write_report
 from mjfim.output.report.correlations import correlation_of
@@ -23,12 +24,11 @@ from mjfim.output.report.palette import palettes
 from mjfim.output.report.render import is_page_of, no_video_in, rendered, video_in
 from mjfim.output.summaries.verdicts import Level, next_steps, verdict_of
 from mjfim.output.video import Video
+from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import CampaignStatus
 from mjfim.records.check import Check
 from mjfim.records.design import Design, LimitUsage, Status
-from mjfim.records.missing_term import TermTestData
-from mjfim.records.serialization import write_json
-from mjfim.records.shown import ShownRecord
+from mjfim.records.terms import TermTestData
 from tests.support import results
 
 # A name that would change the page, or run, if it were not escaped.

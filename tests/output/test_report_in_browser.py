@@ -15,7 +15,7 @@ import pytest
 from mjfim.output.report.build import page_of
 from mjfim.output.report.render import rendered
 from mjfim.output.vocabulary import DESIGNED
-from mjfim.records.shown import ShownRecord
+from mjfim.records.base import ShownRecord
 from tests.support import results
 
 pytestmark = pytest.mark.slow

@@ -50,11 +50,19 @@ from mjfim.output.rerun.series import (
 )
 from mjfim.output.rerun.shapes import INFINITE_REACH, OUTLINE, SOLID
 from mjfim.output.rerun.strips import round_logarithms, round_numbers
-from mjfim.records.design import Design, Evaluation, HistoryRow, LimitUsage, StartResult, Status
+from mjfim.records.design import (
+    MOTION_SAMPLES,
+    Design,
+    Evaluation,
+    HistoryRow,
+    IterateMotion,
+    IterateMotions,
+    LimitUsage,
+    StartResult,
+    Status,
+)
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
-from mjfim.records.iterates import MOTION_SAMPLES, IterateMotion, IterateMotions
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 
 MODELS = {
     "cart": ROOT / "models" / "cart_pendulum.xml",

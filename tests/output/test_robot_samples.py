@@ -20,8 +20,7 @@ from mjfim.output.mjcf.write import same_dynamics, write_identified
 from mjfim.output.robot_samples import clear_samples, sample_files, write_samples
 from mjfim.output.summaries.samples import describe_samples
 from mjfim.output.summary_parts import Paragraph
-from mjfim.records.estimate import Estimate
-from mjfim.records.prior_directions import PriorDirections
+from mjfim.records.estimate import Estimate, PriorDirections
 from tests.identification.test_parameter_draws import COVARIANCE, estimated
 from tests.support.paths import MODELS
 

@@ -22,10 +22,10 @@ from mjfim.output.report.build import write_report
 from mjfim.output.summaries.accuracy import relative
 from mjfim.output.summary_parts import Quantity
 from mjfim.output.text import render
+from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.shown import ShownRecord
 from tests.support.paths import MODELS
 
 

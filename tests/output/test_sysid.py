@@ -21,7 +21,7 @@ from mjfim.output.archive import write_recording
 from mjfim.output.mjcf.write import same_dynamics
 from mjfim.output.sysid.comparison import chi2, fit_with_sysid, report
 from mjfim.output.sysid.sequences import build, export
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from tests.support.cli import misused, run
 from tests.support.dense_residuals import dense_residuals
 from tests.support.numerics import Array, body_task, filtered_task

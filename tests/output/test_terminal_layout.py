@@ -24,12 +24,12 @@ from mjfim.output.summary_parts import (
 )
 from mjfim.output.terminal_tables import fold
 from mjfim.output.text import MAX_LINES, render
+from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check, ParameterCheck, SelfTest
 from mjfim.records.comparison import Comparison
 from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
-from mjfim.records.recording import Recording
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
-from mjfim.records.shown import ShownRecord
+from mjfim.records.trajectory import Recording
 from tests.support.made_records import make_comparison, make_method_result
 
 # A name of 40 characters, and many of them.

@@ -10,7 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.errors import SimulationDivergedError
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # A spring of 50 Hz: explicit integration diverges for timesteps above 1 / (50 pi) s = 6.4 ms.
 STIFF = """

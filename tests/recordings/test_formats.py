@@ -24,11 +24,11 @@ import pyarrow.parquet
 import pytest
 from numpy.typing import NDArray
 
+from mjfim import files
 from mjfim.errors import RecordingError
 from mjfim.recordings.formats.read import read_columns
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import RecordingSpec
-from mjfim.records import unpacked_size as limits
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
@@ -122,7 +122,9 @@ def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
     )
     for cut in cuts:
         path.write_bytes(whole[:cut])
-        with pytest.raises(RecordingError, match=rf"log\{ending}: not (a )?readable") as refused:
+        with pytest.raises(
+            RecordingError, match=rf"log\{ending}: not (a )?(readable|log)"
+        ) as refused:
             read_columns(path, ALL)
         assert "\n" not in str(refused.value)
 
@@ -404,51 +406,25 @@ def bomb_parquet(path: Path) -> None:
 def test_bombs(
     name: str, write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A few kB that unpack to MB are read within the limits, and refused beyond either of them."""
+    """A few kB that unpack to MB are read within the limit, and refused beyond it."""
     path = tmp_path / name
     write(path)
     assert path.stat().st_size < 16_000
     assert len(read_columns(path, ALL).column("t")) == 1_000_000
     with monkeypatch.context() as patch:
-        patch.setattr(limits, "MAX_UNPACKED_SIZE", 2_000_000)
+        patch.setattr(files, "MAX_UNPACKED_SIZE", 2_000_000)
         with pytest.raises(RecordingError, match=rf"{name}: .* more than 0\.00186 GiB"):
             read_columns(path, ALL)
-    if name != "log.parquet":
-        monkeypatch.setattr(limits, "UNSUSPICIOUS_SIZE", 1_000_000)
-        with pytest.raises(
-            RecordingError, match=rf"{name}: unpacks to more than 200 times its size"
-        ):
-            read_columns(path, ALL)
-
-
-def test_packed_logs_are_not_refused_as_bombs(
-    columns: Columns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A log that packs well is read whatever its size, as long as the ratio is plausible."""
-    monkeypatch.setattr(limits, "UNSUSPICIOUS_SIZE", 100)
-    as_gzip(tmp_path / "log.csv.gz", columns)
-    assert same(read_columns(tmp_path / "log.csv.gz", ALL), columns)
 
 
 # ---- npz
-
-
-@pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_npz_arrays_of_one_name(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    np.save(stream, np.arange(3.0))
-    with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
-        for _ in range(2):
-            archive.writestr("t.npy", stream.getvalue())
-    with pytest.raises(RecordingError, match="more than one array is named 't'"):
-        read_columns(tmp_path / "log.npz", ALL)
 
 
 def test_single_array_instead_of_an_archive(tmp_path: Path) -> None:
     with (tmp_path / "log.npz").open("wb") as stream:
         np.save(stream, np.arange(3.0))
     with pytest.raises(
-        RecordingError, match=r"log\.npz: not a log archive: it holds a single array .*numpy\.savez"
+        RecordingError, match=r"log\.npz: not a log archive \(npz of named arrays .*numpy\.savez"
     ):
         read_columns(tmp_path / "log.npz", ALL)
 
@@ -471,9 +447,7 @@ def test_pickles_are_not_loaded(tmp_path: Path) -> None:
         q=np.array([Trap(tmp_path / "sprung")], dtype=object),
     )
     for spec in (ALL, RecordingSpec(columns={"qpos:j": "t", "ctrl:m": "t"})):
-        with pytest.raises(
-            RecordingError, match=r"log\.npz: array 'q' holds pickled objects, which are never read"
-        ):
+        with pytest.raises(RecordingError, match=r"log\.npz: not a log archive .*without pickles"):
             read_columns(tmp_path / "log.npz", spec)
     assert not (tmp_path / "sprung").exists()
     pickle.loads(pickle.dumps(Trap(tmp_path / "sprung")))
@@ -523,7 +497,7 @@ def test_headers_that_announce_too_much(tmp_path: Path) -> None:
     """No memory is allocated for numbers that the file does not hold."""
     with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
         archive.writestr("t.npy", header((10**13,)))
-    with pytest.raises(RecordingError, match=r"declares more numbers than it holds"):
+    with pytest.raises(RecordingError, match=r"log\.npz: not a log archive"):
         read_columns(tmp_path / "log.npz", ALL)
 
 

@@ -146,21 +146,6 @@ def test_truth_values(read: Read) -> None:
         read({"on": on}, columns={"qpos:pin": "on"})
 
 
-def test_the_former_name_of_multiply_by_is_refused(tmp_path: Path) -> None:
-    """The message names the file and the key, and says how the key is called now."""
-    file = tmp_path / "study.toml"
-    file.write_text(
-        'model = "arm.xml"\nrate = 100.0\n[parameters.mass]\ntarget = "body/arm:mass"\n'
-        '[recording.columns]\n"ctrl:turn" = { column = "duty", times = ["enabled"] }\n',
-        encoding="utf-8",
-    )
-    with pytest.raises(ExperimentError) as refused:
-        Experiment.from_file(file)
-    assert str(refused.value) == (
-        f"{file}: recording.columns.ctrl:turn.times: this key is called 'multiply_by' now"
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "unit", "factor"),
     [

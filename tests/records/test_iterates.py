@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from mjfim.records.design import HistoryRow, extended, without_motions
-from mjfim.records.iterates import MAX_MOTIONS, MOTION_SAMPLES, IterateMotion, superfluous
+from mjfim.records.design import (
+    MAX_MOTIONS,
+    MOTION_SAMPLES,
+    HistoryRow,
+    IterateMotion,
+    extended,
+    superfluous,
+    without_motions,
+)
 from mjfim.records.trajectory import Trajectory
 from tests.support.made_records import make_row
 
@@ -64,20 +69,3 @@ def test_motions_are_separated_from_the_history() -> None:
 
 def test_the_iterate_between_the_nearest_neighbours_is_dropped() -> None:
     assert superfluous([0, 10, 11, 20, 30], limit=4) == {2}
-
-
-def test_a_motion_of_another_process_is_read_when_it_is_asked_for() -> None:
-    motion = IterateMotion.of(moved(5))
-    assert motion is not None
-    data = pickle.dumps(motion)
-    received = pickle.loads(data)
-    assert set(vars(received)) == {"_sealed"}
-
-    # It can be sent on without being read.
-    again = pickle.loads(pickle.dumps(received))
-    for name in ("t", "qpos", "ctrl"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(motion, name))
-        assert not getattr(again, name).flags.writeable
-    assert set(vars(received)) == {"_sealed"}
-    with pytest.raises(AttributeError, match="has no attribute 'qvel'"):
-        _ = received.qvel

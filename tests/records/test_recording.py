@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import RecordingError
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 
 @pytest.mark.parametrize("name", ["t", "y"])

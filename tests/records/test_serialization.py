@@ -19,23 +19,23 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim import files
 from mjfim.errors import RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.files import as_json
 from mjfim.identification.identify import identify_system
 from mjfim.output import archive
-from mjfim.records import serialization, unpacked_size
+from mjfim.records.base import RECORD, SavedRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
-from mjfim.records.comparison import Comparison, MethodResult
-from mjfim.records.design import CombinationAccuracy, Design, Evaluation
+from mjfim.records.comparison import Comparison
+from mjfim.records.design import Design, Evaluation
 from mjfim.records.estimate import Estimate, PredictionErrors
 from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.recording import Recording
 from mjfim.records.robustness import Robustness
-from mjfim.records.serialization import RECORD, SavedRecord, as_json
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies.check import check_task
 from mjfim.studies.monte_carlo import monte_carlo_system
 from tests.support.paths import MODELS
@@ -125,7 +125,10 @@ class AwkwardValues:
                 shape
             )
         if origin is tuple:
-            return tuple(self.build(get_args(hint)[0]) for _ in range(self.count))
+            entries = get_args(hint)
+            if entries[-1] is Ellipsis:
+                entries = entries[:1] * self.count
+            return tuple(self.build(entry) for entry in entries)
         if origin is dict:
             return {
                 f"{text}{i}": self.build(get_args(hint)[1])
@@ -242,7 +245,7 @@ def test_large_arrays_are_not_compressed(
     estimate: Estimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Noise can hardly be compressed, and the record is the same."""
-    monkeypatch.setattr(serialization, "MAX_COMPRESSED_BYTES", 1000)
+    monkeypatch.setattr(files, "MAX_COMPRESSED_BYTES", 1000)
     round_trip(estimate, tmp_path)
     with zipfile.ZipFile(next(tmp_path.rglob("estimate.npz"))) as stored:
         assert all(member.compress_type == zipfile.ZIP_STORED for member in stored.infolist())
@@ -326,23 +329,27 @@ AGAIN = r"write it again with `mjfim design EXPERIMENT -o DIR`"
 FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], None], str]] = {
     "an older version": (
         lambda arrays: arrays.pop(RECORD),
-        rf"design\.npz: the array 'record' is missing, .* older version of mjfim .*{AGAIN}",
+        rf"design\.npz: the array 'record' is missing or of another version .*{AGAIN}",
     ),
     "another text": (
         lambda arrays: arrays.update({RECORD: np.array("hello")}),
-        rf"design\.npz: the array 'record' was not written by mjfim; {AGAIN}",
+        rf"design\.npz: the array 'record' is missing or of another version .*{AGAIN}",
     ),
     "another list": (
         lambda arrays: arrays.update({RECORD: np.array("[1]")}),
-        r"design\.npz: the array 'record' was not written by mjfim",
+        r"design\.npz: the array 'record' is missing or of another version",
     ),
     "a missing array": (
         lambda arrays: arrays.pop("initial_qpos"),
-        rf"the array 'initial_qpos' of the field 'initial\.trajectory\.qpos' is missing; {AGAIN}",
+        rf"'initial\.trajectory\.qpos': .*the array 'initial_qpos' is missing; {AGAIN}",
     ),
     "an array of texts": (
         lambda arrays: arrays.update(theta=np.array(["a"])),
         r"the array 'theta' does not hold numbers",
+    ),
+    "a newer version": (
+        with_fields(lambda content: content.update(version=99)),
+        rf"design\.npz: has version 99, not 2; {AGAIN}",
     ),
     "another record": (
         with_fields(lambda content: content.update(type="Check")),
@@ -350,27 +357,27 @@ FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], None], str]] = {
     ),
     "a missing field": (
         with_fields(lambda content: content["fields"]["final"].pop("cost")),
-        r"the field 'final\.cost' is missing",
+        r"the field 'final\.cost': Field required",
     ),
     "a field of a newer version": (
         with_fields(lambda content: content["fields"].update(colour="red")),
-        r"the field 'colour' is unknown",
+        r"the field 'colour': Unexpected keyword",
     ),
     "an unknown status": (
         with_fields(lambda content: content["fields"].update(status="BORED")),
-        r"the field 'status' holds 'BORED', which is not a Status",
+        r"the field 'status': Input should be .*converged",
     ),
     "a text for a number": (
         with_fields(lambda content: content["fields"].update(slope="steep")),
-        r"the field 'slope' holds 'steep', which is not a number",
+        r"the field 'slope': Input should be a valid number",
     ),
     "a number for a text": (
         with_fields(lambda content: content["fields"].update(parameters=[1])),
-        r"the field 'parameters\.0' holds 1, which is not of type str",
+        r"the field 'parameters\.0': Input should be a valid string",
     ),
     "a truth value for a count": (
         with_fields(lambda content: content["fields"].update(steps=True)),
-        r"the field 'steps' holds True, which is not of type int",
+        r"the field 'steps': Input should be a valid integer",
     ),
 }
 
@@ -424,11 +431,7 @@ def test_archives_that_unpack_to_too_much(tmp_path: Path, monkeypatch: pytest.Mo
     """They are refused before memory is allocated, as logs are."""
     path = tmp_path / "design.npz"
     np.savez_compressed(path, t=np.zeros(1_000_000))
-    monkeypatch.setattr(unpacked_size, "UNSUSPICIOUS_SIZE", 1_000_000)
-    with pytest.raises(RecordingError, match=r"design\.npz: unpacks to more than 200 times"):
-        Design.load(path)
-
-    monkeypatch.setattr(unpacked_size, "MAX_UNPACKED_SIZE", 2_000_000)
+    monkeypatch.setattr(files, "MAX_UNPACKED_SIZE", 2_000_000)
     with pytest.raises(RecordingError, match=r"design\.npz: unpacks to more than 0\.00186 GiB"):
         Design.load(path)
 
@@ -440,7 +443,7 @@ def test_headers_that_announce_too_much(tmp_path: Path) -> None:
     np.lib.format.write_array_header_1_0(stream, header)
     with zipfile.ZipFile(tmp_path / "design.npz", "w") as archive:
         archive.writestr("t.npy", stream.getvalue())
-    with pytest.raises(RecordingError, match="declares more numbers than it holds"):
+    with pytest.raises(RecordingError, match=r"design\.npz: not a design archive"):
         Design.load(tmp_path)
 
 
@@ -448,7 +451,7 @@ def test_single_array_instead_of_an_archive(tmp_path: Path) -> None:
     with (tmp_path / "design.npz").open("wb") as opened:
         np.save(opened, np.arange(3.0))
     with pytest.raises(
-        RecordingError, match=r"not a design archive: it holds a single array .*numpy\.savez"
+        RecordingError, match=r"not a design archive \(npz of named arrays .*numpy\.savez"
     ):
         Design.load(tmp_path)
 
@@ -472,20 +475,3 @@ def test_records_may_be_moved(saved: Path, design: Design, tmp_path: Path) -> No
     """The npz file alone is enough, under any name."""
     shutil.copy(saved / "design.npz", tmp_path / "best.npz")
     assert_same(Design.load(tmp_path / "best.npz"), design)
-
-
-@pytest.mark.parametrize(
-    ("kind", "old", "new"),
-    [
-        (kind, old, new)
-        for kind in (Check, CombinationAccuracy, Estimate, MethodResult)
-        for old, new in kind.renamed_fields.items()
-    ],
-)
-def test_the_old_name_of_a_field_is_an_error_that_names_the_new_one(
-    kind: Any, old: str, new: str
-) -> None:
-    record = AwkwardValues(count=1, optional=True).build(kind)
-    assert hasattr(record, new)
-    with pytest.raises(AttributeError, match=f"{old} is called .*{new}"):
-        getattr(record, old)

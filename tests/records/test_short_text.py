@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 import mjfim
-from mjfim.records.short_text import short_text
+from mjfim.arrays import Array
+from mjfim.records.base import Record, record
 from mjfim.records.trajectory import Trajectory
 
 
@@ -16,19 +16,19 @@ class Colour(Enum):
     RED = "a long sentence"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Thing:
+@record
+class Thing(Record):
     number: float = 1.5
     words: str = "x" * 1000
     colour: Colour = Colour.RED
     few: tuple[int, ...] = (1, 2)
     many: tuple[int, ...] = tuple(range(1000))
     table: dict[str, int]
-    array: np.ndarray
+    array: Array
 
 
 def test_each_field_is_one_short_line() -> None:
-    text = short_text(Thing(table={"a": 1}, array=np.zeros((400, 3))))
+    text = repr(Thing(table={"a": 1}, array=np.zeros((400, 3))))
     lines = text.splitlines()
     assert lines[0] == "Thing("
     assert "  array=<array of shape (400, 3)>" in lines

@@ -33,7 +33,7 @@ from mjfim.output.campaign_settings import (
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.studies import campaign as campaign_module
 from mjfim.studies.redesign import restate_experiment
 from tests.support.cli import PROCESS, misused, read, run

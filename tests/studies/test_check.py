@@ -15,11 +15,11 @@ import mjfim
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.files import as_json
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.information.fisher import FisherInformation
 from mjfim.plant.rollout_derivatives import RolloutDerivatives
-from mjfim.records.recording import Recording
-from mjfim.records.serialization import as_json
+from mjfim.records.trajectory import Recording
 from mjfim.studies.check import check, check_recordings, check_task
 from tests.support.dense_residuals import dense_residuals
 from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task, relative_error

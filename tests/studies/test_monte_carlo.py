@@ -14,8 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify, identify_system
 from mjfim.records.events import Event, StudyEvent
-from mjfim.records.recording import Recording
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies import monte_carlo as monte_carlo_module
 from mjfim.studies.monte_carlo import _statistics, monte_carlo, monte_carlo_system
 from tests.support.paths import ROOT

@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import t as student
 
 import mjfim
+from mjfim.arrays import NORMAL_95
 from mjfim.errors import ExperimentError
 from mjfim.identification.independent_blocks import (
     block_length,
@@ -19,10 +20,9 @@ from mjfim.identification.independent_blocks import (
 from mjfim.identification.recording_comparison import compare_evidence
 from mjfim.identification.robust_covariance import robust_uncertainty
 from mjfim.output.summaries.verdicts import Level, verdict_of
-from mjfim.records.intervals import NORMAL_95
-from mjfim.records.prior_directions import PriorDirections
-from mjfim.records.recording import Recording
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.estimate import PriorDirections
+from mjfim.records.robots import RobotComparison
+from mjfim.records.trajectory import Recording
 from mjfim.studies.robot_comparison import compare_estimates, holm, honest_std
 from tests.identification.test_robust_covariance import FINE, Linear, noise, waves
 

@@ -29,9 +29,8 @@ from mjfim.output import archive
 from mjfim.output.playback import design_columns, reference_columns, simulate_playback
 from mjfim.output.summaries.robustness import robustness_sentences
 from mjfim.recordings.design_table import read_playback
-from mjfim.records.playback import Playback
-from mjfim.records.recording import Recording
 from mjfim.records.robustness import RobotConditions, Robustness
+from mjfim.records.trajectory import Playback, Recording
 from mjfim.studies import robot_bench
 from mjfim.studies.robot_bench import RobotBench
 from mjfim.studies.robustness import summarize_runs

@@ -13,7 +13,7 @@ from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses
 from mjfim.model.parameters import ParameterSet
-from mjfim.records.selection import Decision, Selection, SelectionStep
+from mjfim.records.terms import Decision, Selection, SelectionStep
 from mjfim.studies.selected_models import NOT_WIDENED, different, with_selection
 from tests.support.paths import ROOT
 from tests.support.results import SLIDE_FRICTION

@@ -13,8 +13,8 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
-from mjfim.records.recording import Recording
-from mjfim.records.selection import Decision
+from mjfim.records.terms import Decision
+from mjfim.records.trajectory import Recording
 from mjfim.studies import selection as selection_study
 from mjfim.studies.selection import select_terms_system
 from tests.support.paths import ROOT

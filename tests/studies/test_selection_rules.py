@@ -12,8 +12,7 @@ import pytest
 from mjfim.budget import Budget
 from mjfim.identification.held_out_losses import Reduction
 from mjfim.identification.missing_terms import TermTests
-from mjfim.records.missing_term import MissingTerm
-from mjfim.records.selection import Decision, SelectionStep
+from mjfim.records.terms import Decision, MissingTerm, SelectionStep
 from mjfim.studies import selection
 from mjfim.studies.selection import EQUAL_COST, INTERRUPTED, _Selector
 

@@ -13,8 +13,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.model.parameters import ParameterSet
-from mjfim.records.recording import Recording
-from mjfim.records.selection import Decision, PooledParameter
+from mjfim.records.terms import Decision, PooledParameter
+from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import selected_experiment
 from mjfim.studies.simplification import possible_pools, simplified_experiment
 from tests.support.paths import ROOT

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mjfim.experiment.schema import Experiment
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 from mjfim.signals import multisine
 from tests.support.numerics import Array
 

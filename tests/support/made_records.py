@@ -12,13 +12,12 @@ from mjfim.records.design import Design, Evaluation, HistoryRow, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
-from mjfim.records.recording import Recording
-from mjfim.records.recording_comparison import (
+from mjfim.records.robots import (
     OddParameter,
     OddRecording,
     RecordingComparison,
 )
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.trajectory import Recording, Trajectory
 
 
 def padded(name: str, width: int) -> str:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.experiment.schema import Experiment
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Exponents of length, mass and time of the symbols in the package's units; angles have none.
 SYMBOLS = {

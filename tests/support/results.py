@@ -18,19 +18,17 @@ from mjfim.records.design import (
 )
 from mjfim.records.estimate import (
     Estimate,
+    ParameterDraws,
     Prediction,
     PredictionErrors,
     Whiteness,
 )
 from mjfim.records.labels import Labels
-from mjfim.records.missing_term import MissingTerm
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
-from mjfim.records.parameter_draws import ParameterDraws
-from mjfim.records.recording import Recording
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
-from mjfim.records.selection import SelectedTerm
-from mjfim.records.trajectory import Trajectory
+from mjfim.records.terms import MissingTerm, SelectedTerm
+from mjfim.records.trajectory import Recording, Trajectory
 from tests.support.made_records import make_recording_comparison, ten_iterates
 
 # Names of the parameters of all results.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import mujoco
 
-from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError
+from mjfim.files import replacing
 from mjfim.model.loading import load_written_model
 from mjfim.output.mjcf.asset_paths import point_to_copies
 from mjfim.output.mjcf.document import MAIN, MjcfDocument

@@ -17,9 +17,9 @@ import scipy
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, first_ones, listed
 from mjfim.experiment.system import System
+from mjfim.files import replacing
 from mjfim.model.control_laws import remove_numbers
 from mjfim.model.loading import compile_spec, load_written_model
 from mjfim.model.parameters import ParameterSet

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from mjfim.output.plots import style
-from mjfim.records.estimate import Estimate
-from mjfim.records.horizons import HorizonStudy
+from mjfim.records.estimate import Estimate, HorizonStudy
 
 # Largest number of parameters whose estimates are drawn.
 MAX_PARAMETERS = 6

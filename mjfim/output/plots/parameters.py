@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.transforms import Transform
 
-from mjfim.arrays import Array
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     IDENTIFIED_COLOUR,
@@ -35,7 +35,6 @@ from mjfim.output.summaries.accuracy import BEST_CASE, improvement, relative, si
 from mjfim.output.vocabulary import IDENTIFIED, NOMINAL
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.intervals import NORMAL_95
 from mjfim.records.labels import Labels
 
 # Largest number of rows that are high; more rows are lower and their bars have no numbers.

@@ -15,6 +15,7 @@ from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.labels import complete_labels
 from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
 from mjfim.output.plots.pairs import has_pairs
+from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
@@ -22,9 +23,8 @@ from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import Robustness
-from mjfim.records.shown import ShownRecord
 
 # A function that draws a figure.
 DrawPicture = Callable[[], Figure]

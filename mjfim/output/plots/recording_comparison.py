@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from mjfim.arrays import NORMAL_95
 from mjfim.output.plots.narrow_axis import place_ticks
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
@@ -26,9 +27,8 @@ from mjfim.output.plots.style import (
     text_width,
 )
 from mjfim.records.estimate import Estimate
-from mjfim.records.intervals import NORMAL_95
 from mjfim.records.labels import with_unit
-from mjfim.records.recording_comparison import RecordingComparison
+from mjfim.records.robots import RecordingComparison
 
 # Largest number of parameters and of recordings of a figure; of more parameters, those that differ
 # most are drawn.

@@ -34,7 +34,7 @@ from mjfim.output.plots.style import (
 )
 from mjfim.records.estimate import Estimate
 from mjfim.records.labels import Labels
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Largest number of outputs in a figure; of more, the worst ones are shown.
 MAX_OUTPUTS = 8

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from mjfim.arrays import NORMAL_95
 from mjfim.output.plots.style import (
     DESIGNED_COLOUR,
     GRID_COLOUR,
@@ -22,9 +23,8 @@ from mjfim.output.plots.style import (
     shorten,
     shorten_label,
 )
-from mjfim.records.intervals import NORMAL_95
 from mjfim.records.labels import with_unit
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
 
 # Largest number of parameters; of more, those with the most significant differences are drawn.
 MAX_PARAMETERS = 40

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from mjfim.arrays import NORMAL_95
 from mjfim.output.plots import style
 from mjfim.output.vocabulary import NOMINAL
-from mjfim.records.intervals import NORMAL_95
 from mjfim.records.robustness import (
     CONFIDENCE,
     REQUIRED_COVERAGE,

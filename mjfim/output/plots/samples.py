@@ -23,8 +23,7 @@ from mjfim.output.plots.style import (
     text_width,
 )
 from mjfim.output.vocabulary import IDENTIFIED
-from mjfim.records.estimate import Estimate
-from mjfim.records.parameter_draws import ParameterDraws
+from mjfim.records.estimate import Estimate, ParameterDraws
 
 # Largest number of parameters of a figure; of more, those with the largest correlations are drawn.
 MAX_PARAMETERS = 6

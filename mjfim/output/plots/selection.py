@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from mjfim.output.plots import style
 from mjfim.records.estimate import Estimate
-from mjfim.records.selection import Decision, SelectionStep
+from mjfim.records.terms import Decision, SelectionStep
 
 # Characters to which the names of terms are shortened.
 TERM_WIDTH = 40

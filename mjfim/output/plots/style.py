@@ -29,8 +29,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
-from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
+from mjfim.files import replacing
 from mjfim.model.coordinates import split_unit
 from mjfim.output import vocabulary
 from mjfim.output.picture_format import PictureFormat

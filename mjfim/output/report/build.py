@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import singledispatch
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 
-from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError, RecordingError, first_ones, listed
+from mjfim.files import read_json, replacing
 from mjfim.output.report import OWN_REPORTS, REPORT, own_report
 from mjfim.output.report.campaign import campaign_page
 from mjfim.output.report.check import check_page
@@ -21,16 +21,15 @@ from mjfim.output.report.render import is_page_of, no_video_in, rendered, video_
 from mjfim.output.report.robot_comparison import robots_page
 from mjfim.output.report.robustness import robustness_page
 from mjfim.output.video import Video
+from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import Robustness
-from mjfim.records.serialization import read_json
-from mjfim.records.shown import ShownRecord
 
 # Kinds of results that have a report, by the verb, in the order of `VERBS`.
 KINDS: dict[str, type[ShownRecord]] = {

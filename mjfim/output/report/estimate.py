@@ -44,7 +44,7 @@ from mjfim.output.summary_parts import Listing, Part, Quantity, Summary
 from mjfim.output.vocabulary import IDENTIFIED, MEASURED, NOMINAL
 from mjfim.records.estimate import Estimate, Prediction
 from mjfim.records.labels import Labels, with_unit
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Largest number of outputs that are drawn; of more, those whose residuals over sigma are largest.
 MAX_OUTPUTS = 12

@@ -8,7 +8,7 @@ from mjfim.output.report.curves import axis, curve
 from mjfim.output.report.page import Key, Panel, PlotGroup, Section
 from mjfim.output.summaries.horizons import describe_horizons
 from mjfim.output.vocabulary import IDENTIFIED, OTHER
-from mjfim.records.horizons import HorizonStudy
+from mjfim.records.estimate import HorizonStudy
 
 # Names in the legend.
 CHOSEN = "chosen length"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mjfim.arrays import NORMAL_95
 from mjfim.output.report.curves import (
     axis,
     band,
@@ -17,9 +18,8 @@ from mjfim.output.report.page import Key, Panel, PlotGroup, Plotly, Section
 from mjfim.output.summaries.recording_comparison import describe_recordings
 from mjfim.output.vocabulary import DESIGNED, IDENTIFIED, MEASURED
 from mjfim.records.estimate import Estimate
-from mjfim.records.intervals import NORMAL_95
 from mjfim.records.labels import with_unit
-from mjfim.records.recording_comparison import RecordingComparison
+from mjfim.records.robots import RecordingComparison
 
 # Largest number of parameters with a plot; of more, those that differ most.
 MAX_PANELS = 24

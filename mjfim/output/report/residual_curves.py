@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import NORMAL_95, Array
 from mjfim.identification.lagged_products import lagged_products
 from mjfim.output.distributions import chi_squared_quantiles
 from mjfim.records.estimate import Estimate
-from mjfim.records.intervals import NORMAL_95
 
 # Largest number of lags of an autocorrelation.
 MAX_LAGS = 100

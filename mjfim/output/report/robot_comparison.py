@@ -18,8 +18,7 @@ from mjfim.output.summaries.robot_comparison import describe_robots
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.summary_parts import Part
 from mjfim.output.vocabulary import DESIGNED, IDENTIFIED
-from mjfim.records.differences import p_text
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison, p_text
 
 # Names in the legend.
 CHANGED, EQUAL = "differs", "no difference found"

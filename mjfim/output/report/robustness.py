@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mjfim.arrays import NORMAL_95
 from mjfim.output.report.curves import (
     axis,
     band,
@@ -18,7 +19,6 @@ from mjfim.output.summaries.robustness import describe_robustness, robustness_se
 from mjfim.output.summaries.verdicts import next_steps, verdict_of
 from mjfim.output.summary_parts import Listing, Part
 from mjfim.output.vocabulary import DESIGNED, INITIAL, MEASURED
-from mjfim.records.intervals import NORMAL_95
 from mjfim.records.robustness import (
     CONFIDENCE,
     REQUIRED_COVERAGE,

@@ -8,9 +8,8 @@ from mjfim.output.report.curves import axis, level, packed
 from mjfim.output.report.page import Key, Panel, PlotGroup, Plotly, Section
 from mjfim.output.summaries.samples import describe_samples
 from mjfim.output.vocabulary import IDENTIFIED, MEASURED
-from mjfim.records.estimate import Estimate
+from mjfim.records.estimate import Estimate, ParameterDraws
 from mjfim.records.labels import with_unit
-from mjfim.records.parameter_draws import ParameterDraws
 
 # Largest number of parameters with a histogram.
 MAX_PANELS = 24

@@ -8,7 +8,7 @@ from mjfim.output.report.curves import axis, curve, dots
 from mjfim.output.report.page import Key, Panel, PlotGroup, Section
 from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.vocabulary import IDENTIFIED, OTHER
-from mjfim.records.selection import Selection
+from mjfim.records.terms import Selection
 
 # Names in the legend.
 KEPT = "model of this step"

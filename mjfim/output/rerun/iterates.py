@@ -31,8 +31,7 @@ from mjfim.output.rerun.series import Curve, Range, range_with_limits
 from mjfim.output.rerun.shapes import SOLID, DrawnShape, RobotStyle, drawn_shapes
 from mjfim.output.rerun.strips import StripPlot
 from mjfim.plant.state_space import quaternion_product
-from mjfim.records.design import Design
-from mjfim.records.iterates import IterateMotion, IterateMotions
+from mjfim.records.design import Design, IterateMotion, IterateMotions
 from mjfim.records.trajectory import Trajectory
 
 # Number of poses in which the robot is drawn at an iterate, evenly spread over its motion.

@@ -13,7 +13,7 @@ import mujoco
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mjfim.atomic_io import replacing
+from mjfim.files import replacing
 from mjfim.output.rerun.camera import Camera
 from mjfim.output.rerun.scene import EntityParts, entity_path, first_shape_parts, has_floor
 

@@ -36,9 +36,8 @@ from mjfim.output.rerun.scene import (
     strip_of_path,
 )
 from mjfim.output.rerun.shapes import RobotStyle
-from mjfim.records.design import HistoryRow
+from mjfim.records.design import HistoryRow, IterateMotion
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
-from mjfim.records.iterates import IterateMotion
 
 # Shortest time between two transmissions [s].
 UPDATE_SECONDS = 0.3

@@ -17,7 +17,7 @@ from mjfim.output.rerun.panels import dof_positions, grid_tabs, plot_size
 from mjfim.output.rerun.scene import entity_path
 from mjfim.output.rerun.series import Range, range_with_limits
 from mjfim.output.rerun.strips import StripPlot
-from mjfim.records.iterates import IterateMotion
+from mjfim.records.design import IterateMotion
 
 # A plot reaches to the limits if its range is then at most this many times as large.
 LARGEST_ZOOM = 3.0

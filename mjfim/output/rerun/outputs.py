@@ -16,7 +16,7 @@ from mjfim.output import vocabulary
 from mjfim.output.rerun.panels import PLOTS_PER_PAGE, fit_in_a_row, row_height
 from mjfim.output.rerun.series import LIMIT_COLOUR, Curve, SeriesPlot
 from mjfim.records.estimate import Estimate
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Largest number of outputs on one page, each with its residual beside it.
 PAIRS_PER_PAGE = PLOTS_PER_PAGE // 2

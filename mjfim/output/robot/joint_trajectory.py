@@ -16,8 +16,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
 from mjfim.errors import ExperimentError
+from mjfim.files import replacing
 from mjfim.output.robot.options import chosen
 from mjfim.output.robot.plan import Drive, DriveKind, RobotPlan
 

@@ -17,11 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
 from mjfim.errors import ExperimentError
+from mjfim.files import replacing, write_json
 from mjfim.model.coordinates import state_components
 from mjfim.output.robot.plan import Drive, DriveKind, RobotPlan
-from mjfim.records.serialization import write_json
 
 # Units of angles in a dataset.
 AngleUnit = Literal["rad", "deg"]

@@ -25,7 +25,7 @@ from mjfim.model.servos import (
 from mjfim.output.archive import check_fits
 from mjfim.output.playback import reference_columns, simulate_playback
 from mjfim.records.design import Design
-from mjfim.records.playback import Playback
+from mjfim.records.trajectory import Playback
 
 
 class DriveKind(Enum):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
+from mjfim.files import replacing
 from mjfim.model.coordinates import state_names, tangent_names
 from mjfim.output.playback import GAIN_NOTE, design_columns
 from mjfim.output.robot.plan import Drive, RobotPlan

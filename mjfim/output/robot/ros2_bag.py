@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import remove_earlier_result, replacing
+from mjfim.files import remove_earlier_result, replacing
 from mjfim.output.robot.joint_trajectory import (
     NANOSECONDS,
     TRAJECTORY_TOPIC,

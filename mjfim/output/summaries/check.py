@@ -17,8 +17,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.check import Check, ParameterCheck
-from mjfim.records.combinations import ParameterGroup
+from mjfim.records.check import Check, ParameterCheck, ParameterGroup
 
 # Largest number of eigenvalues that a sentence lists; of more, the smallest four and the largest
 # two are listed.

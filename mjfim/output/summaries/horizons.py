@@ -11,7 +11,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.horizons import HorizonStudy
+from mjfim.records.estimate import HorizonStudy
 
 
 def describe_horizons(study: HorizonStudy) -> list[Part]:

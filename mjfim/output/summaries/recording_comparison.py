@@ -14,9 +14,8 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.differences import p_text
 from mjfim.records.estimate import Estimate
-from mjfim.records.recording_comparison import RecordingComparison
+from mjfim.records.robots import RecordingComparison, p_text
 
 # Headings of the table of the scatter.
 BETWEEN = "σ between"

@@ -15,8 +15,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.differences import p_text
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison, p_text
 
 
 def describe_robots(comparison: RobotComparison) -> Summary:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from mjfim.arrays import NORMAL_95
 from mjfim.errors import first_ones
 from mjfim.identification.accuracy import POORLY_KNOWN_SHARE
 from mjfim.output.summary_parts import (
@@ -19,7 +20,6 @@ from mjfim.output.summary_parts import (
     columns,
 )
 from mjfim.records.estimate import Estimate
-from mjfim.records.intervals import NORMAL_95
 
 # Heading of the standard deviation of the distribution.
 STD = "σ"

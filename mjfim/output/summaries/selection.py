@@ -16,7 +16,7 @@ from mjfim.output.summary_parts import (
     SummaryTable,
     columns,
 )
-from mjfim.records.selection import Decision, HeldOutRefit, Selection, SelectionStep
+from mjfim.records.terms import Decision, HeldOutRefit, Selection, SelectionStep
 
 # What each decision is called in the table.
 WORDS = {

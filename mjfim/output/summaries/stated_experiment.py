@@ -12,7 +12,7 @@ from mjfim.output.summary_parts import (
     columns,
 )
 from mjfim.output.vocabulary import NOMINAL
-from mjfim.records.stated_experiment import StatedExperiment
+from mjfim.records.inventory import StatedExperiment
 
 
 def describe_experiment(stated: StatedExperiment) -> Summary:

@@ -14,6 +14,7 @@ from mjfim.output.summaries.accuracy import relative
 from mjfim.output.summaries.inverse_dynamics import LARGE_SHARE
 from mjfim.output.summaries.robustness import robustness_sentences
 from mjfim.output.vocabulary import shown_word
+from mjfim.records.base import ShownRecord
 from mjfim.records.campaign import Campaign, CampaignStatus
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
@@ -21,9 +22,8 @@ from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
-from mjfim.records.robot_comparison import RobotComparison
+from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import Robustness
-from mjfim.records.shown import ShownRecord
 
 # Ratio of two standard deviations above which one of them counts as smaller.
 RELEVANT_RATIO = 1.05

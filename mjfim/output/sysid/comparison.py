@@ -17,17 +17,15 @@ import numpy as np
 from mujoco import sysid
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
 from mjfim.experiment.system import System
+from mjfim.files import replacing, write_json
 from mjfim.identification.identify import identify_system
 from mjfim.output.summary_parts import Cell, Name, Row, Summary, SummaryTable, columns
 from mjfim.output.sysid.sequences import Exported, build, export, silenced
 from mjfim.output.vocabulary import NOMINAL
 from mjfim.records.estimate import Estimate
-from mjfim.records.events import Callback
-from mjfim.records.progress import begin_stage
-from mjfim.records.recording import Recording
-from mjfim.records.serialization import write_json
+from mjfim.records.events import Callback, begin_stage
+from mjfim.records.trajectory import Recording
 
 # Largest number of iterations of a fit by sysid.
 MAX_ITERATIONS = 200

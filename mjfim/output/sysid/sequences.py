@@ -21,7 +21,7 @@ from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
 from mjfim.model.spec_writer import state_derived_values
 from mjfim.output.mjcf.write import same_dynamics, write_spec
 from mjfim.output.sysid.signals import SignalLayout, WhitenedComparison
-from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Recording
 
 # Distance from the guess to a bound that is not stated, in sizes of the parameter; sysid takes
 # finite bounds only.

@@ -14,9 +14,9 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, first_ones
 from mjfim.experiment.system import System
+from mjfim.files import replacing
 from mjfim.model.inertia import BodyInertia, body_inertia, from_barycentric, to_barycentric
 from mjfim.model.loading import load_written_model
 from mjfim.model.parameters import Parameter, Target

@@ -7,8 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError, RecordingError
+from mjfim.files import replacing
 
 # Format of a video: that of the ending of its file.
 Format = Literal["mp4", "gif", "webp"]

@@ -18,10 +18,9 @@ import pyarrow.parquet
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
+from mjfim.files import check_unpacked_size, read_json
 from mjfim.recordings.formats.table import NOT_NUMERIC, Table, one_line
 from mjfim.recordings.spec import RecordingSpec
-from mjfim.records.serialization import read_json
-from mjfim.records.unpacked_size import check_column_size
 
 # File that makes a folder a dataset, and the column that says to which episode a frame belongs.
 INFO_FILE = "meta/info.json"
@@ -265,7 +264,7 @@ def _rows_of_file(file: Path, episode: int, names: Sequence[str]) -> Any:
 
     held = [name for name in dict.fromkeys(names) if name in schema.names]
     rows = pyarrow.parquet.read_metadata(file).num_rows
-    check_column_size(file, rows, len(held))
+    check_unpacked_size(file, 8 * rows * len(held))
     return pyarrow.parquet.read_table(
         file, columns=held, filters=[(EPISODE_COLUMN, "==", episode)], partitioning=None
     )

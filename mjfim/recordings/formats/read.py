@@ -18,6 +18,7 @@ import pyarrow.parquet
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, shortened
+from mjfim.files import check_unpacked_size
 from mjfim.recordings.formats.json_records import read_json
 from mjfim.recordings.formats.lerobot import (
     is_lerobot_dataset,
@@ -34,7 +35,6 @@ from mjfim.recordings.formats.table import (
     one_line,
 )
 from mjfim.recordings.spec import RecordingSpec
-from mjfim.records.unpacked_size import check_column_size, check_unpacked_size
 
 # Errors that pyarrow and gzip raise for a damaged file.
 DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)
@@ -182,7 +182,7 @@ def _check_packed(path: Path) -> None:
     with path.open("rb") as packed, gzip.GzipFile(fileobj=packed) as stream:
         while chunk := stream.read(CHUNK):
             unpacked += len(chunk)
-            check_unpacked_size(path, packed.tell(), unpacked)
+            check_unpacked_size(path, unpacked)
 
 
 def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
@@ -193,7 +193,7 @@ def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
             check_names(path, names)
 
             needed = columns_to_read(names, spec)
-            check_column_size(path, file.metadata.num_rows, len(needed))
+            check_unpacked_size(path, 8 * file.metadata.num_rows * len(needed))
             unread = tuple(name for name in names if name not in needed)
             return _from_arrow(path, file.read(columns=needed), unread)
     except DAMAGED as error:

@@ -1,16 +1,26 @@
-"""Atomic writing of files: each is written under a temporary name in its folder, then renamed."""
+"""Files: atomic writing under a temporary name, JSON for people, and archives without pickles."""
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import platform
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+from mjfim.errors import RecordingError
+
+# The command line starts without NumPy, which takes longer to import than all else.
+if TYPE_CHECKING:
+    import numpy as np
 
 # Permissions of a new file, from which the umask of the process removes some.
 DEFAULT_PERMISSIONS = 0o666
@@ -176,3 +186,124 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+# ---- JSON for people
+
+
+def as_json(values: Mapping[str, Any]) -> str:
+    """Render values as readable JSON; numbers that are not finite become null."""
+    return json.dumps(_plain(values), indent=2, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write values as a JSON file; an incomplete file never remains."""
+    with replacing(path) as temporary:
+        temporary.write_text(as_json(values), encoding="utf-8")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Raises:
+        RecordingError: There is no such file, or it holds something else.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot read: {error.strerror}") from None
+    except RecursionError:
+        raise RecordingError(f"{path}: not a JSON file (nested too deeply)") from None
+    except ValueError:
+        raise RecordingError(f"{path}: not a JSON file") from None
+
+    if not isinstance(values, dict):
+        raise RecordingError(f"{path}: not a JSON object")
+    return values
+
+
+def _plain(value: Any) -> Any:
+    """Replace arrays and NumPy scalars by lists and numbers, and non-finite numbers by None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+# ---- archives of arrays
+
+# Size of all arrays of a file above which they are not compressed [bytes].
+MAX_COMPRESSED_BYTES = 64 * 2**20
+
+# Largest size of a file's unpacked content, and of the columns read from it [bytes].
+MAX_UNPACKED_SIZE = 4 * 2**30
+
+# Errors that zipfile and NumPy raise for a damaged archive.
+DAMAGED_ARCHIVE = (
+    ValueError,
+    OSError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    RuntimeError,
+    MemoryError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def check_unpacked_size(path: Path, unpacked: int) -> None:
+    """Refuse a file that unpacks to more than is ever read, before memory is allocated.
+
+    Raises:
+        RecordingError: The content is too large.
+    """
+    if unpacked > MAX_UNPACKED_SIZE:
+        raise RecordingError(
+            f"{path}: unpacks to more than {MAX_UNPACKED_SIZE / 2**30:.3g} GiB, the largest size "
+            "that is read; split the file, or name fewer columns"
+        )
+
+
+def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
+    """Read all arrays of an npz file; pickled objects are refused.
+
+    Args:
+        path: The file.
+        kind: Kind of file for messages, such as "design".
+
+    Raises:
+        RecordingError: There is no such file, or it is damaged, too large, or of another kind.
+    """
+    import numpy as np
+
+    if path.is_dir():
+        raise RecordingError(f"{path}: this is a folder; name the {kind} file (.npz) in it")
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such {kind} file")
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            check_unpacked_size(path, sum(member.file_size for member in archive.infolist()))
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as loaded:
+            return dict(loaded)
+    except DAMAGED_ARCHIVE as error:
+        raise RecordingError(
+            f"{path}: not a {kind} archive (npz of named arrays without pickles, as numpy.savez "
+            f"writes it), or damaged: {error}"
+        ) from None
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays as an npz file; an incomplete file never remains."""
+    import numpy as np
+
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        size = sum(array.nbytes for array in arrays.values())
+        save = np.savez if size > MAX_COMPRESSED_BYTES else np.savez_compressed
+        save(stream, allow_pickle=False, **arrays)

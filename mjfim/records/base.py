@@ -1,0 +1,287 @@
+"""Frozen records: read-only arrays, JSON that follows from the fields, files without pickles."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from importlib import import_module
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar, dataclass_transform
+
+import numpy as np
+
+from mjfim.arrays import freeze
+from mjfim.errors import RecordingError
+from mjfim.files import read_arrays, write_arrays, write_json
+
+# Name of the text array in an npz file that holds all fields of a record that are not arrays.
+RECORD = "record"
+
+# Version of the files; another one is refused.
+VERSION = 2
+
+# Largest number of characters of one value, and of entries of a sequence, in a short text.
+MAX_VALUE_LENGTH = 48
+MAX_ENTRIES = 4
+
+# Modules that show records as HTML, and that draw their figures.
+PRESENTATION = "mjfim.output.presentation"
+PICTURES = "mjfim.output.plots.pictures"
+
+T = TypeVar("T")
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(field,))
+def record(kind: type[T]) -> type[T]:
+    """Make a frozen dataclass whose fields are keywords and whose arrays nobody can change."""
+    arrays = tuple(name for name, hint in kind.__annotations__.items() if hint == "Array")
+    kind.array_fields = arrays  # type: ignore[attr-defined]
+    return dataclass(frozen=True, kw_only=True, eq=not arrays, repr=False)(kind)
+
+
+class NamedEnum(Enum):
+    """Outcomes that files hold by their names; the values are sentences for people."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Any:
+        """The member of a name, as a file holds it."""
+        return cls.__members__.get(str(value))
+
+
+class Record:
+    """Base class of records, which the decorator `record` makes dataclasses.
+
+    Attributes:
+        array_fields: Names of the fields that are arrays.
+        in_json: Paths of fields and properties that people read in JSON; default: all fields.
+        json_names: Names in JSON of those that have another one there.
+    """
+
+    array_fields: ClassVar[tuple[str, ...]] = ()
+    in_json: ClassVar[tuple[str, ...]] = ()
+    json_names: ClassVar[Mapping[str, str]] = {}
+
+    # Pydantic refuses what a record does not have.
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = {"extra": "forbid"}
+
+    def __post_init__(self) -> None:
+        freeze(self, *self.array_fields)
+
+    def __repr__(self) -> str:
+        lines = [f"  {each.name}={_short(getattr(self, each.name))}" for each in _fields(self)]
+        return "\n".join([f"{type(self).__name__}(", *lines, ")"])
+
+    @property
+    def words(self) -> str:
+        """The record in words, where it has some."""
+        return str(self)
+
+    def summary(self) -> dict[str, Any]:
+        """The contents of the record in JSON files, which people and other programs read."""
+        found = {}
+        for path in self.in_json or [each.name for each in _fields(self)]:
+            key = self.json_names.get(path, path.rpartition(".")[2])
+            found[key] = _summary(attrgetter(path)(self))
+        return found
+
+
+class SavedRecord(Record):
+    """Base class of records that can be saved and loaded.
+
+    Attributes:
+        file_stem: Name of the two files without their endings.
+        made_by: Command or function that writes the files, for messages.
+        array_names: Names of arrays in the npz file by their path; default: the path.
+    """
+
+    file_stem: ClassVar[str]
+    made_by: ClassVar[str]
+    array_names: ClassVar[Mapping[str, str]] = {}
+
+    def save(self, folder: str | Path) -> None:
+        """Write the record's JSON and npz file; an incomplete file never remains."""
+        self.save_archive(folder)
+        write_json(Path(folder) / f"{self.file_stem}.json", self.summary())
+
+    def save_archive(self, folder: str | Path) -> None:
+        """Write the npz file alone, from which `load` builds the record."""
+        write_arrays(Path(folder) / f"{self.file_stem}.npz", self._archived())
+
+    def as_saved(self) -> Self:
+        """The record as `load` builds it from its files, which are not read."""
+        return self._from_archive(self._archived(), Path(self.file_stem))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a record that was saved.
+
+        Args:
+            path: The folder, or one of the record's two files.
+
+        Raises:
+            RecordingError: There is no such record, or it is damaged, or of another version.
+        """
+        path = Path(path)
+        names = f"{cls.file_stem}.json", f"{cls.file_stem}.npz"
+        if not path.exists():
+            raise RecordingError(f"{path}: no such file or folder")
+        if not path.is_dir() and path.suffix not in (".json", ".npz"):
+            raise RecordingError(
+                f"{path}: {cls.__name__}.load takes a folder, a {names[0]} or a {names[1]}"
+            )
+
+        archive = path / names[1] if path.is_dir() else path.with_suffix(".npz")
+        if not archive.is_file():
+            raise RecordingError(
+                f"{archive}: this file is missing, but {cls.__name__}.load needs it; "
+                f"write it again with {cls.made_by}"
+            )
+        return cls._from_archive(read_arrays(archive, cls.file_stem), archive)
+
+    def _archived(self) -> dict[str, np.ndarray]:
+        """The arrays of the npz file; one of them is the text of all other fields."""
+        arrays: dict[str, np.ndarray] = {}
+        values = _stored(self, "", arrays, self.array_names)
+        text = json.dumps({"type": type(self).__name__, "version": VERSION, "fields": values})
+        return {**arrays, RECORD: np.array(text)}
+
+    @classmethod
+    def _from_archive(cls, arrays: Mapping[str, np.ndarray], path: Path) -> Self:
+        """The record that the arrays of an npz file hold."""
+        advice = f"write it again with {cls.made_by}"
+        try:
+            content = json.loads(str(arrays[RECORD]))
+            kind, version, values = content["type"], content["version"], content["fields"]
+        except (ValueError, KeyError, TypeError):
+            raise RecordingError(
+                f"{path}: the array {RECORD!r} is missing or of another version of mjfim; {advice}"
+            ) from None
+
+        if kind != cls.__name__:
+            raise RecordingError(f"{path}: holds a record of type {kind}, not {cls.__name__}")
+        if version != VERSION:
+            raise RecordingError(f"{path}: has version {version}, not {VERSION}; {advice}")
+
+        # Records share arrays that nobody can change.
+        for array in arrays.values():
+            array.setflags(write=False)
+        try:
+            made: Self = _reader(cls).validate_json(  # type: ignore[arg-type]
+                json.dumps(values), strict=True, context=dict(arrays)
+            )
+        except ValueError as error:
+            raise RecordingError(
+                f"{path}: not a {cls.__name__} of this version of mjfim: {_fault(error)}; {advice}"
+            ) from None
+        return made
+
+
+class ShownRecord(SavedRecord):
+    """Base class of the results of verbs, which can also be shown and drawn."""
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """Names of the figures that `plot` can draw, the usual one first."""
+        names: tuple[str, ...] = import_module(PICTURES).picture_names(self)
+        return names
+
+    def plot(self, picture: str | None = None, *, file: str | os.PathLike[str] = "") -> Any:
+        """Draw a figure of the record; the verbs of the command line write the same figures.
+
+        Args:
+            picture: Name of the figure; default: the usual one, see `pictures`.
+            file: Also write the figure into a file of this name; the ending states the format.
+
+        Returns:
+            The Matplotlib figure.
+        """
+        return import_module(PICTURES).draw(self, picture, file)
+
+    def _repr_html_(self) -> str:
+        """Return the tables and sentences of the record as HTML, for notebooks."""
+        html: str = import_module(PRESENTATION).as_html(self)
+        return html
+
+
+def _fields(value: Any) -> Iterable[Any]:
+    """The fields of a dataclass."""
+    return fields(value)
+
+
+def _summary(value: Any) -> Any:
+    """A value in JSON for people: records by their summaries, outcomes by their names."""
+    if isinstance(value, Record):
+        return value.summary()
+    if isinstance(value, Mapping):
+        return {key: _summary(entry) for key, entry in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_summary(entry) for entry in value]
+    if isinstance(value, Enum):
+        return getattr(value, "in_json", value.name.lower())
+    return value
+
+
+def _stored(value: Any, path: str, arrays: dict[str, np.ndarray], names: Mapping[str, str]) -> Any:
+    """A value in the text of an archive; its arrays are collected, each under its path."""
+    prefix = f"{path}." if path else ""
+    if isinstance(value, np.ndarray):
+        name = names.get(path, path)
+        arrays[name] = value
+        return name
+    if is_dataclass(value):
+        return {
+            each.name: _stored(getattr(value, each.name), f"{prefix}{each.name}", arrays, names)
+            for each in fields(value)
+        }
+    if hasattr(value, "stated"):
+        return value.stated()
+    if isinstance(value, Mapping):
+        return {
+            key: _stored(entry, f"{prefix}{place}", arrays, names)
+            for place, (key, entry) in enumerate(value.items())
+        }
+    if isinstance(value, (tuple, list)):
+        return [_stored(entry, f"{prefix}{i}", arrays, names) for i, entry in enumerate(value)]
+    if isinstance(value, Enum):
+        return value.name
+    return value.item() if isinstance(value, np.generic) else value
+
+
+@cache
+def _reader(kind: type) -> Any:
+    """What builds a record from the text of an archive."""
+    from pydantic import TypeAdapter  # slow, and needed only where a file is read
+
+    return TypeAdapter(kind)
+
+
+def _fault(error: ValueError) -> str:
+    """The first fault that pydantic has found, with the field."""
+    first = error.errors()[0]  # type: ignore[attr-defined]
+    place = ".".join(str(part) for part in first["loc"])
+    return f"the field {place!r}: {first['msg']}"
+
+
+def _short(value: Any) -> str:
+    """Describe a value in a few words: arrays and long values by their size."""
+    if isinstance(value, np.ndarray):
+        return f"<array of shape {value.shape}>"
+    if isinstance(value, Enum):
+        return f"{type(value).__name__}.{value.name}"
+    if is_dataclass(value):
+        return f"<{type(value).__name__}>"
+    if isinstance(value, Mapping):
+        return f"<{len(value)} entries>" if value else "{}"
+
+    text = repr(value)
+    if isinstance(value, (tuple, list)):
+        simple = all(isinstance(entry, (str, int, float)) for entry in value)
+        if not simple or len(value) > MAX_ENTRIES or len(text) > MAX_VALUE_LENGTH:
+            kinds = {type(entry).__name__ for entry in value}
+            return f"<{len(value)} × {kinds.pop() if len(kinds) == 1 else 'values'}>"
+    return text if len(text) <= MAX_VALUE_LENGTH else f"{text[:MAX_VALUE_LENGTH]}…"
