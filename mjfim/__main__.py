@@ -1,7 +1,7 @@
 """`python -m mjfim` and the command `mjfim`.
 
-Reacts to Ctrl-C while the program is imported, and takes no code or settings from the current
-folder, which may hold a file `signal.py` or `matplotlibrc` beside the experiment.
+Reacts to Ctrl-C while the program is imported, and takes no code from the current folder, which
+may hold a file `signal.py` beside the experiment.
 """
 
 import os
@@ -18,11 +18,11 @@ if sys.path and os.path.realpath(sys.path[0]) == os.path.realpath(os.curdir) != 
 os.environ["PYTHONSAFEPATH"] = "1"
 
 import signal  # noqa: E402
+from contextlib import suppress  # noqa: E402
 from types import FrameType  # noqa: E402
 from typing import NoReturn  # noqa: E402
 
 from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS  # noqa: E402
-from mjfim.own_defaults import ignore_settings_of_this_folder  # noqa: E402
 
 
 def main() -> NoReturn:
@@ -32,7 +32,7 @@ def main() -> NoReturn:
     for number in SIGNALS if handled else ():
         signal.signal(number, _end_at_once)
 
-    ignore_settings_of_this_folder()
+    _limit_memory()
     from mjfim.cli.main import main as run_command_line
 
     # Verbs have a handler of their own. After a verb, the program ends by itself.
@@ -41,6 +41,19 @@ def main() -> NoReturn:
     finally:
         for number in SIGNALS if handled else ():
             signal.signal(number, signal.SIG_IGN)
+
+
+def _limit_memory() -> None:
+    """Let work that needs more memory than the computer has fail, before the computer stands still.
+
+    Workers have the same limit. Systems without it, such as Windows, are left as they are.
+    """
+    with suppress(ImportError, AttributeError, OSError, ValueError):
+        import resource
+
+        most = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
 
 
 def _end_at_once(number: int, frame: FrameType | None) -> None:

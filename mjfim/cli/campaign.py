@@ -78,7 +78,6 @@ def campaign(
 
     A simulated campaign that was stopped or killed is continued with --resume.
     """
-    from mjfim.cli.announcements import announce_design
     from mjfim.cli.campaign_run import CampaignRun, with_target_accuracies
     from mjfim.excitation.task import DesignTask
     from mjfim.experiment.input_files import input_files
@@ -96,13 +95,9 @@ def campaign(
     names = run.folder.next_files(simulated=simulated)
     claim_folder(output, names, input_files(stated, recordings or []), force=force)
 
-    # Every round makes a design; its recordings add less time.
-    with progress("estimating how long it takes"):
-        system = run.task.system
-        expected = announce_design(system, is_default=False, work="the design of a round")
     with (
         started_if_stated(place, MAX_PARTS) as workers,
-        progress("designing", expected=expected) as display,
+        progress("designing") as display,
     ):
         display.count_rounds(rounds)
         run.display, run.executor = display, workers

@@ -18,7 +18,6 @@ from mjfim.cli.common import (
     Verbose,
     claim_folder,
     draw_elsewhere,
-    errors,
     print_result,
     progress,
     say_written,
@@ -32,12 +31,10 @@ from mjfim.cli.executors import (
     started_if_stated,
     stated_executor,
 )
-from mjfim.errors import ExperimentError
 from mjfim.output.picture_format import PictureFormat
 
 if TYPE_CHECKING:
-    from mjfim.arrays import Array
-    from mjfim.experiment.system import System
+    pass
 
 
 @verb
@@ -66,11 +63,6 @@ def check(
     """Say which parameters can be identified, how accurately, and which only in combination."""
     if output is not None:
         draw_elsewhere()
-    from mjfim.cli.announcements import (
-        announce_check,
-        announce_check_of_recordings,
-        refusal_of_design,
-    )
     from mjfim.excitation.task_parts import require_design_keys
     from mjfim.experiment.input_files import input_files
     from mjfim.experiment.system import System
@@ -95,18 +87,7 @@ def check(
 
     if not loaded and trajectory is None:
         require_design_keys(system, "check without recordings")
-    with progress("estimating how long it takes"):
-        if loaded:
-            expected = announce_check_of_recordings(system, loaded)
-        else:
-            given = _stated_control(system) if trajectory is None else trajectory.ctrl
-            expected = announce_check(system, given)
-
-        # A design whose iterations take hours is refused, which depends on the machine.
-        refused = None
-        if not loaded and trajectory is None and system.controls:
-            refused = refusal_of_design(system)
-    with started_if_stated(place, MAX_PARTS) as workers, progress("checking", expected=expected):
+    with started_if_stated(place, MAX_PARTS) as workers, progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads, executor=workers)
 
     values = archive.summary_with_origin(result, system, output)
@@ -115,20 +96,4 @@ def check(
         with writing(output) as results:
             results.write_check_folder(output, result, system, pictures)
         say_written(output)
-    if refused is not None:
-        errors.print(f"mjfim: `mjfim design` refuses this experiment: {refused}", markup=False)
-    raise typer.Exit(0 if result.ok and refused is None else 1)
-
-
-def _stated_control(system: System) -> Array:
-    """Initial control that the experiment states: (N, nu) [unit of the actuator].
-
-    Raises:
-        ExperimentError: The horizon or the signal cannot be used; the message names the file.
-    """
-    from mjfim.excitation.task_parts import stated_control
-
-    try:
-        return stated_control(system)
-    except ExperimentError as error:
-        raise ExperimentError(f"{system.experiment.source}: {error}") from None
+    raise typer.Exit(0 if result.ok else 1)

@@ -12,7 +12,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from textwrap import wrap
@@ -467,14 +466,8 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         except (InterruptedByUserError, NoResultError, UnfinishedError):
             _say_what_is_there(interruption)
             raise typer.Exit(INTERRUPTED_CODE) from None
-        except MjfimError as error:
-            errors.print(f"mjfim: {error}", markup=False)
-            raise typer.Exit(2) from None
-        except OSError as error:
-            place = error.filename or "cannot write"
-            fault = error.strerror or error
-            errors.print(f"mjfim: {place}: {fault}", markup=False)
-            raise typer.Exit(1) from None
+        except (MjfimError, MemoryError, OSError) as error:
+            raise _told(error) from None
         except typer.Exit as end:
             # An interrupted verb did not do all that it was asked for.
             if interruption.incomplete:
@@ -493,6 +486,20 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
 
     app.command(function.__name__.rstrip("_").replace("_", "-"), cls=VerbCommand)(wrapped)
     return wrapped
+
+
+def _told(error: MjfimError | MemoryError | OSError) -> typer.Exit:
+    """Print one message about an error, and return the end of the verb with its exit code."""
+    message, code = str(error), 2
+    if isinstance(error, MemoryError):
+        message = (
+            f"there is not enough memory ({error or 'nothing is left'}); a shorter horizon, a "
+            "lower rate, or fewer parameters, recordings or trials need less"
+        )
+    elif isinstance(error, OSError):
+        message, code = f"{error.filename or 'cannot write'}: {error.strerror or error}", 1
+    errors.print(f"mjfim: {message}", markup=False)
+    return typer.Exit(code)
 
 
 @contextmanager
@@ -597,19 +604,6 @@ def watched(address: str | None, system: System, display: Callback) -> Iterator[
             show(event)
 
         yield both
-
-
-@dataclass(frozen=True, kw_only=True)
-class Duration:
-    """How long some work takes.
-
-    Attributes:
-        seconds: The time [s].
-        word: How certain it is: "about" or "at most".
-    """
-
-    seconds: float
-    word: str = "about"
 
 
 class _Rounds:
@@ -840,14 +834,14 @@ class ProgressDisplay:
 
 @contextmanager
 def progress(
-    description: str, line_seconds: float = LINE_SECONDS, *, expected: Duration | None = None
+    description: str, line_seconds: float = LINE_SECONDS, *, at_most: float | None = None
 ) -> Iterator[ProgressDisplay]:
     """Show the progress of a long computation on stderr, with the time that is left.
 
     Args:
         description: Text until the first event.
         line_seconds: Silent time after which a line is printed, if stderr is not a terminal [s].
-        expected: Time that the whole takes; None if it is not known.
+        at_most: Time at which the work ends in any case [s]; None without one.
 
     Yields:
         The display, which is called with every event.
@@ -855,7 +849,7 @@ def progress(
     # On a narrow terminal the text is folded, so that the times are not cut.
     folded = Column(no_wrap=False, overflow="fold")
     text = TextColumn("{task.description}", markup=False, table_column=folded)
-    columns = (SpinnerColumn(), text, _Bar(bar_width=BAR_WIDTH), _TimeColumn(expected))
+    columns = (SpinnerColumn(), text, _Bar(bar_width=BAR_WIDTH), _TimeColumn(at_most))
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
         display = ProgressDisplay(bar, description)
         with (
@@ -879,28 +873,23 @@ class _Bar(BarColumn):
 class _TimeColumn(ProgressColumn):
     """The time since the work began, and the time that it takes."""
 
-    def __init__(self, expected: Duration | None) -> None:
-        """Show how long some work takes.
-
-        Args:
-            expected: Time that the whole takes; None if it is not known.
-        """
+    def __init__(self, at_most: float | None) -> None:
+        """Set the time at which the work ends in any case [s]; None without one."""
         super().__init__()
-        self._expected = expected
+        self._at_most = at_most
 
     def render(self, task: Task) -> Text:
         """Write the times of a task."""
         elapsed = task.elapsed or 0.0
         text = clock(elapsed)
-        expected = self._expected
         done = task.completed / task.total if task.total else 0.0
         rounds = task.fields.get("rounds")
         if rounds is not None and rounds.seconds_left is not None:
             text += f", at most about {clock(rounds.seconds_left)} left"
         elif task.fields.get("is_whole") and LEAST_DONE <= done < 1.0:
             text += f", about {clock(elapsed * (1.0 / done - 1.0))} left"
-        elif expected is not None and expected.seconds > elapsed:
-            text += f" of {expected.word} {clock(expected.seconds)}"
+        elif self._at_most is not None and self._at_most > elapsed:
+            text += f" of at most {clock(self._at_most)}"
         elif LEAST_DONE <= done < 1.0:
             of_parts = time.monotonic() - task.fields["part_began"]
             text += f", about {clock(of_parts * (1.0 / done - 1.0))} left"

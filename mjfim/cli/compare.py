@@ -63,7 +63,6 @@ def compare(
 
     The exit code is 1 if one of them is better than the design.
     """
-    from mjfim.cli.announcements import announce_comparison
     from mjfim.excitation.task import DesignTask
     from mjfim.experiment.input_files import input_files
     from mjfim.output import archive
@@ -79,7 +78,6 @@ def compare(
     baselines = chosen_methods(task, chosen)
     names = comparison_files(baselines)
     claim_folder(output, pictures.files(names), input_files(task.experiment), force=force)
-    announce_comparison(len(baselines) + 1, seconds)
     with started_if_stated(place, MAX_PARTS) as workers, progress("comparing") as show:
         result = compare_task(
             task,

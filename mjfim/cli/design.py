@@ -14,7 +14,6 @@ from mjfim.amounts import MAX_STARTS
 from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.cli.common import (
     AsJson,
-    Duration,
     ExperimentFile,
     Folder,
     Force,
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
 
     from mjfim.excitation.shortest_horizon import ShortestExperiment
     from mjfim.excitation.task import DesignTask
-    from mjfim.experiment.system import System
     from mjfim.parallel import Workers
     from mjfim.parallel.stated import StatedExecutor
     from mjfim.records.design import Design
@@ -67,10 +65,10 @@ def several(task: DesignTask, stated: StatedExecutor) -> Iterator[Workers | None
         The workers; None on this computer for a single initial control, and for few of them without
         hard limits, each of which uses all threads.
     """
-    from mjfim.cli.announcements import number_of_starts
-
     threads = task.plant.simulator.threads
-    count = number_of_starts(task.system)
+    descent = task.experiment.descent
+    further = len(descent.previous) + len(descent.fourier) + len(descent.repeats)
+    count = descent.starts + further
     if not task.is_limited and count < (stated.processes or threads):
         count = 1
     with started_executor(stated, count, threads) as workers:
@@ -122,16 +120,15 @@ def design(
 
     # A design that states no time ends all the same. The shortest horizon takes many designs.
     has_default = stated.descent.seconds is None and not shortest
-    with progress("estimating how long it takes"):
-        system, expected = _announced(system, has_default)
-        task = DesignTask.of(system)
+    task = _timed(DesignTask.of(system), has_default)
+    most = None if shortest else task.experiment.descent.seconds
     names = (*DESIGN_FILES, *(SHORTEST_FILES if shortest else ()))
     claim_video(video, input_files(stated), force=force)
     claim_folder(output, pictures.files(names), input_files(stated), force=force)
 
     with (
         several(task, place) as workers,
-        progress("designing", expected=expected) as display,
+        progress("designing", at_most=most) as display,
         watched(live, system, display) as show,
         stop_on_interrupt() as stop,
     ):
@@ -173,6 +170,14 @@ def design(
     raise typer.Exit(0 if is_done else 1)
 
 
+def _timed(task: DesignTask, has_default: bool) -> DesignTask:
+    """A design that ends after the default time where it states none."""
+    if not has_default:
+        return task
+    experiment = task.experiment.replace(descent={"seconds": DEFAULT_SECONDS})
+    return replace(task, system=replace(task.system, experiment=experiment))
+
+
 def _inseparable(result: Design) -> str:
     """Sentence about parameters that do the same, which `mjfim check` says, too."""
     groups = first_ones(result.combinations, "; ")
@@ -181,21 +186,6 @@ def _inseparable(result: Design) -> str:
         f"parameters: {groups}. Remove or fix one of each group, give it a prior, or measure "
         "another output"
     )
-
-
-def _announced(system: System, has_default: bool) -> tuple[System, Duration | None]:
-    """The system with the default time where none is stated, and the time that a design takes.
-
-    Args:
-        system: The system, whose experiment states the design.
-        has_default: True if the default time ends the design.
-    """
-    from mjfim.cli.announcements import announce_design
-
-    if has_default:
-        limited = system.experiment.replace(descent={"seconds": DEFAULT_SECONDS})
-        system = replace(system, experiment=limited)
-    return system, announce_design(system, is_default=has_default)
 
 
 def _say_if_default_ended(result: Design, has_default: bool) -> None:

@@ -34,7 +34,6 @@ def export_sysid(
     force: Force = False,
 ) -> None:
     """Pass recordings and parameters to mujoco.sysid, and compare its estimates with mjfim's."""
-    from mjfim.cli.announcements import announce_fit
     from mjfim.experiment.input_files import input_files
     from mjfim.experiment.system import System
     from mjfim.output.folders import SYSID_FILES
@@ -50,7 +49,6 @@ def export_sysid(
     with progress("reading"):
         logs = recording_paths(recordings, system.channels)
         loaded = [read_recording(path, system.channels) for path in logs]
-        announce_fit(system, loaded)
 
     with progress("fitting") as show:
         result = sysid_comparison.compare_with_sysid(system, loaded, show)

@@ -99,7 +99,6 @@ def identify(
     executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Estimate the parameters from recordings, with intervals, predictions and warnings."""
-    from mjfim.cli.announcements import announce_fit
     from mjfim.experiment.input_files import input_files
     from mjfim.experiment.system import System
     from mjfim.identification.identify import identify_system
@@ -131,7 +130,6 @@ def identify(
     with progress("reading"):
         fitted = [read_log(path, system.channels) for path in logs]
         predicted = [read_log(path, system.channels) for path in held_out_logs]
-        announce_fit(system, [log.recording for log in fitted])
     with (
         started_if_stated(place, MAX_PARTS) as workers,
         progress("fitting") as display,

@@ -35,7 +35,6 @@ from mjfim.cli.common import (
 from mjfim.cli.executors import (
     LOCAL,
     ExecutorPlace,
-    started_executor,
     started_if_stated,
     stated_executor,
 )
@@ -125,13 +124,12 @@ def montecarlo(
     executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Compare estimates with the Cramér-Rao bound on the initial and on the designed trajectory."""
-    from mjfim.cli.announcements import ANNOUNCED_SECONDS, announce_trials
     from mjfim.experiment.input_files import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
     from mjfim.output.folders import study_files
     from mjfim.output.presentation import describe
-    from mjfim.studies.monte_carlo import monte_carlo_system, require_memory_for_trials
+    from mjfim.studies.monte_carlo import monte_carlo_system
 
     place = stated_executor(executor)
     stated = mjfim.Experiment.from_file(experiment)
@@ -144,14 +142,9 @@ def montecarlo(
     inputs = input_files(system.experiment, [design_file])
     claim_folder(output, pictures.files(study_files(system.parameters.names)), inputs, force=force)
 
-    require_memory_for_trials(system, named, trials)
-    expected = announce_trials(system, named, trials)
-
-    # The start of processes takes longer than a short study.
-    start = started_executor if expected.seconds >= ANNOUNCED_SECONDS else started_if_stated
     with (
-        start(place, trials) as workers,
-        progress(f"{trials} trials", expected=expected) as display,
+        started_if_stated(place, trials) as workers,
+        progress(f"{trials} trials") as display,
         watched(live, system, display) as show,
     ):
         study = monte_carlo_system(

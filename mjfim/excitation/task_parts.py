@@ -6,7 +6,6 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, listed, shortened, unknown
-from mjfim.excitation.design_memory import require_memory_for_design
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.robust import ParameterSamples
 from mjfim.experiment.control_signal import generate
@@ -158,7 +157,6 @@ def stated_control(system: System) -> Array:
     experiment, grid = system.experiment, system.stated_grid
     source = experiment.initial.control
     count = sample_count(experiment, grid.stride)
-    require_memory_for_design(system, count)
     t = np.arange(count, dtype=np.float64) * grid.dt
 
     # A model without actuators moves by itself; its control has no columns.

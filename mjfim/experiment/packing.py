@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mjfim.errors import ModelError
 from mjfim.experiment.schema import Experiment
-from mjfim.model.loading import ModelSource, check_model_file
+from mjfim.model.loading import ModelSource
 from mjfim.model.model_files import files_of_model
 from mjfim.model.packed_files import PackedFiles
 from mjfim.model.packed_models import packed_model
@@ -28,7 +28,6 @@ def packed(experiment: Experiment) -> Experiment:
     if before.content(model) is None:
         if not model.is_file():
             raise ModelError(f"{model}: no such model file")
-        check_model_file(model)
         needed += files_of_model(model)
     return experiment.model_copy(update={"files": PackedFiles.read(needed, before)})
 

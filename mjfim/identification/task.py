@@ -13,7 +13,6 @@ from mjfim.errors import ExperimentError, listed, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
-from mjfim.identification.fit_memory import require_memory_for_recordings
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.same_data import refuse_same_data
 from mjfim.records.trajectory import Recording
@@ -117,7 +116,6 @@ class FitTask:
 
         _require_held(system, settings.hold)
         refuse_same_data(recordings, held_out)
-        require_memory_for_recordings(system, [*recordings, *held_out], fit=True)
         return cls(
             system=system,
             recordings=tuple(recordings),

@@ -14,8 +14,6 @@ import mujoco
 
 from mjfim.errors import ModelError
 from mjfim.model.coordinates import ModelCoordinates
-from mjfim.model.expanded_size import check_expanded_size
-from mjfim.model.finite_numbers import check_compiled_numbers, check_file_numbers
 from mjfim.model.model_files import files_of_model
 from mjfim.model.mujoco_log import collected_warnings, tell_once
 from mjfim.model.terms.extension import StateLayout, extended_spec
@@ -29,8 +27,7 @@ def load_spec(path: Path) -> Any:
         path: The file.
 
     Raises:
-        ModelError: The file is absent or no model, holds NaN, expands to a model that would fill
-            the memory, or MuJoCo cannot read it; then the message is MuJoCo's.
+        ModelError: The file is absent or no model, or MuJoCo cannot read it.
     """
     if not path.is_file():
         raise ModelError(f"{path}: no such model file")
@@ -39,27 +36,11 @@ def load_spec(path: Path) -> Any:
             f"{path}: an experiment file, but a model (MJCF or URDF) is needed, such as the one "
             "that this file states"
         )
-    check_model_file(path)
     return _parsed_spec(path, _engine_path(path), None)
-
-
-def check_model_file(path: Path) -> None:
-    """Check a model file before MuJoCo reads it.
-
-    Args:
-        path: MJCF or URDF file.
-
-    Raises:
-        ModelError: A number is not finite, or the model would not fit into the memory.
-    """
-    check_file_numbers(path)
-    check_expanded_size(path)
 
 
 def load_packed_spec(path: Path, files: Any) -> Any:
     """MjSpec of an MJCF or URDF file that is not on the disk.
-
-    The file was checked when it was packed (`check_model_file`), so that it is not checked again.
 
     Args:
         path: The file.
@@ -79,6 +60,9 @@ def _parsed_spec(path: Path, name: str, files: Any) -> Any:
     except ValueError as error:
         raise ModelError(f"{path}: MuJoCo cannot read the model: {str(error).strip()}") from None
 
+    # MuJoCo takes NaN for a number that is not stated, or computes with it.
+    if any("NaN" in warning for warning in found):
+        raise ModelError(f"{path}: the model contains NaN; every number must be finite")
     tell_once(path, found)
     return spec
 
@@ -172,7 +156,6 @@ class ModelSource:
         self.path = path
         self.spec = self._loaded(path, files) if spec is None else spec
         self.model = compile_spec(self.spec, path, tells=True, files=files)
-        check_compiled_numbers(self.model, path)
         self.terms: dict[str, Term] = {}
         self.layout: StateLayout | None = None
         self._files = files

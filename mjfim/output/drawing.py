@@ -154,9 +154,6 @@ def picture_contents(record: ShownRecord) -> dict[str, bytes]:
 
 def _import_what_draws() -> None:
     """Import all modules that draw pictures, before there is anything to draw."""
-    from mjfim.own_defaults import ignore_settings_of_this_folder
-
-    ignore_settings_of_this_folder()
     from mjfim.output.plots import pictures, style  # noqa: F401
 
 

@@ -4,9 +4,8 @@ from .comparison import Comparison, MethodOutcome
 from .design import Design, Status
 from .estimate import Estimate
 from .monte_carlo import MonteCarloStudy
-from .recording import Recording
 from .robustness import RobotConditions, Robustness
-from .trajectory import Trajectory
+from .trajectory import Recording, Trajectory
 
 __all__ = [
     "Campaign",

@@ -22,7 +22,6 @@ from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
-from mjfim.identification.fit_memory import require_memory_for_recordings
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.same_data import refuse_same_data
@@ -161,7 +160,6 @@ def check_recordings(
     See `check`.
     """
     refuse_same_data(recordings, ())
-    require_memory_for_recordings(system, recordings, fit=False)
     begin_stage("simulating the recordings")
     fit = FitProblem.of(system, recordings, data_only=True)
     if executor is not None:

@@ -21,7 +21,6 @@ from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.information.identifiability import require_visible
-from mjfim.memory import NUMBER_BYTES, require_memory
 from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
@@ -36,9 +35,8 @@ from mjfim.studies.trial_chunks import (
 # Largest size of the Jacobians of all trials that are stepped together [bytes].
 CHUNK_BYTES = 1e8
 
-# Copies of all estimates that exist at the same time: of both trajectories, for their statistics
-# and for the files.
-ESTIMATE_COPIES = 6
+# Bytes of one number.
+NUMBER_BYTES = 8
 
 # Smallest number of trials that are stepped together, where their memory and their time permit it.
 # With fewer of them, sending and receiving them takes a considerable part of the time.
@@ -91,7 +89,7 @@ def monte_carlo(
             runs the trials side by side; the estimates do not depend on it.
 
     Raises:
-        ExperimentError: Fewer than two trials, or more than fit into memory.
+        ExperimentError: Fewer than two trials.
         SimulationDivergedError: The model diverges at the true values.
         UnidentifiableError: A parameter has no effect on the data.
     """
@@ -127,8 +125,6 @@ def monte_carlo_system(
         raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
     workers = Workers.of_any(executor)
-    beside = 1 if workers is None else workers.local_count
-    require_memory_for_trials(system, named, trials, side_by_side=beside)
 
     # Fail before the first trial where a trajectory cannot be simulated.
     for curve in named.values():
@@ -174,44 +170,6 @@ def _calibrated_systems(system: System, named: Mapping[str, Trajectory]) -> dict
         name: system.released_as(curve.state[0]).calibrated(system.theta, curve.ctrl)
         for name, curve in named.items()
     }
-
-
-def require_memory_for_trials(
-    system: System,
-    trajectories: Mapping[str, Trajectory],
-    trials: int,
-    *,
-    side_by_side: int = 1,
-    available: float | None = None,
-) -> None:
-    """Refuse trials that do not fit into memory.
-
-    Args:
-        system: The system whose parameters are estimated.
-        trajectories: Trajectories by name.
-        trials: Number of repetitions of each.
-        side_by_side: Number of chunks that run at the same time on this computer.
-        available: Memory that is there [bytes]; None for that of this machine.
-
-    Raises:
-        ExperimentError: The estimates, or the trials that are stepped together, do not fit.
-    """
-    p = len(system.parameters)
-    needed = NUMBER_BYTES * ESTIMATE_COPIES * float(trials) * p
-    needed += max(
-        _trials_at_once(chunk_sizes(system, len(curve.ctrl), trials), side_by_side)
-        * _trial_bytes(system, len(curve.ctrl))
-        for curve in trajectories.values()
-    )
-    cause = f"trials: {trials}"
-    if side_by_side > 1:
-        cause += f", on {side_by_side} workers of this computer"
-    require_memory(needed / NUMBER_BYTES, cause, available=available)
-
-
-def _trials_at_once(sizes: Sequence[int], count: int) -> int:
-    """Number of trials of some chunks that run at the same time."""
-    return sum(sorted(sizes)[-count:])
 
 
 def chunk_sizes(system: System, samples: int, trials: int) -> tuple[int, ...]:

@@ -29,10 +29,12 @@ def test_a_stated_number_of_processes_is_used_where_there_are_as_many_starts(
         yield
 
     monkeypatch.setattr(design, "started_executor", started)
-    monkeypatch.setattr("mjfim.cli.announcements.number_of_starts", lambda system: 2)
     simulator = SimpleNamespace(threads=4)
+    descent = SimpleNamespace(starts=2, previous=(), fourier=(), repeats=())
     task: Any = SimpleNamespace(
-        plant=SimpleNamespace(simulator=simulator), is_limited=False, system=None
+        plant=SimpleNamespace(simulator=simulator),
+        is_limited=False,
+        experiment=SimpleNamespace(descent=descent),
     )
     with design.several(task, StatedExecutor.parse(place)):
         assert found == [tasks]

@@ -23,7 +23,7 @@ from mjfim.output.folders import DESIGN_ARCHIVE, TABLE_FILES
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, FitEvent, StudyEvent
-from mjfim.studies import derivative_test, duration
+from mjfim.studies import derivative_test
 from mjfim.studies import monte_carlo as trials
 from tests.support.cli import (
     DESIGN,
@@ -59,17 +59,6 @@ def test_interrupted_before_a_result(
     result = run(verb, study, *inputs, "-o", tmp_path / "out")
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr == "mjfim: interrupted before there was a result; nothing was written\n"
-    assert names(tmp_path) == set()
-
-
-def test_a_press_while_the_duration_is_estimated(
-    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """An estimate that fails is left out, but a press of the user is no such failure."""
-    monkeypatch.setattr(duration, "estimated_seconds", interrupt)
-    result = run("check", study, "-o", tmp_path / "out")
-    assert (result.exit_code, result.stdout) == (1, "")
-    assert result.stderr == f"mjfim: {NOTHING_SENTENCE}\n"
     assert names(tmp_path) == set()
 
 
@@ -157,7 +146,6 @@ def test_an_interrupted_check_is_written_and_marked_as_incomplete(
         return whole(*arguments)
 
     monkeypatch.setattr(derivative_test, "recursion_error", recursion_error)
-    monkeypatch.setattr(duration, "estimated_seconds", lambda *_, **__: 0.0)
     result = run("check", study, "-o", tmp_path / "out")
     assert result.exit_code == 1
     assert "this check is incomplete; it lacks the test of the derivatives" in result.stdout

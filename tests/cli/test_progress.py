@@ -14,7 +14,6 @@ import mjfim
 from mjfim.cli import common
 from mjfim.cli.common import (
     VIDEO_WEIGHT,
-    Duration,
     MessageConsole,
     ProgressDisplay,
     _TimeColumn,
@@ -55,9 +54,8 @@ def test_the_time_that_is_left_is_shown() -> None:
     task = bar.tasks[0]
     task.start_time, task.stop_time = 0.0, 30.0
     assert str(_TimeColumn(None).render(task)) == "0:30"
-    most = Duration(seconds=120.0, word="at most")
-    assert str(_TimeColumn(most).render(task)) == "0:30 of at most 2:00"
-    assert str(_TimeColumn(Duration(seconds=10.0)).render(task)) == "0:30"
+    assert str(_TimeColumn(120.0).render(task)) == "0:30 of at most 2:00"
+    assert str(_TimeColumn(10.0).render(task)) == "0:30"
     bar.update(number, total=4, completed=1)
     assert str(_TimeColumn(None).render(task)).endswith("left")
 
@@ -128,7 +126,7 @@ def test_no_time_is_cut_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) ->
     """Long descriptions are folded between words."""
     console = MessageConsole(file=io.StringIO(), force_terminal=True, width=60)
     monkeypatch.setattr(common, "errors", console)
-    with common.progress("designing", expected=Duration(seconds=4000.0)) as display:
+    with common.progress("designing", at_most=4000.0) as display:
         display.describe("a description that is so long that it does not fit in one line")
     written = console.file.getvalue()  # type: ignore[attr-defined]
     assert "1:06:40" in written and "…" not in written

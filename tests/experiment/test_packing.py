@@ -73,18 +73,6 @@ def test_a_packed_experiment_needs_no_file_and_has_the_same_cost(tmp_path: Path)
     assert cost_of(received) == before
 
 
-def test_a_model_is_checked_when_it_is_packed(tmp_path: Path) -> None:
-    """Workers do not check packed models again."""
-    experiment = stated(tmp_path)
-    model = tmp_path / "robot" / "tool.xml"
-    model.write_text(
-        '<mujoco>\n<worldbody>\n<body name="arm"><joint/><geom size="1" mass="nan"/></body>\n'
-        "</worldbody>\n</mujoco>\n"
-    )
-    with pytest.raises(ModelError, match="must be finite"):
-        experiment.packed()
-
-
 def test_a_packed_experiment_does_not_see_later_changes_of_its_files(tmp_path: Path) -> None:
     experiment = stated(tmp_path)
     packed = experiment.packed()

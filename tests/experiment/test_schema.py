@@ -585,7 +585,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "timestep not a number": (
         edited("cart_pendulum.xml", "nan.xml"),
         M,
-        ["nan.xml", "timestep", "finite"],
+        ["nan.xml", "NaN", "finite"],
     ),
     "timestep negative": (
         edited("cart_pendulum.xml", "backward.xml"),

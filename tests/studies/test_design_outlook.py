@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim import memory
-from mjfim.cli import announcements
-from mjfim.errors import ExperimentError, MjfimError, SimulationDivergedError
+from mjfim.errors import MjfimError, SimulationDivergedError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.task import DesignTask
 from mjfim.studies import derivative_test
 from mjfim.studies.check import check_task
 from tests.support import stiff_servos
@@ -94,19 +91,6 @@ def test_a_start_that_diverges_is_refused_in_the_same_words(
     assert said[0] == said[1]
 
 
-def test_a_horizon_that_fills_the_memory_is_refused_in_the_same_words(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(memory, "available_memory", lambda: 1e6)
-    said = []
-    for work in (mjfim.design, mjfim.check):
-        with pytest.raises(ExperimentError, match=r"GiB of memory, and .* are available") as error:
-            work(stiff_arm_experiment(tmp_path))
-        said.append(str(error.value))
-    assert said[0] == said[1]
-    assert "horizon: 1 s at 50 Hz" in said[0]
-
-
 def test_parameters_that_do_the_same_are_named_by_both(tmp_path: Path) -> None:
     parameters = {
         "a": {"target": "joint/shoulder:damping"},
@@ -148,19 +132,6 @@ def test_a_motion_without_a_regulator_fails_the_self_test_without_a_traceback(
     assert np.isinf(found.self_test.slope)
     assert not found.self_test.passed
     assert not found.ok
-
-
-def test_a_check_refuses_iterations_of_hours_in_the_words_of_a_design(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    system = DesignTask.resolve(stiff_arm_experiment(tmp_path), threads=1).system
-    assert announcements.refusal_of_design(system) is None
-
-    monkeypatch.setattr(announcements, "iteration_seconds", lambda *_, **__: 7200.0)
-    refused = announcements.refusal_of_design(system)
-    with pytest.raises(ExperimentError, match="one iteration would take about 2 hours") as error:
-        announcements.announce_design(system, is_default=True)
-    assert str(error.value) == refused
 
 
 @pytest.mark.parametrize(("angle", "grows"), [(0.0, True), (3.0, False)], ids=["up", "down"])

@@ -16,7 +16,6 @@ from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import verify
 from mjfim.experiment.schema import Experiment
 from mjfim.studies.check import check
-from mjfim.studies.first_experiment import propose
 from mjfim.studies.first_experiment.document import experiment_text
 from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
 from mjfim.studies.first_experiment.selection import identifiable, separable
@@ -338,23 +337,6 @@ def arm(actuator: str, *, size: float = 1.0, mass: float = 1.0, gravcomp: float 
         actuator=actuator,
     )
     return mujoco.MjModel.from_xml_string(text)
-
-
-def test_candidates_that_do_not_fit_into_memory_are_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A large model gets a first experiment, and is not refused after all trials."""
-    sizes: list[float] = []
-
-    def fits(needed: float) -> bool:
-        """Whether the memory of the smallest number of candidates is reached."""
-        sizes.append(needed)
-        return len(sizes) > 2
-
-    monkeypatch.setattr(propose, "fits_memory", fits)
-    proposal = propose_experiment(MODELS / "cart_pendulum.xml", tmp_path)
-    assert sizes == sorted(sizes, reverse=True)
-    assert 1 <= len(proposal.chosen) <= (len(proposal.chosen) + len(proposal.others)) // 4
 
 
 @pytest.mark.parametrize(("size", "mass"), [(1e-3, 1e-6), (1.0, 1.0), (1e3, 1e6)])

@@ -13,13 +13,11 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, ModelError, SimulationDivergedError
-from mjfim.excitation.design_memory import design_bytes, require_memory_for_design
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import verify
 from mjfim.excitation.violations import violations_of
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.memory import fits_memory
 from mjfim.model.elements import unnamed_count
 from mjfim.model.loading import ModelSource
 from mjfim.model.mujoco_log import silence_mujoco_log
@@ -43,7 +41,6 @@ from mjfim.studies.first_experiment.release import (
 )
 from mjfim.studies.first_experiment.selection import (
     identifiable,
-    largest_fitting,
     separable,
 )
 from mjfim.studies.first_experiment.start import Start, choose_start, influence_of_controls
@@ -351,7 +348,6 @@ class _Refinement:
         # One parameter is enough where only the motion matters, and much quicker.
         lean = replace(draft, chosen=draft.chosen[:1])
         system = System.resolve(self._experiment(lean), source=self.source)
-        require_memory_for_design(system, draft.times.samples)
         rest = self._begins_at_rest(system, lean)
 
         remarks: list[str] = []
@@ -538,19 +534,7 @@ class _Refinement:
         return draft.times.samples
 
     def _identified(self, draft: Proposal) -> Sequence[int]:
-        """Indices of the candidates that the chirp or the release identifies together.
-
-        Of a large model, only the first candidates are looked at: as many as memory permits.
-        """
-
-        def fits(count: int) -> bool:
-            """Whether the information about the first candidates fits into memory."""
-            part = replace(draft, chosen=draft.chosen[:count])
-            tried = System.resolve(self._experiment(part), source=self.source)
-            return fits_memory(design_bytes(tried, draft.times.samples))
-
-        count = largest_fitting(len(draft.chosen), fits)
-        draft = replace(draft, chosen=draft.chosen[:count])
+        """Indices of the candidates that the chirp or the release identifies together."""
         system = System.resolve(self._experiment(draft), source=self.source)
         task = self._task(system, draft)
         point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)

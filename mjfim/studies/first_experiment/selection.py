@@ -102,21 +102,6 @@ def separable(directions: Array) -> Sequence[int]:
     return sorted(kept)
 
 
-def largest_fitting(count: int, fits: Callable[[int], bool]) -> int:
-    """Halve a number of parameters until their information fits into memory.
-
-    Args:
-        count: Number of parameters.
-        fits: Whether the information about this number of parameters fits.
-
-    Returns:
-        The number, at least 1.
-    """
-    while count > 1 and not fits(count):
-        count //= 2
-    return count
-
-
 def _largest_std(F: Array, members: list[int]) -> float:
     """Largest standard deviation of some parameters that are estimated together."""
     part = F[np.ix_(members, members)]
