@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mjfim.identification.inverse_dynamics import inverse_dynamics
     from mjfim.identification.parameter_draws import draw_parameters
     from mjfim.output.live import live
+    from mjfim.output.models.sysid import export_sysid
     from mjfim.output.robot.export import export_design
     from mjfim.output.video.results import save_video
     from mjfim.parallel import ExecutorLike, Pool, Workers
@@ -77,6 +78,7 @@ __all__ = [
     "draw_parameters",
     "evaluate",
     "export_design",
+    "export_sysid",
     "identify",
     "identify_payload",
     "inverse_dynamics",
@@ -109,6 +111,7 @@ MODULES = {
     "inverse_dynamics": "mjfim.identification.inverse_dynamics",
     "draw_parameters": "mjfim.identification.parameter_draws",
     "export_design": "mjfim.output.robot.export",
+    "export_sysid": "mjfim.output.models.sysid",
     "live": "mjfim.output.live",
     "save_video": "mjfim.output.video.results",
     "ExecutorLike": "mjfim.parallel",

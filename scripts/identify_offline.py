@@ -57,7 +57,7 @@ def identify(experiment: Path, files: list[Path], *, force: bool) -> int:
     from mjfim.experiment.system import System
     from mjfim.identification.identify import identify_system
     from mjfim.output.manifest import OutputGuard, claimed
-    from mjfim.output.mjcf.write import write_identified
+    from mjfim.output.models.mjcf import write_identified
     from mjfim.recordings.read import read_recording
 
     # The experiment file says what is unknown, where to start, and how noisy each output is.
@@ -82,8 +82,8 @@ def identify(experiment: Path, files: list[Path], *, force: bool) -> int:
 
     # Write the model with the estimated values.
     with claimed(target.parent, guard, exclusive=False):
-        remark = write_identified(target, system, estimate.theta)
-    print(f"wrote {target}{f' ({remark})' if remark else ''}")
+        remarks = write_identified(target, system, estimate.theta)
+    print("; ".join([f"wrote {target}", *remarks]))
     return 0 if estimate.success and not estimate.misfit else 1
 
 

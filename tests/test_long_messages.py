@@ -19,7 +19,6 @@ from mjfim.identification.fit_start import _divergence
 from mjfim.identification.report import _warnings_of_bounds, _warnings_of_search
 from mjfim.identification.task import _start
 from mjfim.output.campaign_folder import accuracy_sentence
-from mjfim.output.mjcf import write
 from mjfim.output.summaries.robustness import MAX_MISSED_LIMITS, _limit_sentences
 from mjfim.records.campaign import missed_targets
 from mjfim.records.check import (
@@ -262,17 +261,3 @@ def test_faults_of_an_experiment_with_many_joints_are_short(
         DesignTask.resolve(Experiment.from_file(many_joints))
     message = str(raised.value)
     assert len(message) < LONGEST_MESSAGE and named in message, message
-
-
-def test_remarks_on_an_identified_model_list_the_first_bodies(
-    many_joints: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    system = DesignTask.resolve(Experiment.from_file(many_joints)).system
-    monkeypatch.setattr(write, "_write_edited", lambda *_: list(NAMES))
-    monkeypatch.setattr(write, "_reweighted_bodies", lambda *_, **__: NAMES)
-    monkeypatch.setattr(write, "unconstrained", lambda _: False)
-    path = tmp_path / "many.xml"
-    remark = write.write_identified(path, system, system.parameters.guess)
-    assert remark is not None
-    assert remark.count(" more") == 2
-    require_short(remark)

@@ -16,7 +16,6 @@ from mjfim.cli import (  # noqa: F401 - each registers its verbs
     compare_robots,
     design,
     export,
-    export_sysid,
     identify,
     init,
     list,
@@ -45,7 +44,6 @@ ORDER = (
     "robustness",
     "campaign",
     "export",
-    "export-sysid",
     "report",
     "replay",
 )

@@ -10,7 +10,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
 
@@ -127,44 +126,3 @@ def state_geom(geom: Any, compiled: Any) -> None:
     geom.pos = found.pos
     geom.quat = found.quat
     geom.size = found.size
-
-
-def state_derived_values(spec: Any, compiled: Any) -> None:
-    """State in a spec what the compiler would derive anew from changed values.
-
-    These are inertias, springs, servo gains and end points.
-
-    Args:
-        spec: The spec, changed in place.
-        compiled: The model from which the values are taken.
-    """
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-    spec.compiler.settotalmass = -1.0
-
-    for body in spec.bodies[1:]:
-        state_inertia(body, compiled)
-
-    for geom in spec.geoms:
-        if np.isfinite(geom.fromto[0]):
-            state_geom(geom, compiled)
-
-    for joint in spec.joints:
-        if np.any(np.asarray(joint.springdamper) > 0):
-            dof = compiled.jnt_dofadr[joint.id]
-            joint.springdamper = np.zeros(2)
-            joint.stiffness = _with_first(joint.stiffness, float(compiled.jnt_stiffness[joint.id]))
-            joint.damping = _with_first(joint.damping, float(compiled.dof_damping[dof]))
-
-    for tendon in spec.tendons:
-        tendon.springlength = compiled.tendon_lengthspring[tendon.id]
-
-    for actuator in spec.actuators:
-        actuator.biasprm = compiled.actuator_biasprm[actuator.id]
-        actuator.gainprm = compiled.actuator_gainprm[actuator.id]
-
-
-def _with_first(polynomial: Any, value: float) -> Array:
-    """The coefficients of a polynomial, of which the first one is replaced."""
-    changed = np.array(polynomial, dtype=np.float64)
-    changed[0] = value
-    return changed

@@ -29,7 +29,7 @@ from mjfim.output.folders import (
     write_pictures,
     write_tables,
 )
-from mjfim.output.mjcf.write import write_identified
+from mjfim.output.models.mjcf import write_identified
 from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.report import REPORT

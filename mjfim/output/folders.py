@@ -19,8 +19,7 @@ from mjfim.interruption import current_interruption
 from mjfim.output import archive, latex, markdown, plots, video
 from mjfim.output import rerun as rerun_log
 from mjfim.output.drawing import begin_pictures, picture_contents
-from mjfim.output.mjcf.edited_files import copies_of_included_files
-from mjfim.output.mjcf.write import write_identified
+from mjfim.output.models.mjcf import identified_files, write_identified
 from mjfim.output.optional_files import write_guarded, write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
@@ -28,7 +27,6 @@ from mjfim.output.presentation import describe
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import records_in, write_report
 from mjfim.output.robot_samples import clear_samples, write_samples
-from mjfim.output.urdf.write import urdf_files, write_identified_urdfs
 from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
@@ -69,12 +67,10 @@ DESIGN_FILES = (
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
-# Files that `mjfim check`, `mjfim compare-robots`, `mjfim robustness` and `mjfim export-sysid` may
-# write.
+# Files that `mjfim check`, `mjfim compare-robots` and `mjfim robustness` may write.
 CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "pairs.png", *TABLE_FILES)
 ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png", *TABLE_FILES)
 ROBUSTNESS_FILES = ("playback.json", "playback.npz", REPORT, "playback.png", *TABLE_FILES)
-SYSID_FILES = ("comparison.json", "sysid_report.html")
 
 
 def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:
@@ -84,8 +80,7 @@ def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:
         folder: Folder of `identified.xml`.
         model: The user's MJCF.
     """
-    stem = Path(IDENTIFIED).stem
-    return (*copies_of_included_files(folder / IDENTIFIED, model), *urdf_files(model, stem))
+    return identified_files(folder / IDENTIFIED, model)
 
 
 def estimate_files(
@@ -377,11 +372,9 @@ def write_estimate_folder(
     archive.save_with_origin(folder, estimate, system)
     write_tables(folder, estimate)
 
-    urdfs = write_identified_urdfs(folder, Path(IDENTIFIED).stem, system, estimate.theta)
-    remarks = list(urdfs.remarks)
+    remarks = []
     try:
-        remark = write_identified(folder / IDENTIFIED, system, estimate.theta, urdfs)
-        remarks += [remark] if remark else []
+        remarks += write_identified(folder / IDENTIFIED, system, estimate.theta)
     except ModelError as error:
         remarks.append(str(error))
     if estimate.draws is not None:

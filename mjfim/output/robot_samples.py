@@ -15,9 +15,7 @@ from mjfim.files import remove_earlier_result
 from mjfim.identification.parameter_draws import complete_theta
 from mjfim.output.archive import write_table
 from mjfim.output.manifest import MANIFEST
-from mjfim.output.mjcf.edited_files import copies_of_included_files
-from mjfim.output.mjcf.write import write_identified
-from mjfim.output.urdf.write import urdf_files, write_identified_urdfs
+from mjfim.output.models.mjcf import identified_files, write_identified
 from mjfim.records.estimate import Estimate, ParameterDraws
 
 # Table of the drawn robots, and folder of their models.
@@ -42,8 +40,8 @@ def sample_files(folder: Path, count: int, model: Path) -> tuple[str, ...]:
     # The names of copies begin with the name of the robot, so that one robot shows all of them.
     first = _model_name(0)
     stem = Path(first).stem
-    copies = copies_of_included_files(folder / SAMPLES_FOLDER / first, model)
-    endings = [name.removeprefix(stem) for name in (first, *copies, *urdf_files(model, stem))]
+    others = identified_files(folder / SAMPLES_FOLDER / first, model)
+    endings = [name.removeprefix(stem) for name in (first, *others)]
     names = [
         f"{SAMPLES_FOLDER}/{Path(_model_name(i)).stem}{ending}"
         for i in range(count)
@@ -88,9 +86,7 @@ def write_samples(folder: Path, estimate: Estimate, system: System) -> list[str]
 def _write_robot(folder: Path, robot: int, system: System, theta: Array) -> list[str]:
     """Write the models of one robot; return sentences that do not name it."""
     path = folder / SAMPLES_FOLDER / _model_name(robot)
-    urdfs = write_identified_urdfs(path.parent, path.stem, system, theta)
-    remark = write_identified(path, system, theta, urdfs)
-    remarks = [*urdfs.remarks, *([] if remark is None else [remark])]
+    remarks = write_identified(path, system, theta)
     return [remark.replace(path.stem, "robot") for remark in remarks]
 
 

@@ -42,7 +42,7 @@ from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system, least_squares
-from mjfim.output.sysid.sequences import export, silenced
+from mjfim.output.models.sysid import silenced, sysid_problem
 from mjfim.parallel import cores
 from mjfim.records.trajectory import Recording
 from mjfim.signals import multisine
@@ -436,9 +436,9 @@ def by_sysid(system: System, recording: Recording, start: Array, seconds: float)
         start: (p,) parameters at which it starts.
         seconds: Time of the processors that it may take [s].
     """
-    exported = export(system, [recording])
+    exported = sysid_problem(system, [recording])
     parameters = exported.parameters.copy()
-    residual = exported.residual(weighted=True)
+    residual = exported.residual
     sizes = [len(part) for part in residual(system.parameters.guess, parameters)[0]]
     lower, upper = parameters.get_bounds()
     parameters.update_from_vector(np.clip(start, lower, upper))

@@ -631,7 +631,6 @@ OPTIONS: tuple[tuple[list[str], tuple[str, ...]], ...] = (
         ("--measure-rate", "--seed", "--trials"),
     ),
     (["compare", "study.toml", "-o", "out", "--seconds", "0.1"], ("--methods", "--seconds")),
-    (["export-sysid", "study.toml", "run.csv", "-o", "out"], ("--nonsense", "--threads")),
 )
 
 # Files that no verb can read.

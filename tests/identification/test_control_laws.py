@@ -19,7 +19,7 @@ from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.identify import least_squares
-from mjfim.output.mjcf.write import write_identified
+from mjfim.output.models.mjcf import write_identified
 from mjfim.recordings.read import read_recording
 from mjfim.records.trajectory import Recording
 from tests.support.closed_loop import ARM, PlainLaw, arm_experiment, simulate
@@ -270,9 +270,7 @@ def test_the_identified_model_has_no_law(tmp_path: Path) -> None:
         {"shoulder": SHOULDER}, parameters={**PLANT, "kp": {"target": "controller/shoulder:kp"}}
     )
     system = System.resolve(experiment)
-    remark = write_identified(tmp_path / "identified.xml", system, np.array([1.1, 0.4, 55.0]))
-
-    assert remark is not None
+    (remark,) = write_identified(tmp_path / "identified.xml", system, np.array([1.1, 0.4, 55.0]))
     assert "without the control laws of shoulder" in remark
     text = (tmp_path / "identified.xml").read_text()
     assert "numeric" not in text

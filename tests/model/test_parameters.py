@@ -20,8 +20,9 @@ from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
 from mjfim.model.paths import KINDS, ParameterPath, fields_of, resolve
 from mjfim.model.targets import ModelField, RotationField, SpecField
 from mjfim.model.variants import PlantModel
-from mjfim.output.mjcf.write import write_identified, write_spec
+from mjfim.output.models.mjcf import write_identified
 from tests.support.numerics import Loop, make_task
+from tests.support.specs import write_spec
 
 # Two links with inertia from skewed geoms; a position servo; sensors that see sites and geoms.
 ARM = """

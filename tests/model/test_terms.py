@@ -15,7 +15,7 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.experiment.system_tables import TermKind
 from mjfim.model.terms.library import KINDS
-from mjfim.output.mjcf.write import write_identified
+from mjfim.output.models.mjcf import write_identified
 from tests.support.terms import (
     DAMPING,
     EXAMPLES,
@@ -339,8 +339,7 @@ def test_the_identified_text_moves_as_the_identified_model(tmp_path: Path, kind:
     system = System.resolve(experiment)
     path = tmp_path / "out" / "identified.xml"
     path.parent.mkdir()
-    remark = write_identified(path, system, system.parameters.true)
-    assert remark is None
+    assert write_identified(path, system, system.parameters.true) == []
 
     # The user's comments and spelling stay.
     text = path.read_text(encoding="utf-8")

@@ -27,7 +27,7 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.files import PREFIX, as_json, replacing
 from mjfim.identification.identify import identify_system
 from mjfim.output import archive
-from mjfim.output.mjcf.write import write_identified
+from mjfim.output.models.mjcf import write_identified
 from mjfim.recordings import read as logs
 from mjfim.records.design import MAX_MOTIONS, MOTION_SAMPLES, Design
 from mjfim.records.trajectory import Recording, Trajectory

@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.output.folders import parts_of_identified
-from mjfim.output.mjcf.write import write_identified
-from tests.output.test_mjcf import assert_is_identified_model, lines, task_of
+from mjfim.output.models.mjcf import identified_files, write_identified
+from tests.output.test_mjcf import assert_is_identified_model, changes, task_of
 
 # A robot of five files: settings with defaults, an arm in the tree, and inside it a hand, all in
 # folders of their own. The mesh of the arm lies in the folder of the compiler, that of the hand in
@@ -129,13 +128,13 @@ def test_the_file_that_holds_the_number_is_copied(
 
     task = task_of(robot, tmp_path, *targets)
     new = tmp_path / place / "identified.xml"
-    assert write_identified(new, task.system, np.array([value])) is None
+    assert write_identified(new, task.system, np.array([value])) == []
     assert_is_identified_model(new, task, [value])
 
     # In another folder, every file that names others relative to the main file is copied, too.
     written = {file.name for file in new.parent.glob("identified*")}
     assert written >= {"identified.xml", *copies}
-    assert written <= {"identified.xml", *parts_of_identified(new.parent, robot)}
+    assert written <= {"identified.xml", *identified_files(new, robot)}
     if place == "home":
         assert written == {"identified.xml", *copies}
     after = contents(robot.parent)
@@ -145,23 +144,22 @@ def test_the_file_that_holds_the_number_is_copied(
 def test_the_text_stays_as_it_is(robot: Path, tmp_path: Path) -> None:
     task = task_of(robot, tmp_path, "joint/elbow:armature", "joint/finger:damping")
     new = tmp_path / "out" / "identified.xml"
-    assert write_identified(new, task.system, np.array([0.02, 0.05])) is None
+    assert write_identified(new, task.system, np.array([0.02, 0.05])) == []
 
     home = robot.parent
-    gone, came = lines(home / "parts" / "arm.xml", new.parent / "identified_arm.xml")
-    assert [line.strip() for line in came] == [
-        '<joint   name="elbow" axis="0 1 0" armature=\'0.02\'/> <!-- measured in May -->',
+    lost, gained = changes(home / "parts" / "arm.xml", new.parent / "identified_arm.xml")
+    assert gained == [
+        '<joint name="elbow" axis="0 1 0" armature="0.02"/>',
         '<include file="identified_hand.xml"/>',
     ]
-    assert len(gone) == 2
-    gone, came = lines(home / "parts" / "hand" / "hand.xml", new.parent / "identified_hand.xml")
-    assert [line.strip() for line in came] == [
-        '<joint name="finger" axis="1 0 0" damping="0.05" range="-90 90"/>'
-    ]
-    gone, came = lines(robot, new)
-    assert '  <include file="identified_arm.xml"/>' in [line[4:] for line in came]
-    assert '  <include file="../home/parts/motors.xml"/>' not in gone
-    assert len(gone) == len(came) == 3
+    assert len(lost) == 2
+    text = (new.parent / "identified_arm.xml").read_text(encoding="utf-8")
+    assert "<!-- measured in May -->" in text
+    _, gained = changes(home / "parts" / "hand" / "hand.xml", new.parent / "identified_hand.xml")
+    assert gained == ['<joint name="finger" axis="1 0 0" damping="0.05" range="-90 90"/>']
+    lost, gained = changes(robot, new)
+    assert '<include file="identified_arm.xml"/>' in gained
+    assert len(lost) == len(gained) == 3
 
 
 def test_a_copy_can_be_identified_again(robot: Path, tmp_path: Path) -> None:
@@ -171,13 +169,13 @@ def test_a_copy_can_be_identified_again(robot: Path, tmp_path: Path) -> None:
 
     again = task_of(first, tmp_path, "joint/finger:damping")
     second = tmp_path / "second" / "identified.xml"
-    assert write_identified(second, again.system, np.array([0.06])) is None
+    assert write_identified(second, again.system, np.array([0.06])) == []
     assert_is_identified_model(second, again, [0.06])
     assert (second.parent / "identified_hand.xml").is_file()
 
     # In the folder of its own model, the copy takes another name.
     beside = first.with_name("other.xml")
-    assert write_identified(beside, again.system, np.array([0.06])) is None
+    assert write_identified(beside, again.system, np.array([0.06])) == []
     assert (first.parent / "other_identified_hand.xml").is_file()
     assert mujoco.MjModel.from_xml_path(str(first)).joint("finger").damping[0] == 0.05
 
@@ -202,23 +200,25 @@ def test_names_do_not_collide(tmp_path: Path) -> None:
 
     before = contents(tmp_path)
     new = tmp_path / "identified.xml"
-    assert write_identified(new, task.system, np.array([2.0, 3.0, 4.0])) is None
+    assert write_identified(new, task.system, np.array([2.0, 3.0, 4.0])) == []
     assert_is_identified_model(new, task, [2.0, 3.0, 4.0])
     after = contents(tmp_path)
     assert {name: after[name] for name in before} == before
     assert len(after) == len(before) + 4
     copies = after.keys() - before.keys() - {"identified.xml"}
-    assert set(parts_of_identified(tmp_path, tmp_path / "model.xml")) == copies
+    assert set(identified_files(new, tmp_path / "model.xml")) == copies
 
 
 def test_nothing_is_left_where_the_text_cannot_express_the_value(
     robot: Path, tmp_path: Path
 ) -> None:
-    """The pose of a body in a frame is printed by MuJoCo; no copy stays."""
-    task = task_of(robot, tmp_path, "body/hand:pos[0]")
+    """MuJoCo prints the pose of a body in a turned frame; no copy stays."""
+    arm = robot.parent / "parts" / "arm.xml"
+    arm.write_text(ARM.replace('pos="0.1 0 0">', 'euler="0 0 9">'), encoding="utf-8")
+    task = task_of(robot, tmp_path, "body/hand:pos[0]", "joint/elbow:armature")
     new = tmp_path / "out" / "identified.xml"
-    said = write_identified(new, task.system, np.array([0.25]))
-    assert said is not None
+    (said,) = write_identified(new, task.system, np.array([0.25, 0.02]))
     assert "printed by MuJoCo" in said
     assert os.listdir(new.parent) == ["identified.xml"]
-    assert mujoco.MjModel.from_xml_path(str(new)).body("hand").pos[0] == 0.25
+    model = mujoco.MjModel.from_xml_path(str(new))
+    assert model.body("hand").pos[0] == 0.25

@@ -16,7 +16,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.parameter_draws import complete_theta, draw_parameters_system
 from mjfim.output import robot_samples
 from mjfim.output.manifest import MANIFEST, OutputGuard, claimed
-from mjfim.output.mjcf.write import same_dynamics, write_identified
+from mjfim.output.models.mjcf import same_dynamics, write_identified
 from mjfim.output.robot_samples import clear_samples, sample_files, write_samples
 from mjfim.output.summaries.samples import describe_samples
 from mjfim.output.summary_parts import Paragraph

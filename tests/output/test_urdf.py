@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.errors import ModelError
 from mjfim.experiment.system import System
 from mjfim.model.urdf_sources import urdf_sources
 from mjfim.output.manifest import MANIFEST
-from mjfim.output.mjcf.write import same_dynamics, write_identified
+from mjfim.output.models.mjcf import identified_files, same_dynamics, write_identified
 from mjfim.output.robot_samples import sample_files, write_samples
-from mjfim.output.urdf.document import UrdfDocument
-from mjfim.output.urdf.write import urdf_files, write_identified_urdfs
+from tests.output.test_mjcf import changes
 from tests.output.test_robot_samples import drawn
 from tests.support.cli import names, run
 from tests.support.numerics import Array
@@ -133,16 +131,21 @@ def motion(model: Any) -> Array:
     return np.concatenate([np.array(found).ravel(), matrix.ravel()])
 
 
+def written(folder: Path, system: System, theta: Array) -> list[str]:
+    """Write the identified model and return the remarks without that about the printed MJCF."""
+    remarks = write_identified(folder / "identified.xml", system, theta)
+    return [remark for remark in remarks if "printed by MuJoCo" not in remark]
+
+
 def test_mujoco_reads_the_identified_robot(tmp_path: Path) -> None:
     system = system_of(tmp_path)
     theta = other_values(system)
-    out = tmp_path / "out"
-    written = write_identified_urdfs(out, "identified", system, theta)
-    assert written.remarks == ()
-    assert len(written.held) == len(system.parameters)
-
-    found = mujoco.MjModel.from_xml_path(str(out / "identified.urdf"))
+    assert written(tmp_path / "out", system, theta) == []
     wanted = system.model_at(theta)
+    for name in ("identified.urdf", "identified.xml"):
+        found = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / name))
+        np.testing.assert_allclose(motion(found), motion(wanted), rtol=1e-5, atol=1e-5)
+    found = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "identified.urdf"))
     assert same_dynamics(found, wanted)
     np.testing.assert_allclose(motion(found), motion(wanted), rtol=1e-9, atol=1e-11)
 
@@ -158,30 +161,23 @@ def test_only_the_numbers_change(tmp_path: Path) -> None:
     theta[names.index("upper_mass")] = 1.75
     theta[names.index("upper_com")] = 0.03
     theta[names.index("elbow_friction")] = 0.04
-    write_identified_urdfs(tmp_path / "out", "identified", system, theta)
-    text = (tmp_path / "out" / "identified.urdf").read_text(encoding="utf-8")
-    changes = [
-        line
-        for line in difflib.ndiff(URDF.splitlines(), text.splitlines())
-        if line.startswith(("+ ", "- "))
+    written(tmp_path / "out", system, theta)
+    new = tmp_path / "out" / "identified.urdf"
+    lost, gained = changes(tmp_path / "two.urdf", new)
+    assert gained == [
+        '<origin xyz="0.10 0.03 -0.150" rpy="0.3 -0.2 0.5"/>',
+        '<mass value="1.75"/>',
+        '<dynamics friction="0.04"/>',
     ]
-    assert changes == [
-        '-       <origin xyz="0.10 0.02 -0.150" rpy="0.3 -0.2 0.5"/>',
-        '+       <origin xyz="0.10 0.03 -0.150" rpy="0.3 -0.2 0.5"/>',
-        '-       <mass   value="1.50"/>',
-        '+       <mass   value="1.75"/>',
-        '+     <dynamics friction="0.04"/>',
-    ]
+    assert len(lost) == 2
+    assert '<!-- größer als ASCII; <mass value="9"/> stays a comment -->' in new.read_text("utf-8")
 
-    # The tool keeps its inertia; the first moment of the link takes the whole change.
+    # The tool keeps its inertia; the link takes the whole change.
     theta[names.index("lower.alpha")] += 0.1
-    write_identified_urdfs(tmp_path / "out", "identified", system, theta)
-    document = UrdfDocument((tmp_path / "out" / "identified.urdf").read_bytes())
-    tool, lower = document.inertia("tool"), document.inertia("lower")
-    assert tool is not None and lower is not None
-    assert tool.mass == 0.2
+    written(tmp_path / "out", system, theta)
+    masses = [float(mass) for mass in re.findall(r'<mass value="([^"]*)"', new.read_text("utf-8"))]
     total = system.model_at(theta).body("lower").mass[0]
-    assert lower.mass == pytest.approx(total - 0.2, rel=1e-12)
+    assert masses[2:] == [pytest.approx(total - 0.2, rel=1e-12), 0.2]
 
 
 @pytest.mark.parametrize("prefix", ["", "left_"])
@@ -202,16 +198,13 @@ def test_an_mjcf_attaches_the_identified_urdf(tmp_path: Path, prefix: str) -> No
     system = system_of(tmp_path, "driven.xml", prefix, **renamed)
     theta = other_values(system)
     out = tmp_path / "out"
-    written = write_identified_urdfs(out, "identified", system, theta)
-    assert written.remarks == (
+    assert write_identified(out / "identified.xml", system, theta) == [
         "identified.urdf: a URDF cannot hold gear; identified.xml has all values",
-    )
-    assert write_identified(out / "identified.xml", system, theta, written) is None
+    ]
     text = (out / "identified.xml").read_text(encoding="utf-8")
     assert '<model name="robot" file="identified.urdf"/>' in text
     assert "<!-- motors for the URDF -->" in text
-    gear = theta[-1]
-    assert f'gear="{float(gear)!r}"' in text
+    assert f'gear="{float(theta[-1])!r}"' in text
 
     wanted = system.model_at(theta)
     assert same_dynamics(mujoco.MjModel.from_xml_path(str(out / "identified.xml")), wanted)
@@ -227,15 +220,13 @@ def test_values_that_a_urdf_cannot_hold_are_named(tmp_path: Path) -> None:
         "drag": {"target": "joint/elbow:damping[1]", "scale": 0.01},
     }
     system = system_of(tmp_path, **further)
-    theta = other_values(system)
-    written = write_identified_urdfs(tmp_path / "out", "identified", system, theta)
-    assert written.remarks == (
+    assert written(tmp_path / "out", system, other_values(system)) == [
         "identified.urdf: a URDF cannot hold rotor, drag; identified.xml has all values",
-    )
-    assert (tmp_path / "out" / "identified.urdf").is_file()
+    ]
 
 
 def test_a_urdf_that_is_attached_twice_is_not_written(tmp_path: Path) -> None:
+    """The MJCF, which MuJoCo prints, holds the values of the first one."""
     system = system_of(tmp_path)
     twice = MOTORS.format(prefix="a_").replace(
         '<attach model="robot" prefix="a_"/>',
@@ -252,11 +243,11 @@ def test_a_urdf_that_is_attached_twice_is_not_written(tmp_path: Path) -> None:
     both = System.resolve(mjfim.Experiment(**tables))
     (source,) = urdf_sources(both.model_path)
     assert source.prefixes == ("a_", "b_")
-    written = write_identified_urdfs(tmp_path / "out", "identified", both, np.array([1.6]))
-    (remark,) = written.remarks
+    (remark,) = written(tmp_path / "out", both, np.array([1.6]))
     assert "is attached 2 times, and one URDF has one set of values" in remark
-    assert written.files == {}
-    assert not (tmp_path / "out").exists()
+    assert names(tmp_path / "out") == {"identified.xml"}
+    found = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "identified.xml"))
+    assert [found.body(f"{side}_upper").mass[0] for side in "ab"] == [1.6, 1.5]
 
 
 def test_fixed_links_that_are_heavier_than_the_whole(tmp_path: Path) -> None:
@@ -264,8 +255,7 @@ def test_fixed_links_that_are_heavier_than_the_whole(tmp_path: Path) -> None:
     system = system_of(tmp_path)
     theta = np.array(system.parameters.guess)
     theta[0] = 0.5 * np.log(0.1)
-    written = write_identified_urdfs(tmp_path / "out", "identified", system, theta)
-    (remark,) = written.remarks
+    (remark,) = written(tmp_path / "out", system, theta)
     assert remark.startswith(
         "identified.urdf: not written: the links that are fixed to link 'lower'"
     )
@@ -306,13 +296,12 @@ def test_links_whose_inertia_comes_from_their_geometry(tmp_path: Path) -> None:
     }
     system = System.resolve(mjfim.Experiment(**tables))
     theta = np.array([5.0, -0.05])
-    written = write_identified_urdfs(tmp_path / "out", "identified", system, theta)
-    assert written.remarks == ()
+    assert written(tmp_path / "out", system, theta) == []
     file = tmp_path / "out" / "identified.urdf"
     assert same_dynamics(mujoco.MjModel.from_xml_path(str(file)), system.model_at(theta))
     changed = file.read_text(encoding="utf-8")
     assert '<origin xyz="0 0 -0.05"/>' in changed
-    assert '<inertial><origin xyz="0.0 0.0 -0.2"/><mass value="5.0"/>' in changed
+    assert '<mass value="5"/>' in changed
 
 
 @pytest.mark.parametrize(
@@ -323,7 +312,7 @@ def test_links_whose_inertia_comes_from_their_geometry(tmp_path: Path) -> None:
         (
             '<mujoco><compiler strippath="true"/></mujoco>',
             "package://some/arm.obj",
-            '<compiler strippath="true" meshdir="../.."/>',
+            '<compiler strippath="true" assetdir="../.."/>',
         ),
     ],
 )
@@ -345,7 +334,7 @@ def test_meshes_are_found_from_another_folder(
     }
     system = System.resolve(mjfim.Experiment(**tables))
     out = tmp_path / "far" / "away"
-    assert write_identified_urdfs(out, "identified", system, np.array([2.0])).remarks == ()
+    assert written(out, system, np.array([2.0])) == []
     assert said in (out / "identified.urdf").read_text(encoding="utf-8")
     assert mujoco.MjModel.from_xml_path(str(out / "identified.urdf")).nmesh == 1
 
@@ -368,27 +357,20 @@ def test_drawn_robots_are_urdfs_as_well(tmp_path: Path) -> None:
         assert model.body("upper").mass[0] == estimate.draws.values[i, j]
 
 
-def test_names_of_files(tmp_path: Path) -> None:
-    system = system_of(tmp_path, "driven.xml")
-    assert urdf_files(system.model_path, "identified") == ("identified.urdf",)
-    two = MOTORS.format(prefix="a_").replace(
-        "</asset>", '<model name="other" file="other.urdf"/></asset>'
-    )
-    two = two.replace("</worldbody>", '<attach model="other" prefix="b_"/></worldbody>')
+@pytest.mark.parametrize(
+    ("others", "expected"),
+    [
+        ("", ("identified.urdf",)),
+        ('<attach model="other" prefix="b_"/>', ("identified_two.urdf", "identified_other.urdf")),
+    ],
+)
+def test_names_of_files(others: str, expected: tuple[str, ...], tmp_path: Path) -> None:
+    system_of(tmp_path, "driven.xml")
     (tmp_path / "other.urdf").write_text(URDF, encoding="utf-8")
-    (tmp_path / "driven.xml").write_text(two, encoding="utf-8")
-    assert urdf_files(tmp_path / "driven.xml", "identified") == (
-        "identified_two.urdf",
-        "identified_other.urdf",
-    )
-    plain = tmp_path / "plain.xml"
-    plain.write_text("<mujoco/>", encoding="utf-8")
-    assert urdf_files(plain, "identified") == ()
-
-
-def test_a_text_that_is_no_urdf() -> None:
-    with pytest.raises(ModelError, match="no URDF but <mujoco>"):
-        UrdfDocument(b"<mujoco/>")
+    text = MOTORS.format(prefix="a_").replace("</worldbody>", f"{others}</worldbody>")
+    text = text.replace("</asset>", '<model name="other" file="other.urdf"/></asset>')
+    (tmp_path / "driven.xml").write_text(text, encoding="utf-8")
+    assert identified_files(tmp_path / "identified.xml", tmp_path / "driven.xml") == expected
 
 
 @pytest.mark.slow
@@ -414,7 +396,7 @@ true = 1.6
     result = run(*words)
     assert result.exit_code == 0, result.stderr
     assert {"identified.xml", "identified.urdf", MANIFEST} <= names(out)
-    assert "six significant digits" not in result.stderr
+    assert "printed by MuJoCo" not in result.stderr
     estimate = mjfim.Estimate.load(out)
     model = mujoco.MjModel.from_xml_path(str(out / "identified.xml"))
     assert model.body("upper").mass[0] == estimate.theta[0]

@@ -20,7 +20,6 @@ from mjfim.model.loading import ModelSource, compile_spec, load_spec
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.variants import PlantModel, unconstrained
 from mjfim.optimize.lq import LinearRecursion, TangentCurve, regulator
-from mjfim.output.mjcf.write import write_spec
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
 from mjfim.records.trajectory import Linearization
 from tests.support.numerics import (
@@ -35,6 +34,7 @@ from tests.support.numerics import (
     relative_error,
     shared_model,
 )
+from tests.support.specs import write_spec
 
 SENSED = {"angle": 0.01, "rate": 0.05, "acc": 0.3, "drive": 0.1}
 SAMPLES = (0, 7, 23, 49)

@@ -1,0 +1,286 @@
+"""The user's MJCF with identified values.
+
+The model to which the text compiles is compared with the identified one, and every element whose
+numbers differ states those of the identified one. A file is written only if it compiles to this.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ModelError, first_ones, listed
+from mjfim.experiment.system import System
+from mjfim.model.control_laws import remove_numbers
+from mjfim.model.loading import ModelSource, compile_spec, load_written_model
+from mjfim.model.parameters import ParameterSet
+from mjfim.model.paths import MODEL_ARRAYS
+from mjfim.model.targets import OutputBiasField, OutputDelayField, OutputScaleField, SpecField
+from mjfim.model.terms.changes import Attributes, ChangedElement, NewElement
+from mjfim.output.models.element_numbers import differ_in_inertia, state_differences
+from mjfim.output.models.model_xml import (
+    ModelXml,
+    add_comment,
+    add_element,
+    all_digits,
+    child,
+)
+from mjfim.output.models.urdf import urdf_files, write_identified_urdfs
+
+# Attributes of actuators that <general> does not have.
+OF_SHORTHANDS = ("kp", "kv", "dampratio", "timeconst", "inheritrange")
+
+# Prefixes of the arrays that determine the motion, and of those among them that only speed it up,
+# follow from others, or are compared as matrices.
+COMPARED = (
+    *("body_", "jnt_", "dof_", "qpos", "actuator_", "tendon_", "pair_friction", "pair_solref"),
+    *("site_pos", "site_quat", "geom_pos", "geom_quat", "geom_size", "geom_friction"),
+    "geom_solref",
+)
+NOT_COMPARED = (
+    *("body_bvh", "body_simple", "body_sameframe", "body_margin", "body_inertia", "body_iquat"),
+    *("body_invweight0", "dof_simplenum"),
+)
+
+# Relative difference below which numbers count as equal: of the number itself, and of the largest
+# one of its array. MuJoCo prints six digits.
+TOLERANCE, ROUNDING = 1e-9, 1e-12
+PRINTED_TOLERANCE = 1e-4
+
+# Longest list of actuators in a remark [characters].
+REMARK_TEXT = 120
+
+
+def write_identified(path: Path, system: System, theta: Array) -> list[str]:
+    """Write the user's model with parameter values, as MJCF, and as URDF where one came in.
+
+    Included files that change are written beside the main file. Where the text cannot express the
+    values, MuJoCo prints the model, without comments.
+
+    Args:
+        path: MJCF file that is written; its folder may differ from that of the model. A URDF has
+            its name with another ending.
+        system: The experiment with its model.
+        theta: (p,) parameter values.
+
+    Returns:
+        Sentences about everything that a user would not expect.
+
+    Raises:
+        ModelError: No MJCF expresses the values.
+    """
+    wanted = system.model_at(theta, at_keyframe=False)
+    urdfs, remarks = write_identified_urdfs(path, system, theta)
+    try:
+        xml = _edited(system, theta, wanted, urdfs)
+        _save(xml, path, wanted, TOLERANCE)
+    except ModelError as error:
+        try:
+            _save(_printed(system, theta, wanted), path, wanted, PRINTED_TOLERANCE)
+        except ModelError as reason:
+            raise ModelError(f"{path}: not written: {reason}") from None
+        remarks.append(
+            f"{path.name}: it is printed by MuJoCo, without comments and, where elements have no "
+            f"name, with six digits: {error}"
+        )
+    if system.laws is not None:
+        names = first_ones([law.actuator for law in system.laws.laws], longest=REMARK_TEXT)
+        remarks.append(
+            f"{path.name}: it holds the model without the control laws of {names}, because MJCF "
+            "has no laws with a rate; estimate.json holds their numbers"
+        )
+    return remarks
+
+
+def identified_files(path: Path, model: Path) -> tuple[str, ...]:
+    """Names of all files that `write_identified` may write beside the main file.
+
+    Args:
+        path: The new main file.
+        model: The user's model.
+    """
+    try:
+        copies = ModelXml(model).copies(path)
+    except (ModelError, OSError):
+        copies = []
+    return (*copies, *urdf_files(path, model))
+
+
+def same_dynamics(a: Any, b: Any, tolerance: float = TOLERANCE) -> bool:
+    """Whether everything that determines the motion agrees in two MjModels."""
+    return not _differences(a, b, tolerance)
+
+
+def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) -> ModelXml:
+    """The user's text with the values."""
+    source = system.source
+    xml = ModelXml(system.model_path)
+    if xml.root.tag != "mujoco":
+        raise ModelError(f"the model is no MJCF but <{xml.root.tag}>")
+    for term in source.terms.values():
+        for change in term.changes():
+            if isinstance(change, NewElement):
+                _add(xml, change, f"{term.kind} {term.name!r}")
+            else:
+                _change(xml, change)
+    if source.terms:
+        _extend_keyframes(xml, source)
+
+    xml.attach(urdfs)
+    has_masses = _state_masses_of_geoms(xml, system.parameters, theta)
+    compiled = xml.compiled() if urdfs or has_masses else (source.spec, source.model)
+    state_differences(xml, compiled, wanted)
+    outside = _errors_of_sensors(system.parameters, theta)
+    if outside:
+        add_comment(xml.root, f"not part of an MJCF: {', '.join(outside)}", first=True)
+    return xml
+
+
+def _printed(system: System, theta: Array, wanted: Any) -> ModelXml:
+    """The model as MuJoCo prints it, with all digits of the numbers of elements with names."""
+    spec = system.source.spec.copy()
+    remove_numbers(spec)
+    for parameter, value in zip(system.parameters.parameters, theta, strict=True):
+        if parameter.function is not None:
+            parameter.function(spec, float(value))
+
+    # Inertias that are stated have to count.
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    spec.compiler.settotalmass = -1.0
+    compile_spec(spec, system.model_path)
+    xml = ModelXml(system.model_path, spec.to_xml().encode())
+    state_differences(xml, xml.compiled(), wanted, names_needed=False)
+    return xml
+
+
+def _save(xml: ModelXml, path: Path, wanted: Any, tolerance: float) -> None:
+    """Write a text if it compiles to the wanted model."""
+
+    def check(written: Path) -> None:
+        """Raise ModelError if the file gives another model."""
+        try:
+            found = load_written_model(written)
+        except (ValueError, mujoco.FatalError) as error:
+            reason = " ".join(str(error).split())
+            raise ModelError(f"MuJoCo does not load the text ({reason})") from None
+        different = _differences(found, wanted, tolerance)
+        if different:
+            raise ModelError(
+                f"with the identified values the text compiles to a different {listed(different)}"
+            )
+
+    xml.save(path, check)
+
+
+def _differences(a: Any, b: Any, tolerance: float) -> list[str]:
+    """The arrays that determine the motion and differ between two models."""
+    names = [n for n in dir(a) if n.startswith(COMPARED) and not n.startswith(NOT_COMPARED)]
+    pairs = {name: (getattr(a, name), getattr(b, name)) for name in names}
+    pairs |= {n: (getattr(a.opt, n), getattr(b.opt, n)) for n in MODEL_ARRAYS["option"]}
+    found = [name for name, (x, y) in pairs.items() if not _is_equal(x, y, tolerance)]
+
+    # Principal axes may be named in any order.
+    is_same = a.nbody == b.nbody and not any(
+        differ_in_inertia(a, b, i, tolerance) for i in range(a.nbody)
+    )
+    return found if is_same else [*found, "body_inertia"]
+
+
+def _is_equal(x: Any, y: Any, tolerance: float) -> bool:
+    """Whether two arrays have the same shape and nearly the same numbers, in any unit."""
+    x, y = np.asarray(x), np.asarray(y)
+    if np.array_equal(x, y):
+        return True
+    if x.shape != y.shape:
+        return False
+    largest = float(np.abs(y[np.isfinite(y)]).max(initial=0.0))
+    rounding = largest * max(ROUNDING, tolerance * tolerance)
+    return bool(np.isclose(x, y, rtol=tolerance, atol=rounding).all())
+
+
+def _state_masses_of_geoms(xml: ModelXml, parameters: ParameterSet, theta: Array) -> bool:
+    """State masses and densities of geoms, which MjModel does not keep; whether there are any."""
+    has_masses = False
+    for parameter, value in zip(parameters.parameters, theta, strict=True):
+        for target in parameter.targets:
+            field = target.field
+            if isinstance(field, SpecField) and field.field in ("mass", "density"):
+                element = xml.named(field.kind, field.name)
+                element.set(field.field, all_digits(target.scale * float(value) + target.offset))
+                has_masses = True
+    return has_masses
+
+
+def _errors_of_sensors(parameters: ParameterSet, theta: Array) -> list[str]:
+    """Values of biases, scales and delays that are not zero, which no element can state."""
+    kinds = (OutputBiasField, OutputScaleField, OutputDelayField)
+    found = []
+    for parameter, value in zip(parameters.parameters, theta, strict=True):
+        for target in parameter.targets:
+            written = target.scale * float(value) + target.offset
+            if isinstance(target.field, kinds) and written != 0.0:
+                unit = parameter.unit if target.scale == 1.0 else ""
+                found.append(f"{target.path} = {all_digits(written)} {unit}".rstrip())
+    return found
+
+
+# ---- physical terms
+
+
+def _add(xml: ModelXml, new: NewElement, comment: str) -> None:
+    """Add an element of a term, with a comment that says what it is."""
+    if new.parent_kind:
+        parent = xml.named(new.parent_kind, new.parent)
+    else:
+        # Elements of a section keep their order, so that the new one is in the last section.
+        sections = xml.sections(new.parent)
+        parent = sections[-1] if sections else add_element(xml.root, new.parent)
+    element = add_element(parent, new.tag, _texts(new.attributes), comment=comment)
+    for tag, attributes in new.children:
+        add_element(element, tag, _texts(attributes))
+
+
+def _change(xml: ModelXml, change: ChangedElement) -> None:
+    """Change the attributes of an element for a term."""
+    if change.kind == "option":
+        elements = xml.sections("option")[-1:] or [child(xml.root, "option")]
+    elif change.kind == "flag":
+        elements = list(xml.root.iter("flag"))
+    else:
+        elements = [xml.named(change.kind, change.name)]
+
+    for element in elements:
+        if change.tag and change.tag != element.tag:
+            is_shorthand = element.tag not in ("general", "motor")
+            element.tag = change.tag
+            for attribute in OF_SHORTHANDS if is_shorthand else ():
+                element.attrib.pop(attribute, None)
+            element.attrib.update(_texts(change.of_shorthand) if is_shorthand else {})
+        for attribute in change.removed:
+            element.attrib.pop(attribute, None)
+        element.attrib.update(_texts(change.attributes))
+
+
+def _texts(attributes: Attributes) -> dict[str, str]:
+    """Attributes of a term as the text states them."""
+    return {
+        name: value if isinstance(value, str) else all_digits(*value) for name, value in attributes
+    }
+
+
+def _extend_keyframes(xml: ModelXml, source: ModelSource) -> None:
+    """State the keyframes for the state of the model with its terms."""
+    stated, model = source.stated.model, source.model
+    keys = list(xml.root.iter("key"))
+    if len(keys) != model.nkey:
+        return
+    for i, key in enumerate(keys):
+        for attribute, count in {"qpos": "nq", "qvel": "nv", "act": "na"}.items():
+            is_extended = getattr(stated, count) != getattr(model, count)
+            numbers = getattr(model, f"key_{attribute}")[i]
+            if is_extended and (attribute in key.attrib or (attribute == "act" and numbers.any())):
+                key.set(attribute, all_digits(*numbers))

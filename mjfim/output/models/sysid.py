@@ -1,0 +1,274 @@
+"""An experiment and its recordings in the types of `mujoco.sysid`, MuJoCo's own toolbox for fits.
+
+sysid gives the sensor values of a step the time after the step, although they belong to the state
+before it; states are not delayed. Therefore positions and velocities become state signals, and
+sensors are read one step earlier. sysid divides residuals by the norm of each measured signal,
+whatever its noise; here they are also whitened by the stated noise.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mujoco import sysid
+from scipy.interpolate import CubicSpline
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, MjfimError
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.identification.aligned_recording import AlignedRecording, align
+from mjfim.identification.cad_prior import CadPrior
+from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.records.trajectory import Recording
+
+# Distance from the guess to a bound that is not stated, in sizes of the parameter; sysid takes
+# finite bounds only.
+UNSTATED_BOUND = 1e3
+
+# Largest distance of a time from an engine step at which it counts as on that step [engine steps].
+ON_STEP = 1e-6
+
+# Names that sysid gives to the state of joints without a name.
+UNNAMED_SIGNALS = ("_qpos", "_qvel")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SysidProblem:
+    """A fit in the form that `sysid.optimize(parameters, residual)` takes.
+
+    Attributes:
+        sequences: `ModelSequences` of the recordings.
+        parameters: `ParameterDict` at the guess.
+        build_model: Gives the MjModel at a `ParameterDict`, as `build_model` of sysid.
+        residual: Residuals whitened by the stated noise, followed by those of the priors.
+    """
+
+    sequences: Any
+    parameters: Any
+    build_model: Callable[[Any, Any], Any]
+    residual: Callable[..., Any]
+
+
+def export_sysid(experiment: Experiment, recordings: Sequence[Recording]) -> SysidProblem:
+    """State the fit of recordings for `mujoco.sysid`.
+
+    sysid takes neither robust losses nor estimated noise. A bound that is not stated is 1000 sizes
+    of the parameter from its guess.
+
+        problem = mjfim.export_sysid(experiment, [recording])
+        fit, result = mujoco.sysid.optimize(problem.parameters, problem.residual)
+
+    Args:
+        experiment: The experiment.
+        recordings: Its recordings.
+
+    Raises:
+        MjfimError: sysid cannot express the problem, or is not installed.
+    """
+    return sysid_problem(System.resolve(experiment), recordings)
+
+
+def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProblem:
+    """State the fit of recordings of a resolved experiment. See `export_sysid`."""
+    if not hasattr(sysid, "ModelSequences"):
+        raise MjfimError("mujoco.sysid is not installed; pip install 'mjfim[sysid]'")
+    _check_expressible(system)
+    signals, places = _signals(system)
+    columns = [place for _, group in signals.values() for place in group]
+    mapping = {
+        name: (kind, np.array([columns.index(place) for place in group]))
+        for name, (kind, group) in signals.items()
+    }
+
+    aligned = [align(system, recording) for recording in recordings]
+    qpos, qvel, act = system.space.split(system.plant.initial_state(system.parameters.guess))
+    start = sysid.create_initial_state(system.model, qpos, qvel, act)
+    measured = []
+    for recording in aligned:
+        data = np.full((len(recording.t), len(columns)), np.nan)
+        data[:, [columns.index(place) for place in places]] = recording.y
+        measured.append(sysid.TimeSeries(np.array(recording.t), data, mapping))
+
+    # sysid warns, because it counts state signals among the sensors.
+    with silenced():
+        sequences = sysid.ModelSequences(
+            system.model_path.stem,
+            system.source.spec.copy(),
+            [recording.name for recording in aligned],
+            [start] * len(aligned),
+            [_control(system, recording) for recording in aligned],
+            measured,
+            allow_missing_sensors=True,
+        )
+
+    def build_model(parameters: Any, _: Any) -> Any:
+        """The model at values of the parameters."""
+        return system.model_at(np.array(parameters.as_vector()))
+
+    of_data: Callable[..., Any] = sysid.build_residual_fn(
+        models_sequences=[sequences],
+        build_model=build_model,
+        modify_residual=_whitened(system, columns, places),
+        resample_true=False,
+    )
+    return SysidProblem(
+        sequences=sequences,
+        parameters=_parameters(system),
+        build_model=build_model,
+        residual=_with_priors(system, of_data),
+    )
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Suppress messages of MuJoCo and sysid inside the block."""
+    logger = logging.getLogger("absl")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with silence_mujoco_log():
+            yield
+    finally:
+        logger.setLevel(before)
+
+
+# Whether a value is that of a sensor, and its index in sensordata or in the state.
+Place = tuple[bool, int]
+
+
+def _signals(system: System) -> tuple[dict[str, tuple[Any, list[Place]]], list[Place]]:
+    """The whole signals of sysid that have measured components, and the place of each output."""
+    qpos, qvel, act, _ = sysid.TimeSeries.compute_all_state_mappings(system.model)
+    sensors = sysid.TimeSeries.compute_all_sensor_mapping(system.model)
+    known = [(False, name, each) for name, each in {**qpos, **qvel, **act}.items()]
+    known += [(True, name, each) for name, each in sensors.items()]
+
+    found: dict[str, tuple[Any, list[Place]]] = {}
+    places: list[Place] = []
+    for output in system.outputs.outputs:
+        sensed = output.sensor is not None
+        index = output.sensor if sensed else output.state
+        for of_sensor, name, (kind, indices) in known:
+            if of_sensor == sensed and index in indices and name not in UNNAMED_SIGNALS:
+                found[name] = kind, [(sensed, int(each)) for each in indices]
+                places.append((sensed, int(index or 0)))
+                break
+        else:
+            raise ExperimentError(
+                f"output {output.name!r}: sysid finds signals by name; name the joint and the body "
+                "in the MJCF"
+            )
+    return found, places
+
+
+def _control(system: System, recording: AlignedRecording) -> Any:
+    """The control at every engine step as a TimeSeries, held over each sample."""
+    steps = np.repeat(recording.ctrl, system.grid.substeps, axis=0)
+
+    # sysid drops the last row. One more row makes it step past the end, so that the sensors at the
+    # end are evaluated.
+    held = np.concatenate([steps, steps[-1:], steps[-1:]])
+    t = np.arange(len(held)) * float(system.model.opt.timestep)
+    return sysid.TimeSeries(t, held, sysid.TimeSeries.compute_all_control_mapping(system.model))
+
+
+def _parameters(system: System) -> Any:
+    """The parameters at the guess; the model at their values is that of mjfim."""
+    p = system.parameters
+    lower = np.where(np.isfinite(p.lower), p.lower, p.guess - UNSTATED_BOUND * p.magnitude)
+    upper = np.where(np.isfinite(p.upper), p.upper, p.guess + UNSTATED_BOUND * p.magnitude)
+    found = sysid.ParameterDict()
+    for j, name in enumerate(p.names):
+        found.add(sysid.Parameter(name, p.guess[j], lower[j], upper[j]))
+    return found
+
+
+def _check_expressible(system: System) -> None:
+    """Raise ExperimentError if sysid cannot state this problem."""
+    experiment, parameters = system.experiment, system.parameters
+    fault = ""
+    if system.laws is not None:
+        fault = (
+            "controllers: sysid applies the control of a log; remove the laws, and use a log that "
+            "holds the controls"
+        )
+    elif parameters.outside_model.any():
+        name = parameters.names[int(np.argmax(parameters.outside_model))]
+        fault = (
+            f"{name}: sysid fits numbers of the model only; remove initial states, biases and "
+            "delays from the unknowns"
+        )
+    elif experiment.fit.segment_length is not None or experiment.fit.start != "stated":
+        fault = (
+            "fit: sysid simulates from the stated initial state only; remove `segments` and `start`"
+        )
+    if fault:
+        raise ExperimentError(f"{experiment.source}: {fault}")
+
+
+def _whitened(
+    system: System, columns: Sequence[Place], places: Sequence[Place]
+) -> Callable[..., Any]:
+    """The `modify_residual` of sysid that gives all residuals in units of their noise.
+
+    Args:
+        system: The experiment.
+        columns: Place of each column of a measured TimeSeries.
+        places: Place of each of the ny outputs.
+    """
+    chosen = [columns.index(place) for place in places]
+
+    def modify(
+        _: Any, predicted: Any, measured: Any, model: Any, __: bool, state: Array, **___: Any
+    ) -> tuple[Array, Any, Any]:
+        """Residuals after time 0, and both TimeSeries.
+
+        Row 0 of the sensors belongs to the time 0, that of the state (with the time in its first
+        column) is after the first engine step.
+        """
+        after_start = measured.times > 0.0
+        t, data = measured.times[after_start], measured.data[after_start]
+        steps = t / float(model.opt.timestep)
+        found = np.empty_like(data)
+        for i, (is_sensed, index) in enumerate(columns):
+            values = predicted.data[:, index] if is_sensed else state[:, 1 + index]
+            found[:, i] = _at_rows(values, steps - (0 if is_sensed else 1))
+
+        y = data[:, chosen]
+        present = np.isfinite(y)
+        residual = np.where(present, y - found[:, chosen], 0.0)
+        pair = [sysid.TimeSeries(t, each, measured.signal_mapping) for each in (found, data)]
+        return system.noise.whiten_present(residual, present), *pair
+
+    return modify
+
+
+def _with_priors(system: System, of_data: Callable[..., Any]) -> Callable[..., Any]:
+    """The residual function of sysid, with the residuals of the priors behind those of the data."""
+    parameters = system.parameters
+    weights = np.sqrt(np.diag(parameters.prior_information))
+    of_model = CadPrior.of(parameters)
+
+    def residual(theta: Array, values: Any, **options: Any) -> tuple[list[Array], Any, Any]:
+        """Residuals at theta (p,), or (p, k) where sysid computes finite differences."""
+        residuals, predicted, measured = of_data(theta, values, **options)
+        stated = (weights * (parameters.guess - theta.T)).T[weights > 0.0]
+        distances = [-of_model.rows(each)[:, -1] for each in np.atleast_2d(theta.T)]
+        from_model = np.array(distances).T.reshape(-1, *theta.shape[1:])
+        return [*residuals, stated, from_model], predicted, measured
+
+    return residual
+
+
+def _at_rows(values: Array, rows: Array) -> Array:
+    """(M,) values (n,) at rows, between which a cubic spline is taken."""
+    nearest = np.rint(rows)
+    if np.abs(rows - nearest).max() <= ON_STEP:
+        return np.asarray(values[nearest.astype(int)])
+    return np.asarray(CubicSpline(np.arange(len(values)), values)(rows))

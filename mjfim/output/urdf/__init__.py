@@ -1,1 +1,0 @@
-"""The user's URDF with identified values."""
