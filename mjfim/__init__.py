@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from mjfim.identification.parameter_draws import draw_parameters
     from mjfim.output.live import live
     from mjfim.output.models.sysid import export_sysid
-    from mjfim.output.robot.export import export_design
-    from mjfim.output.video.results import save_video
+    from mjfim.output.robots.export import export_design
+    from mjfim.output.video.video import save_video
     from mjfim.parallel import ExecutorLike, Pool, Workers
     from mjfim.records.campaign import Campaign
     from mjfim.records.check import Check
@@ -110,10 +110,10 @@ MODULES = {
     "identify": "mjfim.identification.identify",
     "inverse_dynamics": "mjfim.identification.inverse_dynamics",
     "draw_parameters": "mjfim.identification.parameter_draws",
-    "export_design": "mjfim.output.robot.export",
+    "export_design": "mjfim.output.robots.export",
     "export_sysid": "mjfim.output.models.sysid",
     "live": "mjfim.output.live",
-    "save_video": "mjfim.output.video.results",
+    "save_video": "mjfim.output.video.video",
     "ExecutorLike": "mjfim.parallel",
     "Pool": "mjfim.parallel",
     "Workers": "mjfim.parallel",

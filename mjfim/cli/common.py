@@ -52,7 +52,7 @@ from mjfim.output.progress_text import design_stage, design_text, fit_text, part
 from mjfim.output.report import OWN_REPORTS, REPORT, is_report
 from mjfim.output.summary_parts import Summary
 from mjfim.output.text import render
-from mjfim.output.video.record import NoVideoError, format_of, require_encoder
+from mjfim.output.video.video import NoVideoError, require_format, write_video
 from mjfim.records.events import (
     Callback,
     DesignEvent,
@@ -64,7 +64,7 @@ from mjfim.records.events import (
 
 if TYPE_CHECKING:
     from mjfim.experiment.system import System
-    from mjfim.output.video.results import Filmed
+    from mjfim.output.video.film import Filmed
 
 app = typer.Typer(
     add_completion=False,
@@ -311,7 +311,7 @@ def claim_video(video: Path | None, inputs: Sequence[Path], *, force: bool) -> N
     if video is None:
         return
 
-    require_encoder(format_of(video))
+    require_format(video)
     claim_file(video, inputs, force=force)
 
 
@@ -325,8 +325,6 @@ def write_wanted_video(video: Path | None, system: System, result: Filmed) -> No
     """
     if video is None:
         return
-
-    from mjfim.output.video.results import write_video
 
     def write() -> None:
         """Write the file and say what it shows."""
@@ -350,24 +348,17 @@ def permit_processes() -> None:
     _may_start_processes = True
 
 
-def draw_elsewhere(*, with_video: bool = False) -> None:
-    """Let other processes draw the pictures of the running verb's result.
+def draw_elsewhere() -> None:
+    """Let another process draw the pictures of the running verb's result.
 
-    They import what they need while the verb works. On a single processor, they would delay it.
-
-    Args:
-        with_video: True where a video of the result is drawn, too.
+    It imports what it needs while the verb works. On a single processor, it would delay it.
     """
     if not _may_start_processes:
         return
 
-    from mjfim.output.drawing import FEWEST_CORES, drawing_elsewhere
-    from mjfim.output.video.process import process_waiting
-    from mjfim.parallel import cores
+    from mjfim.output.drawing import drawing_elsewhere
 
     _claims.enter_context(drawing_elsewhere())
-    if with_video and cores() >= FEWEST_CORES:
-        _claims.enter_context(process_waiting())
 
 
 def keep_result(folder: Path | None = None) -> None:

@@ -101,7 +101,7 @@ def design(
     executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Design the excitation that gives the most information about the parameters."""
-    draw_elsewhere(with_video=True)
+    draw_elsewhere()
     from mjfim.excitation.design import design_budget, design_task
     from mjfim.excitation.task import DesignTask
     from mjfim.excitation.task_parts import require_design_keys

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import typer
 
 import mjfim
 from mjfim.cli.common import Force, claim_file, claim_folder, errors, keep_result, progress, verb
-from mjfim.output.robot.options import Target
+from mjfim.output.robots import TARGETS
 
 
 @verb
@@ -20,9 +20,7 @@ def export(
     ],
     to: Annotated[
         str,
-        typer.Option(
-            "--to", metavar="TARGET", help=f"What is written: {', '.join(get_args(Target))}."
-        ),
+        typer.Option("--to", metavar="TARGET", help=f"What is written: {', '.join(TARGETS)}."),
     ],
     output: Annotated[
         Path,
@@ -52,31 +50,29 @@ def export(
     from mjfim.experiment.input_files import input_files
     from mjfim.experiment.system import System
     from mjfim.output.folders import find_experiment_file
-    from mjfim.output.robot.export import (
-        ExportOptions,
+    from mjfim.output.robots.export import (
         exported_files,
         is_folder,
-        target_of,
+        require_options,
         write_export,
     )
-    from mjfim.output.robot.plan import RobotPlan
+    from mjfim.output.robots.plan import RobotPlan
 
-    target = target_of(to)
+    require_options(to, positions, storage, unit)
     file = design_folder / "design.npz" if design_folder.is_dir() else design_folder
     stated = mjfim.Experiment.from_file(experiment or find_experiment_file(file))
     inputs = input_files(stated, [design_folder])
-    if is_folder(target):
-        claim_folder(output, exported_files(target, output), inputs, force=force)
+    if is_folder(to):
+        claim_folder(output, exported_files(to, output), inputs, force=force)
     else:
         claim_file(output, inputs, force=force)
 
     with progress("exporting"):
         design = mjfim.Design.load(file)
         plan = RobotPlan.of(design, System.resolve(stated), file)
-        keep_result(output if is_folder(target) else output.parent)
-        options = ExportOptions(positions=positions, storage=storage, unit=unit)
-        remarks = write_export(plan, output, target, options)
+        keep_result(output if is_folder(to) else output.parent)
+        remarks = write_export(plan, output, to, positions, storage, unit)
 
     for sentence in remarks:
         errors.print(f"note: {sentence}", markup=False)
-    errors.print(f"wrote {output}{'/' if is_folder(target) else ''}", markup=False)
+    errors.print(f"wrote {output}{'/' if is_folder(to) else ''}", markup=False)

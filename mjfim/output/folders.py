@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +15,7 @@ from mjfim.experiment.system import System
 from mjfim.files import read_json, remove_earlier_result, replacing, write_json
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.interruption import current_interruption
-from mjfim.output import archive, latex, markdown, plots, video
+from mjfim.output import archive, latex, markdown, plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.drawing import begin_pictures, picture_contents
 from mjfim.output.models.mjcf import identified_files, write_identified
@@ -27,6 +26,7 @@ from mjfim.output.presentation import describe
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import records_in, write_report
 from mjfim.output.robot_samples import clear_samples, write_samples
+from mjfim.output.video.video import report_video
 from mjfim.records.base import ShownRecord
 from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
@@ -222,39 +222,25 @@ def write_design_folder(
         system: The experiment for which it was made.
         picture_format: Format of the pictures.
     """
-    # Other processes draw the pictures and the video, while this one writes the other files.
+    # Other processes draw the pictures, while this one writes the other files.
     begin_pictures(design, picture_format)
-    with _video_begun(system, design) as drawn:
-        archive.write_design(folder, design, system)
-        write_tables(folder, design)
+    archive.write_design(folder, design, system)
+    write_tables(folder, design)
 
-        write_optional(REPORT, lambda: write_report(folder, Design))
-        write_optional("design.rrd", lambda: _write_design_log(folder, design, system))
-        _write_figures(folder, design, picture_format)
-        write_optional("the video", lambda: _add_video(folder, design, drawn))
-
-
-def _video_begun(
-    system: System, result: Design | Estimate
-) -> AbstractContextManager[video.VideoBegun | None]:
-    """Begin to draw the video of a report; who has pressed Ctrl-C does not wait for one."""
-    return nullcontext() if _is_interrupted() else video.VideoBegun(system, result)
+    write_optional(REPORT, lambda: write_report(folder, Design))
+    write_optional("design.rrd", lambda: _write_design_log(folder, design, system))
+    _write_figures(folder, design, picture_format)
+    write_optional("the video", lambda: _add_video(folder, design, system))
 
 
-def _add_video(folder: Path, result: Design | Estimate, begun: video.VideoBegun | None) -> None:
+def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
     """Write the report once more, with its video or with the sentence why there is none."""
-    if begun is None or _is_interrupted():
-        return
-
-    begin_stage("drawing the video of the report")
-    found, sentence = begun.result()
-    write_report(folder, type(result), found, sentence, made=result)
-
-
-def _is_interrupted() -> bool:
-    """Whether the user has pressed Ctrl-C."""
     interruption = current_interruption()
-    return interruption is not None and interruption.presses > 0
+    if interruption is not None and interruption.presses:
+        return  # who has pressed Ctrl-C does not wait for a video
+    begin_stage("drawing the video of the report")
+    found, sentence = report_video(system, result)
+    write_report(folder, type(result), found, sentence, made=result)
 
 
 def _write_design_log(folder: Path, design: Design, system: System) -> None:
@@ -383,11 +369,10 @@ def write_estimate_folder(
             "the drawn robots", lambda: remarks.extend(write_samples(folder, estimate, system))
         )
 
-    with _video_begun(system, estimate) as drawn:
-        write_optional(REPORT, lambda: write_report(folder, Estimate, made=estimate))
-        _write_figures(folder, estimate, picture_format)
-        write_optional("estimate.rrd", lambda: _write_estimate_log(folder, estimate, system))
-        write_optional("the video", lambda: _add_video(folder, estimate, drawn))
+    write_optional(REPORT, lambda: write_report(folder, Estimate, made=estimate))
+    _write_figures(folder, estimate, picture_format)
+    write_optional("estimate.rrd", lambda: _write_estimate_log(folder, estimate, system))
+    write_optional("the video", lambda: _add_video(folder, estimate, system))
     return remarks
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -15,22 +14,13 @@ from PIL import Image
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.cli import common
 from mjfim.errors import RecordingError
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output import vocabulary
-from mjfim.output.video import NoVideoError, VideoBegun, picture, process, rendering
-from mjfim.output.video.film import (
-    Film,
-    film_of_estimate,
-    film_of_trajectories,
-    film_speed,
-    positions_at,
-)
-from mjfim.output.video.process import back_ends
-from mjfim.output.video.record import Video, format_of
-from mjfim.output.video.rendering import Effort, render
-from mjfim.output.video.worker import counted_seconds
+from mjfim.output.video.film import Film, film_of, film_of_motions, film_speed, positions_at
+from mjfim.output.video.video import NoVideoError, Video, render, report_video, require_format
 from mjfim.records.trajectory import Trajectory
 from tests.support.paths import MODELS
 
@@ -47,9 +37,6 @@ FLYING = """
   <worldbody><body name="flyer"><freejoint/><geom size=".1" mass="1000"/></body></worldbody>
 </mujoco>
 """
-
-# Few and small frames, so that a test takes little time.
-QUICK = Effort(seconds=2.0, fewest_frames=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -76,20 +63,16 @@ def swinging(seconds: float, amplitude: float = 0.5) -> Trajectory:
     return motion(t, amplitude * np.sin(3.0 * t)[:, None])
 
 
-def test_lines_cast_no_shadow(swing: mujoco.MjModel) -> None:
-    """The path of a robot and the floor are decoration, which MuJoCo leaves out of shadows."""
-    scene = mujoco.MjvScene(swing, 2)
-    scene.geoms[0].category = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
-    colour = np.ones(4, dtype=np.float32)
-    picture._add_line(scene, np.zeros(3), np.ones(3), 0.01, colour)
-    assert scene.ngeom == 1
-    assert scene.geoms[0].category == int(mujoco.mjtCatBit.mjCAT_DECOR)
+def identified(model: mujoco.MjModel, *motions: Trajectory) -> Film:
+    """A film of an identified motion, with a measured one as a ghost."""
+    terms = (vocabulary.IDENTIFIED, vocabulary.MEASURED)
+    return film_of_motions(model, [list(zip(terms, motions, strict=False))])
 
 
 def drawn(film: Film, kind: str) -> Video:
-    """Draw a film; skip the test where nothing can be drawn."""
+    """Draw a film in two seconds; skip the test where nothing can be drawn."""
     try:
-        return render(film, kind, QUICK)  # type: ignore[arg-type]
+        return render(film, kind, 2.0)  # type: ignore[arg-type]
     except NoVideoError as reason:
         pytest.skip(f"no video here: {reason}")
 
@@ -103,40 +86,22 @@ class TestFilm:
         assert film_speed(seconds) == speed
 
     def test_a_long_motion_ends_early_and_says_so(self, swing: mujoco.MjModel) -> None:
-        film = film_of_estimate(swing, swinging(100.0), None)
+        film = identified(swing, swinging(100.0))
         assert film.t[-1] == pytest.approx(40.0)
         assert film.caption == (
             "The identified motion, 2 times faster than real time. "
             "Only the first 40 s are shown; 60 s follow."
         )
 
-    def test_the_rest_of_a_recording_that_is_longer_than_the_motion_is_said(
-        self, swing: mujoco.MjModel
-    ) -> None:
-        for seconds, recorded, text in (
-            (10.0, 60.0, "Only the first 10 s are shown; 50 s follow."),
-            (100.0, 160.0, "Only the first 40 s are shown; 120 s follow."),
-        ):
-            film = film_of_estimate(swing, swinging(seconds), swinging(seconds), recorded)
-            assert film.caption.endswith(text)
-        film = film_of_estimate(swing, swinging(10.0), swinging(10.0), 10.0001)
-        assert "follow" not in film.caption
-
     def test_initial_is_beside_designed(self, swing: mujoco.MjModel) -> None:
-        named = {"initial": swinging(4.0), "final": swinging(4.0, 1.0)}
-        film = film_of_trajectories(swing, named)
-
-        words = [[track.word for track in view.tracks] for view in film.views]
-        assert words == [["initial"], ["designed"]]
+        motions = [[(vocabulary.INITIAL, swinging(4.0))], [(vocabulary.DESIGNED, swinging(4.0))]]
+        film = film_of_motions(swing, motions)
         assert film.caption == "The initial motion beside the designed motion, in real time."
 
     def test_measured_is_a_ghost_over_identified(self, swing: mujoco.MjModel) -> None:
-        film = film_of_estimate(swing, swinging(4.0), swinging(4.0, 0.6))
+        film = identified(swing, swinging(4.0), swinging(4.0, 0.6))
         (view,) = film.views
-        robot, ghost = view.tracks
-        assert (robot.word, ghost.word) == ("identified", "measured")
-        assert robot.opacity == 1.0 > ghost.opacity
-        assert ghost.colour == vocabulary.MEASURED.rgb
+        assert [track.is_ghost for track in view.tracks] == [False, True]
         assert film.caption.startswith(
             "The identified motion and the measured motion (transparent)"
         )
@@ -166,9 +131,8 @@ class TestFilm:
         qpos = np.tile(model.qpos0, (41, 1))
         qpos[:, 0] = scale * distance * t / 4.0
 
-        film = film_of_estimate(model, motion(t, qpos), None)
-        assert film.follows == follows
-        (view,) = film.views
+        (view,) = identified(model, motion(t, qpos)).views
+        assert len(view.trail) == (100 if follows else 0)
         travelled = view.target[-1, 0] - view.target[0, 0]
         assert travelled == pytest.approx(scale * distance if follows else 0.0, rel=0.1)
 
@@ -180,155 +144,78 @@ class TestFilm:
         text = SWING.replace('axis="0 1 0"', f'axis="{axis}"').replace("0 0 -1", "0.8 0 -0.1")
         t = np.linspace(0.0, 4.0, 81)
         turning = motion(t, 2.0 * np.pi * t[:, None] / t[-1])
-        film = film_of_estimate(mujoco.MjModel.from_xml_string(text), turning, None)
+        film = identified(mujoco.MjModel.from_xml_string(text), turning)
         assert film.camera.size == size
 
 
 class TestVideo:
     def test_other_endings_are_refused(self) -> None:
-        assert format_of(Path("a.MP4")) == "mp4"
+        assert require_format(Path("a.GIF")) == "gif"
         with pytest.raises(RecordingError, match=r"ends in \.mp4 or \.gif"):
-            format_of(Path("a.avi"))
+            require_format(Path("a.avi"))
 
-    def test_drawing_may_be_turned_off(
-        self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+    @pytest.mark.parametrize(
+        ("back_end", "said"),
+        [
+            ("disable", "MUJOCO_GL turns drawing off"),
+            ("nonsense", "nothing with the variable MUJOCO_GL=nonsense"),
+        ],
+    )
+    def test_without_a_context_there_is_a_sentence(
+        self, back_end: str, said: str, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setenv("MUJOCO_GL", "disable")
-        with pytest.raises(NoVideoError, match="MUJOCO_GL turns drawing off"):
-            render(film_of_estimate(swing, swinging(1.0), None), "gif")
+        monkeypatch.setenv("MUJOCO_GL", back_end)
+        with pytest.raises(NoVideoError, match=said):
+            render(identified(swing, swinging(1.0)), "gif")
 
     def test_a_report_says_why_it_has_no_video(self) -> None:
         """Nothing is drawn while tests run, see `tests/conftest.py`."""
         system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
         resting = motion(np.array([0.0, 1.0]), np.zeros((2, 2)))
-        with VideoBegun(system, resting) as begun:
-            drawn = begun.result()
-        assert drawn == (
+        assert report_video(system, resting) == (
             None,
             "There is no video of the robot: the variable MUJOCO_GL turns drawing off.",
         )
 
         # A motion that diverged cannot be drawn anywhere.
         diverged = motion(np.array([0.0, 1.0]), np.full((2, 2), np.nan))
-        with VideoBegun(system, diverged) as begun:
-            video, sentence = begun.result()
+        video, sentence = report_video(system, diverged)
         assert video is None
         assert "positions that are not finite" in sentence
 
-    def test_a_process_that_waits_draws_the_first_film_and_ends(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """One that nobody needs ends with its context."""
-        monkeypatch.setattr(process, "PROGRAM", "import sys; print(sys.stdin.readline())")
-        with process.process_waiting():
-            assert process._waiting == {}  # drawing is turned off while tests run
-
-        monkeypatch.setenv("MUJOCO_GL", "egl")
-        with process.process_waiting():
-            (waiting,) = process._waiting.values()
-            with process.process_for(tmp_path, "egl") as drawing:
-                assert drawing is waiting
-                assert drawing.wait(timeout=60.0) == 0
-        with process.process_waiting():
-            (waiting,) = process._waiting.values()
-        assert waiting.poll() is not None
-
-    def test_a_process_that_was_ended_from_outside_is_replaced(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """One that has failed is not: it shows that this kind of context does not work."""
-        monkeypatch.setenv("MUJOCO_GL", "egl")
-        for program, is_replaced in (("raise SystemExit(3)", True), ("raise ValueError", False)):
-            monkeypatch.setattr(process, "PROGRAM", program)
-            with process.process_waiting():
-                (waiting,) = process._waiting.values()
-                waiting.wait(timeout=60.0)
-                with process.process_for(tmp_path, "egl") as drawing:
-                    assert (drawing is not waiting) == is_replaced
-
-    def test_without_another_process_there_is_no_video(
-        self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def fail(*_: Any, **__: Any) -> Any:
-            raise OSError("no memory")
-
-        monkeypatch.setenv("MUJOCO_GL", "egl")
-        monkeypatch.setattr("mjfim.output.video.process.subprocess.Popen", fail)
-        with process.process_waiting():
-            assert process._waiting == {}
-            reason = r"the process that draws it cannot be started \(no memory\)"
-            with pytest.raises(NoVideoError, match=reason):
-                render(film_of_estimate(swing, swinging(1.0), None), "gif")
-
-    @pytest.mark.parametrize(("cores", "begun"), [(1, []), (2, ["pictures", "video"])])
-    def test_a_single_processor_lets_no_process_wait(
-        self, cores: int, begun: list[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        started: list[str] = []
-
-        @contextmanager
-        def waiting() -> Iterator[None]:
-            started.append("video")
-            yield
-
-        def pictures() -> None:
-            started.append("pictures")
-
-        monkeypatch.setattr("mjfim.parallel.cores", lambda: cores)
-        monkeypatch.setattr(common, "_may_start_processes", True)
-        monkeypatch.setattr(process, "process_waiting", waiting)
-        monkeypatch.setattr("mjfim.output.drawing.DrawingProcess", pictures)
-        with ExitStack() as claims:
-            monkeypatch.setattr(common, "_claims", claims)
-            common.draw_elsewhere(with_video=True)
-        assert started == begun
-
-    @pytest.mark.parametrize(
-        ("wall", "processor", "counted"),
-        [(1.0, 0.9, 0.9), (1.0, 1.9, 1.0), (2.0, 0.04, 1.0)],
-        ids=["others use the processor", "two processors draw", "a graphics card draws"],
-    )
-    def test_waiting_for_a_graphics_card_counts(
-        self, wall: float, processor: float, counted: float
-    ) -> None:
-        assert counted_seconds(wall, processor) == pytest.approx(counted)
-
-    def test_a_stated_context_is_the_only_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("MUJOCO_GL", "egl")
-        assert back_ends() == ("egl",)
-        monkeypatch.delenv("MUJOCO_GL")
-        assert len(back_ends()) >= 1
-
-    @pytest.mark.slow
-    def test_a_context_that_cannot_be_opened_gives_a_sentence(
-        self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("MUJOCO_GL", "nonsense")
-        with pytest.raises(NoVideoError, match="nothing with the variable MUJOCO_GL=nonsense"):
-            render(film_of_estimate(swing, swinging(1.0), None), "gif")
+    @pytest.mark.parametrize(("seconds", "follow"), [(3.0, 1.0), (4.0, 0.0)])
+    def test_the_rest_of_a_recording_is_said(self, seconds: float, follow: float) -> None:
+        """An estimate may hold the motion of a part of its recording."""
+        task = DesignTask.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+        recording = simulate_system(task.system, task.initial, 0)
+        whole = task.initial
+        rows = round(seconds / task.dt)
+        shown = motion(whole.t[: rows + 1], whole.qpos[: rows + 1])
+        estimate: Any = SimpleNamespace(motion=shown, recordings=[recording], theta=task.theta)
+        caption = film_of(task.system, estimate).caption
+        assert ("1 s follow" in caption) == (follow > 0.0)
+        assert ("follow" in caption) == (follow > 0.0)
+        assert "measured motion (transparent)" in caption
 
     @pytest.mark.slow
     @pytest.mark.usefixtures("drawing")
-    def test_a_driver_that_hangs_is_ended(
-        self, swing: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(process, "PROGRAM", "import time; time.sleep(600.0)")
-        monkeypatch.setattr(rendering, "START_SECONDS", 0.1)
-        quick = Effort(seconds=0.1)
-        with pytest.raises(NoVideoError, match=r"did not end within|took too long"):
-            render(film_of_estimate(swing, swinging(1.0), None), "gif", quick)
+    def test_too_slow_for_a_report(self, swing: mujoco.MjModel) -> None:
+        film = identified(swing, swinging(3.0))
+        drawn(film, "gif")
+        with pytest.raises(NoVideoError, match=r"drawing it takes about \d+ s here"):
+            render(film, "gif", seconds=1e-3, fewest_frames=7.0)
 
     @pytest.mark.slow
     @pytest.mark.usefixtures("drawing")
     def test_mp4_shows_both_motions(self, swing: mujoco.MjModel, tmp_path: Path) -> None:
         av = pytest.importorskip("av", reason="mp4 needs the extra `video`")
-        named = {"initial": swinging(4.0, 0.0), "final": swinging(4.0, 1.0)}
-        video = drawn(film_of_trajectories(swing, named), "mp4")
-        video.save(tmp_path / "film.mp4")
+        still, moving = swinging(4.0, 0.0), swinging(4.0, 1.0)
+        motions = [[(vocabulary.INITIAL, still)], [(vocabulary.DESIGNED, moving)]]
+        video = drawn(film_of_motions(swing, motions), "mp4")
 
         assert video.media_type == "video/mp4"
         assert 1000 < len(video.data) < 2_000_000
-        with av.open(str(tmp_path / "film.mp4")) as container:
+        with av.open(io.BytesIO(video.data)) as container:
             stream = container.streams.video[0]
             assert (stream.codec.name, stream.pix_fmt) == ("h264", "yuv420p")
             assert (stream.width, stream.height) == (video.width, video.height)
@@ -342,11 +229,14 @@ class TestVideo:
 
     @pytest.mark.slow
     @pytest.mark.usefixtures("drawing")
-    def test_gif_repeats_for_ever(self, swing: mujoco.MjModel) -> None:
-        video = drawn(film_of_estimate(swing, swinging(3.0), swinging(3.0, 0.6)), "gif")
+    @pytest.mark.parametrize("kind", ["gif", "webp"])
+    def test_pictures_repeat_for_ever(self, kind: str, swing: mujoco.MjModel) -> None:
+        video = drawn(identified(swing, swinging(3.0), swinging(3.0, 0.6)), kind)
         with Image.open(io.BytesIO(video.data)) as picture:
-            assert picture.format == "GIF"
+            assert picture.format == kind.upper()
             assert picture.size == (video.width, video.height)
             assert picture.info["loop"] == 0
-            duration = picture.info["duration"] * getattr(picture, "n_frames", 1)
-        assert duration == pytest.approx(3000.0, rel=0.1)
+            frames = getattr(picture, "n_frames", 1)
+            picture.seek(1)
+            picture.load()
+            assert frames * picture.info["duration"] == pytest.approx(3000.0, rel=0.1)

@@ -1,8 +1,6 @@
-from .begun import VideoBegun
-from .record import NoVideoError, Video
+from .video import NoVideoError, Video
 
 __all__ = [
     "NoVideoError",
     "Video",
-    "VideoBegun",
 ]

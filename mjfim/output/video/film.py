@@ -1,7 +1,4 @@
-"""Contents of a video: the motions, their views, the speed, and the camera.
-
-A film holds arrays and words only. `mjfim.output.video.rendering` draws it.
-"""
+"""Contents of a video: the motions, their views, the speed, and the camera."""
 
 from __future__ import annotations
 
@@ -10,28 +7,39 @@ from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
+import scipy.ndimage
 
 from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.experiment.system import System
+from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.output import vocabulary
-from mjfim.output.rerun.scene import BodyPoses, body_poses
-from mjfim.output.video.camera import FilmCamera, lowered, place_film_camera
-from mjfim.output.video.record import NoVideoError
+from mjfim.output.rerun.camera import (
+    EDGE_ON,
+    camera_axes,
+    extents,
+    fit_in_view,
+    moving_points,
+    seen_points,
+    view_direction,
+)
+from mjfim.output.rerun.scene import BodyPoses, body_poses, has_floor
+from mjfim.output.video.video import NoVideoError
 from mjfim.output.vocabulary import Term
 from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
 from mjfim.records.trajectory import Trajectory
+
+# What a video can show: a trajectory is a simulated motion.
+Filmed = Design | Estimate | Trajectory
 
 # Frames per second of the film, of which a slow computer draws a part. Every second frame is at a
 # multiple of 10 ms, as a GIF needs.
 FRAME_RATE = 25.0
 
-# Longest and shortest film [s]. A longer motion is played faster or ends early, a shorter one is
-# played slower.
+# Longest and shortest film [s]. A longer motion is played at the largest speed, in multiples of
+# real time, or ends early; a shorter one is played at a smaller speed.
 LONGEST_FILM, SHORTEST_FILM = 20.0, 3.0
-
-# Largest speed at which a motion is played, in multiples of real time.
 FASTEST = 2.0
-
-# Speeds below real time.
 SLOW_SPEEDS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 
 # Sizes that a view may have [pixels], all about equally large: that one is taken in which the robot
@@ -39,20 +47,19 @@ SLOW_SPEEDS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 VIEW_SIZES = ((640, 360), (560, 420), (480, 480))
 
 # Distance that a free body travels, as a multiple of the size of the robot, above which the camera
-# follows it.
+# follows it; time over which the motion of this camera is averaged [s of the film]; and points of
+# the line along the path of the body.
 FOLLOWED_TRAVEL = 1.5
-
-# Time over which the motion of a camera that follows a body is averaged [s of the film].
 CAMERA_SECONDS = 0.5
-
-# Points of the line along the path of a body that the camera follows.
 TRAIL_POINTS = 100
 
-# Share of the colour of its word in the grey parts of a robot, and in a ghost.
-TINT, GHOST_TINT = 0.45, 0.9
+# Vertical field of view [rad], and the share of the picture that the motion fills.
+FIELD_OF_VIEW = float(np.radians(40.0))
+FILLED = 0.9
 
-# Opacity of a ghost.
-GHOST_OPACITY = 0.4
+# Distance between the lines of the floor, as a share of the distance of the camera, or of its
+# height above the floor where that is larger.
+FLOOR_SPACING = 0.12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,19 +67,14 @@ class Track:
     """One robot in a view.
 
     Attributes:
-        word: Word in the title of the view.
-        colour: Colour of the word and of the tint (0..255).
+        term: Its word and its colour.
         qpos: (F, nq) positions in each frame of the film.
-        tint: Share of the colour in the moving parts (0..1). Parts of a robot that have a colour in
-            the model nearly keep it, those of a ghost do not.
-        opacity: Opacity of the moving parts (0..1).
+        is_ghost: Whether it is transparent.
     """
 
-    word: str
-    colour: tuple[int, int, int]
+    term: Term
     qpos: Array
-    tint: float = TINT
-    opacity: float = 1.0
+    is_ghost: bool
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -91,6 +93,26 @@ class FilmView:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class FilmCamera:
+    """Camera of all views.
+
+    Attributes:
+        target: (3,) point at which it looks in the first frame [m].
+        offset: (3,) vector from there to the camera [m].
+        floor: Height of a floor that is drawn for models without one [m]; None where it would
+            be seen edge-on, and for models with a floor.
+        spacing: Distance between the lines of this floor [m].
+        size: Width and height of the picture [pixels].
+    """
+
+    target: Array
+    offset: Array
+    floor: float | None
+    spacing: float
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Film:
     """A motion in frames.
 
@@ -98,9 +120,8 @@ class Film:
         model: The model.
         t: (F,) time of the motion in each frame [s].
         views: Views side by side.
-        camera: The camera in the first frame.
+        camera: The camera.
         speed: Speed in multiples of real time.
-        follows: True if the camera moves with the robot.
         left_out: Time at the end of the motion that is not shown [s].
     """
 
@@ -109,103 +130,87 @@ class Film:
     views: tuple[FilmView, ...]
     camera: FilmCamera
     speed: float
-    follows: bool
     left_out: float
+
+    @property
+    def speed_text(self) -> str:
+        """How fast the film is played."""
+        if self.speed == 1.0:
+            return "in real time"
+        if self.speed > 1.0:
+            return f"{self.speed:g} times faster than real time"
+        return f"{1.0 / self.speed:g} times slower than real time"
 
     @property
     def caption(self) -> str:
         """One or two sentences that describe the film."""
-        pictures = [" and ".join(_robot(track) for track in view.tracks) for view in self.views]
+        pictures = []
+        for view in self.views:
+            robots = [
+                f"the {track.term.word} motion{' (transparent)' if track.is_ghost else ''}"
+                for track in view.tracks
+            ]
+            pictures.append(" and ".join(robots))
         shown = " beside ".join(pictures)
-        sentences = [f"{shown[:1].upper()}{shown[1:]}, {speed_text(self.speed)}."]
+        caption = f"{shown[:1].upper()}{shown[1:]}, {self.speed_text}."
         if self.left_out > 0.0:
-            sentences.append(
-                f"Only the first {self.t[-1] - self.t[0]:.3g} s are shown; "
-                f"{self.left_out:.3g} s follow."
-            )
-        return " ".join(sentences)
+            seconds = self.t[-1] - self.t[0]
+            caption += f" Only the first {seconds:.3g} s are shown; {self.left_out:.3g} s follow."
+        return caption
 
 
-def speed_text(speed: float) -> str:
-    """Say how fast a film is played.
+def film_of(system: System, result: Filmed) -> Film:
+    """Film a result: a design beside its initial motion, an estimate under the measured robot.
 
     Args:
-        speed: Speed in multiples of real time.
+        system: The experiment, resolved.
+        result: The result.
+
+    Raises:
+        NoVideoError: The result holds no motion, or one that diverged.
     """
-    if speed == 1.0:
-        return "in real time"
-    if speed > 1.0:
-        return f"{speed:g} times faster than real time"
-    return f"{1.0 / speed:g} times slower than real time"
+    if isinstance(result, Design):
+        motions = [
+            [(vocabulary.INITIAL, result.initial.trajectory)],
+            [(vocabulary.DESIGNED, result.final.trajectory)],
+        ]
+        return film_of_motions(system.model_at(system.theta), motions)
+    if isinstance(result, Trajectory):
+        simulated = replace(vocabulary.OTHER, word="simulated")
+        return film_of_motions(system.model_at(system.theta), [[(simulated, result)]])
 
-
-def _robot(track: Track) -> str:
-    """Name the robot of a track."""
-    return f"the {track.word} motion" + (" (transparent)" if track.opacity < 1.0 else "")
-
-
-# ---- films of results
-
-
-def film_of_design(model: mujoco.MjModel, design: Design) -> Film:
-    """Film the initial beside the designed motion.
-
-    Args:
-        model: The model.
-        design: The design.
-    """
-    named = {"initial": design.initial.trajectory, "final": design.final.trajectory}
-    return film_of_trajectories(model, named)
-
-
-def film_of_trajectories(model: mujoco.MjModel, named: dict[str, Trajectory]) -> Film:
-    """Film trajectories beside each other.
-
-    Args:
-        model: The model.
-        named: The trajectories; `initial` and `final` get their words and colours.
-    """
-    motions = []
-    for name, trajectory in named.items():
-        term = vocabulary.TRAJECTORY_TERMS.get(name)
-        if term is None:
-            term = replace(vocabulary.OTHER, word=name)
-        motions.append([(term, trajectory)])
-    return _film(model, motions)
-
-
-def film_of_estimate(
-    model: mujoco.MjModel,
-    identified: Trajectory,
-    measured: Trajectory | None,
-    recorded: float = 0.0,
-) -> Film:
-    """Film the measured robot as a ghost over the identified one.
-
-    Args:
-        model: The identified model.
-        identified: Motion of the identified model.
-        measured: Measured motion; None where positions were not measured.
-        recorded: Duration of the recording, of which the motions may show a part [s].
-    """
-    motions = [(vocabulary.IDENTIFIED, identified)]
+    if result.motion is None:
+        raise NoVideoError("the estimate holds no motion of a recording")
+    recording = result.recordings[0]
+    measured = measured_trajectory(system, recording, float(result.motion.t[-1]))
+    view = [(vocabulary.IDENTIFIED, result.motion)]
     if measured is not None:
-        motions.append((vocabulary.MEASURED, measured))
-    film = _film(model, [motions])
+        view.append((vocabulary.MEASURED, measured))
+    film = film_of_motions(system.model_at(result.theta), [view])
 
-    # Both may end up to one sample apart.
-    missing = recorded - float(identified.t[-1] - identified.t[0])
-    if missing <= float(identified.t[1] - identified.t[0]):
-        return film
-    return replace(film, left_out=film.left_out + missing)
+    # The motion may be a part of the recording; both may end up to one sample apart.
+    t = result.motion.t
+    missing = float(recording.t[-1] - recording.t[0]) - float(t[-1] - t[0])
+    return replace(film, left_out=film.left_out + (missing if missing > t[1] - t[0] else 0.0))
 
 
-def _film(model: mujoco.MjModel, motions: Sequence[Sequence[tuple[Term, Trajectory]]]) -> Film:
-    """Film motions: a view for each list, in which the motions after the first are ghosts."""
-    if not all(np.isfinite(each.qpos).all() for view in motions for _, each in view):
+def film_of_motions(
+    model: mujoco.MjModel, motions: Sequence[Sequence[tuple[Term, Trajectory]]]
+) -> Film:
+    """Film motions.
+
+    Args:
+        model: The model.
+        motions: The motions of each view; those after the first one are ghosts.
+
+    Raises:
+        NoVideoError: A motion has positions that are not finite.
+    """
+    every = [each for view in motions for _, each in view]
+    if not all(np.isfinite(each.qpos).all() for each in every):
         raise NoVideoError("the motion has positions that are not finite")
 
-    longest = max((each for view in motions for _, each in view), key=lambda each: each.t[-1])
+    longest = max(every, key=lambda each: float(each.t[-1]))
     begin, end = float(longest.t[0]), float(longest.t[-1])
     speed = film_speed(end - begin)
     shown = min(end - begin, LONGEST_FILM * speed)
@@ -213,51 +218,37 @@ def _film(model: mujoco.MjModel, motions: Sequence[Sequence[tuple[Term, Trajecto
     t = begin + np.linspace(0.0, shown, frames)
 
     tracks = [
-        tuple(_track(model, term, each, t, ghost=k > 0) for k, (term, each) in enumerate(view))
+        tuple(
+            Track(term=term, qpos=positions_at(model, each.t, each.qpos, t), is_ghost=k > 0)
+            for k, (term, each) in enumerate(view)
+        )
         for view in motions
     ]
     poses = [[body_poses(model, t, track.qpos) for track in view] for view in tracks]
     paths = _followed_paths(model, poses)
     shifts = [_smooth(path - path[0]) for path in paths] or [np.zeros((frames, 3))] * len(poses)
     camera = _camera(model, poses, shifts)
-    trails = [_thinned(path) for path in paths] or [np.zeros((0, 3))] * len(poses)
-    views = tuple(
-        FilmView(tracks=view, target=camera.target + shift, trail=trail)
-        for view, shift, trail in zip(tracks, shifts, trails, strict=True)
-    )
-
+    points = evenly_spread_indices(frames, TRAIL_POINTS)
+    trails = [path[points] for path in paths] or [np.zeros((0, 3))] * len(poses)
     return Film(
         model=model,
         t=t,
-        views=views,
+        views=tuple(
+            FilmView(tracks=view, target=camera.target + shift, trail=trail)
+            for view, shift, trail in zip(tracks, shifts, trails, strict=True)
+        ),
         camera=camera,
         speed=speed,
-        follows=bool(paths),
         left_out=end - begin - shown,
     )
 
 
 def film_speed(seconds: float) -> float:
-    """Choose how fast a motion is played, in multiples of real time.
-
-    Args:
-        seconds: Duration of the motion [s].
-    """
+    """How fast a motion of some seconds is played, in multiples of real time."""
     if seconds > LONGEST_FILM:
         return FASTEST
-    return next((speed for speed in SLOW_SPEEDS if seconds >= SHORTEST_FILM * speed), 0.001)
-
-
-def _track(
-    model: mujoco.MjModel, term: Term, trajectory: Trajectory, t: Array, *, ghost: bool
-) -> Track:
-    """One robot, with its positions in each frame."""
-    qpos = positions_at(model, trajectory.t, trajectory.qpos, t)
-    if ghost:
-        return Track(
-            word=term.word, colour=term.rgb, qpos=qpos, tint=GHOST_TINT, opacity=GHOST_OPACITY
-        )
-    return Track(word=term.word, colour=term.rgb, qpos=qpos)
+    fitting = [speed for speed in SLOW_SPEEDS if seconds >= SHORTEST_FILM * speed]
+    return fitting[0] if fitting else SLOW_SPEEDS[-1]
 
 
 def positions_at(model: mujoco.MjModel, t: Array, qpos: Array, times: Array) -> Array:
@@ -286,9 +277,6 @@ def positions_at(model: mujoco.MjModel, t: Array, qpos: Array, times: Array) -> 
     return found
 
 
-# ---- camera
-
-
 def _camera(
     model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]], shifts: Sequence[Array]
 ) -> FilmCamera:
@@ -298,14 +286,36 @@ def _camera(
         for view, shift in zip(poses, shifts, strict=True)
         for each in view
     ]
-    cameras = [place_film_camera(model, seen, size) for size in VIEW_SIZES]
-    camera = max(cameras, key=lambda each: each.scale)
+    clouds = moving_points(model, seen)
+    direction = view_direction(extents(clouds))
+    axes = camera_axes(direction)
+    points = seen_points(model, clouds) @ axes.T
+
+    # The size of the picture in which a metre has the most pixels.
+    slope = FILLED * float(np.tan(FIELD_OF_VIEW / 2.0))
+    fits = [(size, fit_in_view(points, slope, size[0] / size[1])) for size in VIEW_SIZES]
+    size, view = max(fits, key=lambda each: each[0][1] / each[1].distance)
+    target = view.target @ axes
+    if has_floor(model) or direction[2] < EDGE_ON:
+        return FilmCamera(
+            target=target, offset=view.distance * direction, floor=None, spacing=0.0, size=size
+        )
+
+    # The floor is below the whole motion.
     heights = np.concatenate([shift[:, 2] for shift in shifts])
-    return lowered(camera, float(heights.min()), float(heights.max()))
+    lowest = float((points @ axes)[:, 2].min())
+    height = float(target[2] + view.distance * direction[2] + np.ptp(heights)) - lowest
+    return FilmCamera(
+        target=target,
+        offset=view.distance * direction,
+        floor=lowest + float(heights.min()),
+        spacing=FLOOR_SPACING * max(view.distance, height),
+        size=size,
+    )
 
 
 def _followed_paths(model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]]) -> list[Array]:
-    """Return the (F, 3) path in each view of the free body that the camera follows [m].
+    """The (F, 3) path in each view of the free body that the camera follows [m].
 
     There are none where no free body travels far.
     """
@@ -313,31 +323,19 @@ def _followed_paths(model: mujoco.MjModel, poses: Sequence[Sequence[BodyPoses]])
     if not len(free):
         return []
 
-    # The free body that carries most of the mass.
+    # The free body that carries most of the mass, and its size with everything on it.
     bodies = model.jnt_bodyid[free]
     body = int(bodies[np.argmax(model.body_subtreemass[bodies])])
+    members = np.flatnonzero(model.body_rootid == model.body_rootid[body])
+    reach = model.geom_rbound[np.isin(model.geom_bodyid, members)].max(initial=0.0)
+    size = 2.0 * float(reach) or float(model.stat.extent)
+
     paths = [view[0].positions[:, body] for view in poses]
     travel = max(float(np.ptp(path, axis=0).max()) for path in paths)
-    return paths if travel >= FOLLOWED_TRAVEL * _size(model, body) else []
-
-
-def _size(model: mujoco.MjModel, body: int) -> float:
-    """Size of a free body with everything on it [m]."""
-    members = np.flatnonzero(model.body_rootid == model.body_rootid[body])
-    geoms = np.flatnonzero(np.isin(model.geom_bodyid, members))
-    reach = model.geom_rbound[geoms].max(initial=0.0)
-    return 2.0 * float(reach) or float(model.stat.extent)
+    return paths if travel >= FOLLOWED_TRAVEL * size else []
 
 
 def _smooth(path: Array) -> Array:
     """Moving average of a path (F, 3) over `CAMERA_SECONDS`; the ends continue."""
     window = round(CAMERA_SECONDS * FRAME_RATE)
-    before, after = window // 2, window - 1 - window // 2
-    wide = np.pad(path, ((before, after), (0, 0)), mode="edge")
-    kernel = np.full(window, 1.0 / window)
-    return np.stack([np.convolve(column, kernel, mode="valid") for column in wide.T], axis=1)
-
-
-def _thinned(path: Array) -> Array:
-    """Points of a path (F, 3) from which its line is drawn."""
-    return path[evenly_spread_indices(len(path), TRAIL_POINTS)]
+    return np.asarray(scipy.ndimage.uniform_filter1d(path, window, axis=0, mode="nearest"))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -13,36 +12,15 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.excitation.limits import limits_of
 from mjfim.experiment.system import System
-from mjfim.model.coordinates import ScalarJoint, actuator_names
-from mjfim.model.servos import (
-    AFFINE,
-    AT_JOINT,
-    Servo,
-    actuator_gear,
-    is_integrated,
-    servo_kind,
-)
+from mjfim.model.coordinates import ScalarJoint
+from mjfim.model.servos import AFFINE, AT_JOINT, actuator_gear, is_integrated, servo_kind
 from mjfim.output.archive import check_fits
 from mjfim.output.playback import reference_columns, simulate_playback
 from mjfim.records.design import Design
 from mjfim.records.trajectory import Playback
 
-
-class DriveKind(Enum):
-    """Meaning of the control of an actuator."""
-
-    FORCE = "force or torque"
-    POSITION = "position of a servo"
-    VELOCITY = "velocity of a servo"
-    OTHER = "none of these"
-
-
-# What the controls of servos mean.
-KINDS_OF_SERVOS: dict[Servo | None, DriveKind] = {
-    "position": DriveKind.POSITION,
-    "velocity": DriveKind.VELOCITY,
-    None: DriveKind.OTHER,
-}
+# What a control means; that of a servo is a position or a velocity.
+Meaning = Literal["force", "position", "velocity", "other"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +29,7 @@ class Drive:
 
     Attributes:
         name: Name of the control.
-        kind: What the control means.
+        meaning: What the control means.
         joint: The slide or hinge joint on which its actuator acts; None where it acts on something
             else, or on several joints.
         gear: Ratio of the actuator's coordinate to that of the joint.
@@ -61,7 +39,7 @@ class Drive:
     """
 
     name: str
-    kind: DriveKind
+    meaning: Meaning
     joint: ScalarJoint | None
     gear: float
     holds_position: bool
@@ -78,7 +56,7 @@ class RobotPlan:
         system: The experiment.
         playback: The M rows of control and the final state, as in design.csv.
         reference: (M+1,) columns of reference.csv by name.
-        drives: The nu controls.
+        drives: The nu controls, in the order of the model.
     """
 
     name: str
@@ -100,15 +78,14 @@ class RobotPlan:
             RecordingError: The design was made for another model or another rate.
             SimulationDivergedError: The simulation diverges.
         """
-        source = Path(system.experiment.source)
         check_fits(file or Path("the design"), design.trajectory, system)
         playback = simulate_playback(system, design.trajectory, design.final.gain)
         return cls(
-            name=source.stem,
+            name=Path(system.experiment.source).stem,
             system=system,
             playback=playback,
             reference=reference_columns(playback, system),
-            drives=drives_of(system),
+            drives=_drives(system),
         )
 
     @property
@@ -117,51 +94,39 @@ class RobotPlan:
         ctrl = self.playback.ctrl
         return np.concatenate([ctrl, ctrl[-1:]])
 
-    def column(self, name: str) -> Array:
-        """(M+1,) a column of reference.csv, for example `qpos:<joint>` or `force:<joint>`."""
-        return self.reference[name]
+    def columns(self, field: str, joints: list[str]) -> Array:
+        """(M+1, n) columns of reference.csv of one field, such as `qpos`, for some joints."""
+        rows = len(self.playback.t)
+        return np.reshape([self.reference[f"{field}:{joint}"] for joint in joints], (-1, rows)).T
 
 
-def drives_of(system: System) -> tuple[Drive, ...]:
-    """Find what the controls of an experiment drive, and their limits.
-
-    Args:
-        system: The experiment.
-
-    Returns:
-        The nu controls, in the order of the model.
-    """
+def _drives(system: System) -> tuple[Drive, ...]:
+    """Find what the controls of an experiment drive, and their limits."""
     model = system.model
-    period = system.dt
-    limits = limits_of(model, system.controls, system.experiment.limits, period)
+    limits = limits_of(model, system.controls, system.experiment.limits, system.dt)
     ranges = {each.name: (each.lower, each.upper) for each in limits if each.kind == "control"}
     joints = {joint.joint: joint for joint in system.coordinates}
+    actuators = np.repeat(np.arange(model.nactuator), model.actuator_ctrlnum)
 
-    drives: list[Drive] = []
-    for i in range(len(actuator_names(model))):
-        count = int(model.actuator_ctrlnum[i])
-        for _ in range(count):
-            name = system.controls[len(drives)]
-            lower, upper = ranges.get(name, (-np.inf, np.inf))
-            joint = joints.get(_joint_number(model, i)) if count == 1 else None
-            drives.append(
-                Drive(
-                    name=name,
-                    kind=_kind(model, i) if count == 1 else DriveKind.OTHER,
-                    joint=joint,
-                    gear=actuator_gear(model, i),
-                    holds_position=_holds_position(model, i),
-                    lower=float(lower),
-                    upper=float(upper),
-                )
+    drives = []
+    for name, i in zip(system.controls, actuators.tolist(), strict=True):
+        is_single = int(model.actuator_ctrlnum[i]) == 1
+        at_joint = mujoco.mjtTrn(int(model.actuator_trntype[i])) in AT_JOINT
+        lower, upper = ranges.get(name, (-np.inf, np.inf))
+        drives.append(
+            Drive(
+                name=name,
+                meaning=_meaning(model, i) if is_single else "other",
+                joint=joints.get(int(model.actuator_trnid[i, 0]))
+                if is_single and at_joint
+                else None,
+                gear=actuator_gear(model, i),
+                holds_position=_holds_position(model, i),
+                lower=float(lower),
+                upper=float(upper),
             )
+        )
     return tuple(drives)
-
-
-def _joint_number(model: Any, actuator: int) -> int:
-    """Number of the joint on which an actuator acts; -1 where it acts on something else."""
-    at_joint = mujoco.mjtTrn(int(model.actuator_trntype[actuator])) in AT_JOINT
-    return int(model.actuator_trnid[actuator, 0]) if at_joint else -1
 
 
 def _holds_position(model: Any, actuator: int) -> bool:
@@ -171,16 +136,15 @@ def _holds_position(model: Any, actuator: int) -> bool:
     return pulls and not is_integrated(model, actuator)
 
 
-def _kind(model: Any, actuator: int) -> DriveKind:
+def _meaning(model: Any, actuator: int) -> Meaning:
     """Meaning of the control of an actuator that has one control."""
     has_fixed_gain = int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
     has_gain = float(model.actuator_gainprm[actuator, 0]) != 0.0
     if not has_fixed_gain or not has_gain or is_integrated(model, actuator):
-        return DriveKind.OTHER
-
+        return "other"
     if int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE):
-        return DriveKind.FORCE
+        return "force"
 
     # A servo with a constant force beside does not rest at its command.
     has_constant = float(model.actuator_biasprm[actuator, 0]) != 0.0
-    return DriveKind.OTHER if has_constant else KINDS_OF_SERVOS[servo_kind(model, actuator)]
+    return "other" if has_constant else servo_kind(model, actuator) or "other"

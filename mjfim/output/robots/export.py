@@ -1,0 +1,114 @@
+"""Export of a design for the programs that run robots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from mjfim.errors import ExperimentError, unknown
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.output.robots import TARGETS
+from mjfim.output.robots.lerobot import DATASET_FILES, write_lerobot_dataset
+from mjfim.output.robots.plan import RobotPlan
+from mjfim.output.robots.player_script import write_player
+from mjfim.output.robots.ros2 import (
+    ENDINGS,
+    POSITIONS,
+    bag_files,
+    joint_trajectory,
+    write_bag,
+    write_trajectory_yaml,
+)
+from mjfim.records.design import Design
+
+
+def export_design(
+    experiment: Experiment,
+    design: Design,
+    path: str | Path,
+    *,
+    to: str,
+    positions: str | None = None,
+    storage: str = "mcap",
+    unit: str = "rad",
+) -> list[str]:
+    """Write a design for a program that runs robots.
+
+    `to` is `ros2` for a YAML file with a `trajectory_msgs/JointTrajectory`, `ros2-bag` for the
+    folder of a ROS 2 bag with this message, the planned joint states and the controls, `player` for
+    a stand-alone Python program that plays the controls, with or without feedback, or `lerobot` for
+    the folder of a LeRobot dataset (v3.0) with one episode.
+
+    Args:
+        experiment: The experiment for which the design was made.
+        design: The design.
+        path: The file or the folder to write.
+        to: The target.
+        positions: What the positions of a joint trajectory are: `motion` or `command`; default: the
+            commands where every driven joint has a position servo.
+        storage: Format of the file in a ROS 2 bag: `mcap` or `sqlite3`.
+        unit: Unit of angles in a LeRobot dataset: `rad` or `deg`.
+
+    Returns:
+        Sentences that the user of the export needs.
+
+    Raises:
+        ExperimentError: The target or an option is unknown, or the model has nothing that the
+            target can hold.
+        RecordingError: The design was made for another model or another rate, or a library that
+            the target needs is not installed.
+    """
+    require_options(to, positions, storage, unit)
+    plan = RobotPlan.of(design, System.resolve(experiment))
+    return write_export(plan, Path(path), to, positions, storage, unit)
+
+
+def write_export(
+    plan: RobotPlan, path: Path, to: str, positions: str | None, storage: str, unit: str
+) -> list[str]:
+    """Write a design for a target. See `export_design`."""
+    if to == "player":
+        write_player(path, plan)
+        return [f"`python {path}` says what the design needs, and how to play it"]
+    if to == "lerobot":
+        write_lerobot_dataset(path, plan, unit)
+        return []
+
+    trajectory = joint_trajectory(plan, positions)
+    if to == "ros2":
+        write_trajectory_yaml(path, trajectory, plan.name)
+    else:
+        write_bag(path, plan, trajectory, storage)
+    return trajectory.remarks()
+
+
+def require_options(to: str, positions: str | None, storage: str, unit: str) -> None:
+    """Raise ExperimentError unless an export has a target and options that exist."""
+    _require("--to", "target", to, TARGETS)
+    _require("--positions", "kind", positions or POSITIONS[0], POSITIONS)
+    _require("--storage", "format", storage, ENDINGS)
+    _require("--unit", "unit", unit, ("rad", "deg"))
+
+
+def _require(option: str, kind: str, word: str, valid: Iterable[str]) -> None:
+    """Raise ExperimentError unless a word is valid."""
+    words = tuple(valid)
+    if word not in words:
+        raise ExperimentError(f"{option}: {unknown(kind, word, words)}")
+
+
+def is_folder(to: str) -> bool:
+    """Whether an export to a target is a folder instead of a file."""
+    return to in ("ros2-bag", "lerobot")
+
+
+def exported_files(to: str, path: Path) -> tuple[str, ...]:
+    """List the files that an export may write into its folder.
+
+    Args:
+        to: The target.
+        path: The folder, or the file, whose folder is its parent.
+    """
+    files = {"lerobot": DATASET_FILES, "ros2-bag": bag_files(path)}
+    return files.get(to, (path.name,))

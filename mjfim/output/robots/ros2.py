@@ -1,0 +1,285 @@
+"""A design for ROS 2: a joint trajectory as YAML, and a bag with the joint states and controls.
+
+The points are the rows of `reference.csv`. For joints with a motor they hold the planned motion and
+the force that belongs to it. For joints with a position servo, the command of the servo is the
+control of the design, so the positions are these commands, and there are no velocities.
+
+`ros2 bag play` of a bag publishes the trajectory on the topic of a trajectory controller. The
+planned states and controls are on topics of mjfim, which no robot listens to; `identify` reads them
+as a recording without noise.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError
+from mjfim.files import remove_earlier_result, replacing
+from mjfim.output.robots.plan import RobotPlan
+from mjfim.recordings.formats.ros2_bag import CONTROL_TOPIC, JOINT_STATE, rosbags_module
+
+# What the positions of a trajectory are: the planned motion, or the commands of position servos.
+POSITIONS = ("motion", "command")
+CONTENT = {
+    "motion": "positions are the planned motion",
+    "command": "positions are the commands of the position servos",
+}
+
+# Ending of the file inside a bag, by its format; and a version of bags that all supported versions
+# of ROS 2 read.
+ENDINGS = {"mcap": ".mcap", "sqlite3": ".db3"}
+BAG_VERSION = 9
+
+# Topic on which a trajectory controller of ros2_control listens, and that of the planned joint
+# states; that of a robot is not used, because `ros2 bag play` publishes.
+TRAJECTORY_TOPIC = "/joint_trajectory_controller/joint_trajectory"
+PLANNED_TOPIC = "/mjfim/planned_joint_states"
+TRAJECTORY_TYPE = "trajectory_msgs/msg/JointTrajectory"
+
+# Nanoseconds per second, and the time stamp of the start of a bag: 0 would mean no stamp.
+NANOSECONDS = 1_000_000_000
+START = NANOSECONDS
+
+# Significant digits of the numbers in a YAML file.
+DIGITS = 12
+
+# Final speed that counts as rest, relative to the largest speed of the joint.
+REST = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointTrajectory:
+    """The contents of a message `trajectory_msgs/JointTrajectory`.
+
+    Attributes:
+        joints: Names of the n joints.
+        nanoseconds: (M+1,) times from the start [ns].
+        fields: (M+1, n) values of the fields that a point has, by name.
+        content: What the positions are, one of `POSITIONS`.
+    """
+
+    joints: list[str]
+    nanoseconds: list[int]
+    fields: dict[str, Array]
+    content: str
+
+    def remarks(self) -> list[str]:
+        """Sentences that the user of a trajectory needs."""
+        if self.content == "command":
+            return [
+                "the positions are the commands of the position servos, which are the control of "
+                "the design (--positions motion: the planned motion instead)"
+            ]
+        remarks = []
+        if "effort" not in self.fields:
+            remarks.append(
+                "effort is left out, because not every joint has motors only: what servos apply "
+                "depends on the motion"
+            )
+        speeds = np.abs(self.fields["velocities"])
+        moves = speeds[-1] > REST * speeds.max(axis=0)
+        names = [name for name, is_moving in zip(self.joints, moves, strict=True) if is_moving]
+        if names:
+            remarks.append(
+                f"the motion of {', '.join(names)} does not end at rest; controllers of "
+                "ros2_control accept it with allow_nonzero_velocity_at_trajectory_end: true, and "
+                'a design with [boundary] end = "rest" ends at rest'
+            )
+        return remarks
+
+
+def joint_trajectory(plan: RobotPlan, positions: str | None = None) -> JointTrajectory:
+    """Make a joint trajectory of a design, with all joints on which an actuator acts.
+
+    Args:
+        plan: The design.
+        positions: `motion` for the planned motion, `command` for the commands of position servos;
+            default: the commands where every driven joint has a position servo.
+
+    Raises:
+        ExperimentError: No actuator acts on a joint, or there are no position servos whose commands
+            are wanted.
+    """
+    drives = {
+        joint.name: [drive for drive in plan.drives if drive.joint == joint]
+        for joint in plan.system.coordinates
+    }
+    drives = {name: found for name, found in drives.items() if found}
+    if not drives:
+        raise ExperimentError(
+            "a joint trajectory describes slides and hinges on which actuators act, and the model "
+            "has none; export it --to player, which sends the controls"
+        )
+    meanings = [[drive.meaning for drive in found] for found in drives.values()]
+    are_servos = all(
+        each == ["position"] and found[0].gear != 0.0
+        for each, found in zip(meanings, drives.values(), strict=True)
+    )
+    content = positions or ("command" if are_servos else "motion")
+    if content == "command" and not are_servos:
+        raise ExperimentError(
+            "--positions command: not every driven joint has one position servo, whose control is "
+            "a position; leave the option out, or state motion"
+        )
+
+    joints = list(drives)
+    if content == "command":
+        servos = [found[0] for found in drives.values()]
+        numbers = [plan.drives.index(servo) for servo in servos]
+        gears = np.array([servo.gear for servo in servos])
+        fields = {"positions": plan.held_control[:, numbers] / gears}
+    else:
+        columns = {"positions": "qpos", "velocities": "qvel", "accelerations": "qacc"}
+        if all(set(each) == {"force"} for each in meanings):
+            columns["effort"] = "force"
+        fields = {name: plan.columns(column, joints) for name, column in columns.items()}
+    return JointTrajectory(
+        joints=joints,
+        nanoseconds=[round(t * NANOSECONDS) for t in plan.playback.t.tolist()],
+        fields=fields,
+        content=content,
+    )
+
+
+def write_trajectory_yaml(path: Path, trajectory: JointTrajectory, name: str) -> None:
+    """Write a trajectory as YAML, as `ros2 topic pub` and `ros2 action send_goal` read it.
+
+    The message is one value in braces, so that a shell can put it into a goal:
+    `"{trajectory: $(cat FILE)}"`.
+
+    Args:
+        path: File to write.
+        trajectory: The trajectory.
+        name: Name of the experiment, for the comment.
+    """
+    points = []
+    for k, nanoseconds in enumerate(trajectory.nanoseconds):
+        parts = [
+            f"{key}: [{', '.join(map(yaml_number, values[k].tolist()))}]"
+            for key, values in trajectory.fields.items()
+        ]
+        sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+        parts.append(f"time_from_start: {{sec: {sec}, nanosec: {nanosec}}}")
+        points.append(f"  {{{', '.join(parts)}}}")
+
+    content = CONTENT[trajectory.content]
+    lines = [
+        f"# {TRAJECTORY_TYPE} of the design {json.dumps(name)} by mjfim; {content}.",
+        "# Bring the robot to the first point before, and record the joint states and commands.",
+        '{header: {stamp: {sec: 0, nanosec: 0}, frame_id: ""},',
+        f" joint_names: {json.dumps(trajectory.joints)},",
+        " points: [",
+        ",\n".join(points),
+        " ]}",
+    ]
+    with replacing(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def yaml_number(value: float) -> str:
+    """Write a float for YAML 1.1, where `1e-05` without a decimal point is a text."""
+    digits, exponent, rest = f"{value:.{DIGITS}g}".partition("e")
+    return f"{digits}{'' if '.' in digits else '.0'}{exponent}{rest}"
+
+
+# ---- bags
+
+
+def bag_files(folder: Path) -> tuple[str, ...]:
+    """List the files that a bag may have.
+
+    Args:
+        folder: Folder of the bag, whose name is also that of the file in it.
+    """
+    name = folder.absolute().name
+    return ("metadata.yaml", *(f"{name}{ending}" for ending in ENDINGS.values()))
+
+
+def write_bag(folder: Path, plan: RobotPlan, trajectory: JointTrajectory, storage: str) -> None:
+    """Write a design as a ROS 2 bag.
+
+    Args:
+        folder: Folder of the bag.
+        plan: The design.
+        trajectory: Its joint trajectory.
+        storage: Format of the file in the bag.
+
+    Raises:
+        RecordingError: The library rosbags is not installed.
+    """
+    rosbag2 = rosbags_module(folder, "rosbags.rosbag2")
+    typesys = rosbags_module(folder, "rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    plugin = getattr(rosbag2.StoragePlugin, storage.upper())
+    name = folder.absolute().name
+
+    # The library writes a folder that does not exist yet; its files are then put in their places.
+    with tempfile.TemporaryDirectory() as scratch:
+        written = Path(scratch) / name
+        with rosbag2.Writer(written, version=BAG_VERSION, storage_plugin=plugin) as bag:
+            topics = {
+                topic: bag.add_connection(topic, kind, typestore=store)
+                for topic, kind in (
+                    (TRAJECTORY_TOPIC, TRAJECTORY_TYPE),
+                    (PLANNED_TOPIC, JOINT_STATE),
+                    (CONTROL_TOPIC, JOINT_STATE),
+                )
+            }
+            for topic, kind, stamp, message in _messages(store.types, plan, trajectory):
+                bag.write(topics[topic], stamp, store.serialize_cdr(message, kind))
+
+        # The data first, which the metadata describe.
+        for file in (f"{name}{ENDINGS[storage]}", "metadata.yaml"):
+            with replacing(folder / file) as temporary:
+                shutil.copyfile(written / file, temporary)
+    for other, ending in ENDINGS.items():
+        stale = folder / f"{name}{ending}"
+        if other != storage and stale.is_file():
+            remove_earlier_result(stale)
+
+
+def _messages(
+    types: Any, plan: RobotPlan, trajectory: JointTrajectory
+) -> Iterator[tuple[str, str, int, Any]]:
+    """The messages of a bag: topic, type, time stamp [ns] and contents."""
+    nothing = np.zeros(0)
+
+    def header(stamp: int) -> Any:
+        """A header with a time stamp [ns]; one of 0 lets a trajectory begin at once."""
+        sec, nanosec = divmod(stamp, NANOSECONDS)
+        time = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
+        return types["std_msgs/msg/Header"](stamp=time, frame_id="")
+
+    points = []
+    for k, nanoseconds in enumerate(trajectory.nanoseconds):
+        sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+        names = ("positions", "velocities", "accelerations", "effort")
+        row = {
+            each: trajectory.fields[each][k] if each in trajectory.fields else nothing
+            for each in names
+        }
+        duration = types["builtin_interfaces/msg/Duration"](sec=sec, nanosec=nanosec)
+        point = types["trajectory_msgs/msg/JointTrajectoryPoint"]
+        points.append(point(**row, time_from_start=duration))
+    message = types[TRAJECTORY_TYPE](header(0), trajectory.joints, points)
+    yield TRAJECTORY_TOPIC, TRAJECTORY_TYPE, START, message
+
+    joints = [joint.name for joint in plan.system.coordinates]
+    planned = [plan.columns(field, joints) for field in ("qpos", "qvel", "force")]
+    controls = [drive.name for drive in plan.drives]
+    state = types[JOINT_STATE]
+    for k, t in enumerate(plan.playback.t.tolist()):
+        stamp = START + round(t * NANOSECONDS)
+        rows: Sequence[Array] = [np.ascontiguousarray(values[k]) for values in planned]
+        yield PLANNED_TOPIC, JOINT_STATE, stamp, state(header(stamp), joints, *rows)
+        sent = state(header(stamp), controls, nothing, nothing, plan.held_control[k])
+        yield CONTROL_TOPIC, JOINT_STATE, stamp, sent
