@@ -45,7 +45,7 @@ from mjfim.interruption import (
     Interruption,
     current_interruption,
 )
-from mjfim.output.live_address import ADDRESS, HERE
+from mjfim.output.live import ADDRESS, HERE, live_system
 from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.progress_text import design_stage, design_text, fit_text, part_text
@@ -584,7 +584,6 @@ def watched(address: str | None, system: System, display: Callback) -> Iterator[
         yield display
         return
 
-    from mjfim.output.live import live_system
 
     where = None if address == HERE else address
     with live_system(system, where, say=_announce) as show:

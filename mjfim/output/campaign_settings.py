@@ -8,18 +8,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mjfim.errors import RecordingError
+from mjfim.errors import RecordingError, first_ones, shortened
 from mjfim.experiment.input_files import input_files
 from mjfim.experiment.schema import Experiment
 from mjfim.files import as_json, read_json, write_json
-from mjfim.output.manifest import Fingerprint
+from mjfim.output.manifest import fingerprint
 
 # File with the settings, in the folder of the campaign.
 SETTINGS_FILE = "settings.json"
-
-# Largest number of differences that a message lists, and of characters of a value in it.
-LISTED_DIFFERENCES = 3
-SHOWN_VALUE = 40
 
 
 def campaign_settings(experiment: Experiment, seed: int) -> dict[str, Any]:
@@ -34,7 +30,7 @@ def campaign_settings(experiment: Experiment, seed: int) -> dict[str, Any]:
     """
     source = Path(experiment.source)
     sums = {
-        os.path.relpath(file, experiment.directory): Fingerprint.of(file).sha256
+        os.path.relpath(file, experiment.directory): fingerprint(file)["sha256"]
         for file in input_files(experiment)
         if file != source and file.is_file()
     }
@@ -75,44 +71,37 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any]) -> None:
 
     differences = list(_differences(read_json(path), settings))
     if differences:
-        listed = "; ".join(differences[:LISTED_DIFFERENCES])
-        more = len(differences) - LISTED_DIFFERENCES
         raise RecordingError(
-            f"{folder}: --resume needs the settings with which the campaign began: {listed}"
-            f"{f'; and {more} more' if more > 0 else ''}. Repeat the call with these settings, or "
-            "begin a campaign in another folder"
+            f"{folder}: --resume needs the settings with which the campaign began: "
+            f"{first_ones(differences, '; ')}. Repeat the call with these settings, or begin a "
+            "campaign in another folder"
         )
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
     """Describe each setting that differs: `--seed was 5, is 6`."""
-    if before.get("seed") != now["seed"]:
-        yield f"--seed was {before.get('seed')}, is {now['seed']}"
-
-    # Targets of --wanted are part of the experiment.
-    old, new = (dict(_leaves(values.get("experiment"))) for values in (before, now))
-    for key in sorted({*old, *new}):
-        if old.get(key) != new.get(key):
-            yield f"{key} was {_shown(old.get(key))}, is {_shown(new.get(key))}"
-
-    sums, present = (dict(_leaves(values.get("files"))) for values in (before, now))
-    for name in sorted({*sums, *present}):
-        if sums.get(name) != present.get(name):
-            yield f"the file {name} was changed"
+    old, new = dict(_leaves(before)), dict(_leaves(now))
+    for place in sorted({*old, *new}):
+        if old.get(place) == new.get(place):
+            continue
+        table, *keys = place
+        if table == "files":
+            yield f"the file {keys[0]} was changed"
+        else:
+            # Targets of --wanted are part of the experiment.
+            name = ".".join(keys) if keys else f"--{table}"
+            yield f"{name} was {_shown(old.get(place))}, is {_shown(new.get(place))}"
 
 
-def _leaves(values: object, place: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield all values of nested tables, each with its key: `parameters.m.guess`."""
+def _leaves(values: object, *place: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield all values of nested tables, each with its keys."""
     if not isinstance(values, Mapping):
         yield place, values
         return
     for key, value in values.items():
-        yield from _leaves(value, f"{place}.{key}" if place else str(key))
+        yield from _leaves(value, *place, str(key))
 
 
 def _shown(value: object) -> str:
     """Return a value for a message."""
-    if value is None:
-        return "not stated"
-    text = json.dumps(value)
-    return text if len(text) <= SHOWN_VALUE else f"{text[:SHOWN_VALUE]}…"
+    return "not stated" if value is None else shortened(json.dumps(value))

@@ -1,11 +1,13 @@
 """A search that is watched in a Rerun viewer while it runs.
 
-A viewer that is missing, or that is closed, never changes the search: one sentence says so.
+A viewer that is missing, or that is closed, never changes the search: one sentence says so. The
+command line imports this module at its start, so that it imports nothing slow.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -15,17 +17,25 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from mjfim.errors import MjfimError
-from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import System
-from mjfim.output.live_address import DEFAULT_ADDRESS, DEFAULT_PORT, url_of
-from mjfim.records.events import Callback, Event
+from mjfim.errors import ExperimentError, MjfimError
 
 if TYPE_CHECKING:
+    from mjfim.experiment.schema import Experiment
+    from mjfim.experiment.system import System
     from mjfim.output.rerun.live import LiveShow
+    from mjfim.records.events import Callback
 
-# Time to wait for an answer of a viewer that should be there, and for a new viewer [s].
-ANSWER_SECONDS, START_SECONDS = 2.0, 20.0
+# Address of a viewer that is told nothing else, and the word for the viewer of this computer, which
+# may be opened.
+DEFAULT_ADDRESS = "127.0.0.1:9876"
+HERE = "here"
+
+# Form of an address: a host with a port, or a URL of Rerun.
+ADDRESS = re.compile(r"rerun(\+https?)?://\S+|[\w.-]+:\d{1,5}")
+
+# Time to wait for an answer of a viewer that should be there, for a new viewer, and between two
+# looks for it [s].
+ANSWER_SECONDS, START_SECONDS, LOOK_SECONDS = 2.0, 20.0, 0.2
 
 
 class NoViewerError(MjfimError):
@@ -37,7 +47,7 @@ def live(
     experiment: Experiment,
     address: str | None = None,
     *,
-    say: Callable[[str], None] | None = None,
+    say: Callable[[str], object] | None = None,
 ) -> Iterator[Callback]:
     """Show in a Rerun viewer how a search proceeds; a context around the verb.
 
@@ -63,106 +73,76 @@ def live(
     Raises:
         ExperimentError: The address has another form.
     """
+    from mjfim.experiment.system import System
+
     with live_system(System.resolve(experiment), address, say=say) as show:
         yield show
 
 
 @contextmanager
 def live_system(
-    system: System, address: str | None = None, *, say: Callable[[str], None] | None = None
+    system: System, address: str | None = None, *, say: Callable[[str], object] | None = None
 ) -> Iterator[Callback]:
-    """Show how a search for a resolved system proceeds. See `live`.
-
-    Args:
-        system: The system.
-        address: Where a viewer listens; default: the viewer of this computer.
-        say: Takes the sentence about a viewer that is missing or has ended.
-
-    Yields:
-        The function that takes the events.
-    """
-    tell = _print if say is None else say
-    where = address or DEFAULT_ADDRESS
-    url = url_of(where)
+    """Show how a search for a resolved system proceeds. See `live`."""
+    tell = say or (lambda sentence: sys.stderr.write(f"mjfim: {sentence}\n"))
+    viewer: LiveShow | None = None
     try:
-        _require_viewer(url, may_open=address is None)
-        show = _connected(url, system)
+        viewer = _connected(url_of(address or DEFAULT_ADDRESS), system, may_open=address is None)
     except NoViewerError as reason:
         tell(f"there is no live view: {reason}")
-        yield _show_nothing
-        return
 
-    watched = _Watched(show, tell)
+    def watched(action: Callable[[LiveShow], object]) -> None:
+        """Do something with the viewer; the search never fails with it."""
+        nonlocal viewer
+        if viewer is not None:
+            try:
+                action(viewer)
+            except Exception as error:
+                viewer = None
+                tell(f"the live view ended: {error}")
+
     try:
-        yield watched
+        yield lambda event: watched(lambda show: show(event))
     finally:
-        watched.end()
+        watched(lambda show: show.end())
 
 
-class _Watched:
-    """Passes events on to a viewer until it fails; the search never fails with it."""
+def url_of(address: str) -> str:
+    """Return the URL of a viewer.
 
-    def __init__(self, show: LiveShow, tell: Callable[[str], None]) -> None:
-        self._show: LiveShow | None = show
-        self._tell = tell
+    Args:
+        address: A host with a port, or a URL of Rerun.
 
-    def __call__(self, event: Event) -> None:
-        """Show an event."""
-        if self._show is not None:
-            self._try(self._show, event)
-
-    def end(self) -> None:
-        """Show the last event, and close the connection."""
-        if self._show is not None:
-            self._try(self._show, None)
-
-    def _try(self, show: LiveShow, event: Event | None) -> None:
-        """Show an event, or the end; a failure ends the view."""
-        try:
-            if event is None:
-                show.end()
-            else:
-                show(event)
-        except Exception as error:
-            self._show = None
-            self._tell(f"the live view ended: {error}")
+    Raises:
+        ExperimentError: The address has another form.
+    """
+    if not ADDRESS.fullmatch(address):
+        raise ExperimentError(
+            f"--live {address}: an address is HOST:PORT, such as {DEFAULT_ADDRESS}, or a URL that "
+            "begins with rerun+http://"
+        )
+    return address if "://" in address else f"rerun+http://{address}/proxy"
 
 
-def _show_nothing(event: Event) -> None:
-    """Take an event where there is no viewer."""
+def _connected(url: str, system: System, *, may_open: bool) -> LiveShow:
+    """Connect to a viewer, which is opened if it is missing and that is permitted.
 
+    Raises NoViewerError where there is none.
+    """
+    if not _is_listening(url):
+        if not may_open:
+            raise NoViewerError(f"nothing listens at {url}; start a viewer there with `rerun`")
+        if not has_display():
+            raise NoViewerError(
+                "this computer has no display; start a viewer on another one with `rerun`, and "
+                "state its address, such as --live HOST:9876"
+            )
+        _open_viewer(url)
 
-def _print(sentence: str) -> None:
-    """Show a sentence to the user of a script."""
-    sys.stderr.write(f"mjfim: {sentence}\n")
-
-
-def _connected(url: str, system: System) -> LiveShow:
-    """Connect to a viewer. This imports Rerun, which takes a while."""
+    # This imports Rerun, which takes a while.
     from mjfim.output.rerun.live import LiveShow
 
     return LiveShow.connected(url, system.model_at(system.theta))
-
-
-# ---- the viewer
-
-
-def _require_viewer(url: str, *, may_open: bool) -> None:
-    """Make sure that a viewer listens; open one if that is permitted.
-
-    Raises:
-        NoViewerError: There is none.
-    """
-    if _is_listening(url):
-        return
-    if not may_open:
-        raise NoViewerError(f"nothing listens at {url}; start a viewer there with `rerun`")
-    if not has_display():
-        raise NoViewerError(
-            "this computer has no display; start a viewer on another one with `rerun`, and state "
-            "its address, such as --live HOST:9876"
-        )
-    _open_viewer(url)
 
 
 def has_display() -> bool:
@@ -177,12 +157,9 @@ def _open_viewer(url: str) -> None:
     # With -P, Python does not look for the viewer in the current folder.
     port = str(urlsplit(url).port)
     command = [sys.executable, "-P", "-m", "rerun", "--port", port, "--hide-welcome-screen"]
+    nowhere = subprocess.DEVNULL
     viewer = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
+        command, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True
     )
 
     deadline = time.monotonic() + START_SECONDS
@@ -192,8 +169,7 @@ def _open_viewer(url: str) -> None:
             raise NoViewerError(f"the viewer ended with code {code}; it needs a display")
         if _is_listening(url):
             return
-        time.sleep(0.2)
-
+        time.sleep(LOOK_SECONDS)
     viewer.kill()
     raise NoViewerError(f"the viewer did not answer within {START_SECONDS:.0f} s")
 
@@ -202,7 +178,7 @@ def _is_listening(url: str) -> bool:
     """Whether something listens at the host and the port of a URL."""
     parts = urlsplit(url)
     try:
-        place = (parts.hostname or "127.0.0.1", parts.port or DEFAULT_PORT)
+        place = (parts.hostname or "127.0.0.1", parts.port or urlsplit(f"//{DEFAULT_ADDRESS}").port)
         with socket.create_connection(place, timeout=ANSWER_SECONDS):
             return True
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Which files of a folder mjfim wrote, and which of them a run may replace or remove.
+"""Which files of a folder mjfim wrote, which of them a run may replace, and who writes there now.
 
 A folder with results holds a manifest, `.mjfim.json`. It lists the size and the SHA-256 sum of each
 file that a verb of the command line wrote there. A file that is not listed, or has other contents,
@@ -10,16 +10,16 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import sys
+import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from enum import Enum
+from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from mjfim.errors import OutputError, RecordingError
 from mjfim.files import guarded_by, read_json, replacing
-from mjfim.output.file_lock import FileLock
 
 # Name of the manifest, and of the locks of a manifest and of a folder.
 MANIFEST = ".mjfim.json"
@@ -29,120 +29,24 @@ FOLDER_LOCK = ".mjfim.lock"
 # Version of the manifest's format.
 FORMAT = 1
 
-# Longest time to wait for another process that writes the same manifest [s]. Writing takes
-# milliseconds; if it does not end, the files count as the user's, which is the safe side.
-MANIFEST_PATIENCE = 10.0
+# Longest time to wait for another process that writes the same manifest, and the time between two
+# trials [s]. Writing takes milliseconds; if it does not end, the files count as the user's, which
+# is the safe side.
+PATIENCE, INTERVAL = 10.0, 0.01
 
 # Largest number of files that a message lists.
 LISTED_FILES = 5
 
-
-class Origin(Enum):
-    """Who wrote a file."""
-
-    WRITTEN_HERE = "written by mjfim and unchanged since"
-    CHANGED = "changed since mjfim wrote it"
-    UNKNOWN = "not known to be written by mjfim"
+# Sizes and check sums of files by their names. A file can have two: the new one is entered before
+# the file is replaced, so that a process that is killed in between leaves no unknown file.
+Entries = dict[str, list[dict[str, Any]]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fingerprint:
-    """Size and check sum of the contents of a file.
-
-    Attributes:
-        size: Number of bytes.
-        sha256: SHA-256 sum, in hexadecimal digits.
-    """
-
-    size: int
-    sha256: str
-
-    @classmethod
-    def of(cls, file: Path) -> Fingerprint:
-        """Read the fingerprint of a file.
-
-        Args:
-            file: The file.
-        """
-        with file.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256")
-            return cls(size=stream.tell(), sha256=digest.hexdigest())
-
-
-class Manifest:
-    """The files that mjfim wrote into one folder.
-
-    A file can have two fingerprints. The new one is entered before the file is replaced, so that a
-    process that is killed in between leaves no file that is not listed.
-
-    Attributes:
-        folder: The folder.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        """Describe the manifest of a folder, which need not exist.
-
-        Args:
-            folder: The folder.
-        """
-        self.folder = folder
-
-    def origins(self, files: Sequence[Path]) -> list[Origin]:
-        """Say who wrote some files of the folder.
-
-        Args:
-            files: Files that exist.
-        """
-        entries = self._read()
-        return [_origin(file, entries.get(file.name)) for file in files]
-
-    def enter(self, name: str, contents: Path) -> None:
-        """Enter a file that is about to be written.
-
-        Args:
-            name: Name of the file in the folder.
-            contents: File with its contents, under another name.
-        """
-        lock = FileLock(self.folder / MANIFEST_LOCK)
-        lock.acquire(MANIFEST_PATIENCE)
-        try:
-            files = self._read()
-
-            # The file under this name, which is replaced next, stays known until then.
-            present = self.folder / name
-            kept = [Fingerprint.of(present)] if present.is_file() else []
-            kept = [entry for entry in kept if entry in files.get(name, [])]
-
-            new = Fingerprint.of(contents)
-            files[name] = [*(entry for entry in kept if entry != new), new]
-            self._write(files)
-        finally:
-            lock.release()
-
-    def _read(self) -> dict[str, list[Fingerprint]]:
-        """Return the fingerprints by name of the file; nothing if there is no usable manifest."""
-        try:
-            files = read_json(self.folder / MANIFEST)["files"]
-            return {
-                str(name): [
-                    Fingerprint(size=int(entry["size"]), sha256=str(entry["sha256"]))
-                    for entry in entries
-                ]
-                for name, entries in files.items()
-            }
-        except (RecordingError, LookupError, TypeError, ValueError, AttributeError):
-            return {}
-
-    def _write(self, files: dict[str, list[Fingerprint]]) -> None:
-        """Write the fingerprints by name of the file."""
-        table: dict[str, Any] = {
-            name: [{"size": entry.size, "sha256": entry.sha256} for entry in entries]
-            for name, entries in sorted(files.items())
-        }
-
-        # Readable JSON would take most of the time in a folder with many files.
-        with replacing(self.folder / MANIFEST) as temporary:
-            temporary.write_text(json.dumps({"format": FORMAT, "files": table}), encoding="utf-8")
+def fingerprint(file: Path) -> dict[str, Any]:
+    """Size [bytes] and SHA-256 sum of a file, as the manifest states them."""
+    with file.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256")
+        return {"size": stream.tell(), "sha256": digest.hexdigest()}
 
 
 class OutputGuard:
@@ -171,21 +75,30 @@ class OutputGuard:
         Raises:
             OutputError: One of them is an input or a folder, or belongs to the user.
         """
-        existing = [file for file in files if os.path.lexists(file)]
-        for file in existing:
-            self._refuse_input(file)
+        unknown: list[Path] = []
+        changed: list[Path] = []
+        manifests: dict[Path, Entries] = {}
+        for file in files:
+            if not os.path.lexists(file):
+                continue
+            source = self._input(file)
+            if source is not None:
+                raise OutputError(
+                    f"{file}: this result would replace {source}, which is an input of the same "
+                    "run; choose another place for the result (--force does not replace inputs)"
+                )
             if file.exists() and not file.is_file():
                 raise OutputError(f"{file}: is not a file; a result of this name cannot be written")
 
-        if self._force:
-            return
-
-        refused: dict[Origin, list[Path]] = {Origin.UNKNOWN: [], Origin.CHANGED: []}
-        for file, origin in zip(existing, _origins(existing), strict=True):
-            if origin is not Origin.WRITTEN_HERE:
-                refused[origin].append(file)
-        if any(refused.values()):
-            raise OutputError(_refusal(refused[Origin.UNKNOWN], refused[Origin.CHANGED]))
+            if file.parent not in manifests:
+                manifests[file.parent] = _entries(file.parent)
+            entries = manifests[file.parent]
+            if file.name not in entries or not file.exists():
+                unknown.append(file)
+            elif fingerprint(file) not in entries[file.name]:
+                changed.append(file)
+        if (unknown or changed) and not self._force:
+            raise OutputError(_refusal(unknown, changed))
 
     def before_replacing(self, temporary: Path, target: Path) -> None:
         """Check a file again when it is written, and enter it in the manifest.
@@ -197,11 +110,9 @@ class OutputGuard:
         Raises:
             OutputError: The existing file may not be replaced.
         """
-        if target.name == MANIFEST:
-            return
-
-        self.check([target])
-        Manifest(target.parent).enter(target.name, temporary)
+        if target.name != MANIFEST:
+            self.check([target])
+            _enter(target, fingerprint(temporary))
 
     def may_remove(self, file: Path) -> bool:
         """Say whether a result of an earlier run may be removed.
@@ -209,17 +120,60 @@ class OutputGuard:
         Args:
             file: A file that exists.
         """
-        is_input = any(_is_same(file, source) for source in self._inputs)
-        return not is_input and _origins([file]) == [Origin.WRITTEN_HERE]
+        known = _entries(file.parent).get(file.name, [])
+        return self._input(file) is None and fingerprint(file) in known
 
-    def _refuse_input(self, file: Path) -> None:
-        """Raise OutputError if a file is an input of the run."""
+    def _input(self, file: Path) -> Path | None:
+        """The input of the run that a file is, also by links or in another spelling."""
         for source in self._inputs:
-            if _is_same(file, source):
-                raise OutputError(
-                    f"{file}: this result would replace {source}, which is an input of the same "
-                    "run; choose another place for the result (--force does not replace inputs)"
-                )
+            with suppress(OSError):
+                if file.samefile(source):
+                    return source
+        return None
+
+
+def _entries(folder: Path) -> Entries:
+    """What the manifest of a folder lists; nothing where there is no usable one."""
+    with suppress(RecordingError, LookupError, TypeError, AttributeError):
+        files = read_json(folder / MANIFEST)["files"]
+        return {name: list(entries) for name, entries in files.items()}
+    return {}
+
+
+def _enter(file: Path, new: dict[str, Any]) -> None:
+    """Enter the contents of a file that is about to be replaced, and keep the present ones."""
+    lock = FileLock(file.parent / MANIFEST_LOCK)
+    lock.acquire(PATIENCE)
+    try:
+        entries = _entries(file.parent)
+        present = fingerprint(file) if file.is_file() else {}
+        kept = [entry for entry in entries.get(file.name, []) if entry == present != new]
+        entries[file.name] = [*kept, new]
+
+        # Readable JSON would take most of the time in a folder with many files.
+        text = json.dumps({"format": FORMAT, "files": dict(sorted(entries.items()))})
+        with replacing(file.parent / MANIFEST) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    finally:
+        lock.release()
+
+
+def _refusal(unknown: Sequence[Path], changed: Sequence[Path]) -> str:
+    """Say which files are not replaced, why, and what the user can do."""
+    reasons = (
+        (
+            unknown,
+            f"not listed in {MANIFEST} beside it as written by mjfim (your own, or from an older "
+            "version)",
+        ),
+        (changed, "changed after mjfim wrote it"),
+    )
+    parts = []
+    for files, reason in reasons:
+        names = [*map(str, files[:1]), *(file.name for file in files[1:LISTED_FILES])]
+        more = f" and {len(files) - len(names)} more" if len(files) > len(names) else ""
+        parts += [f"{', '.join(names)}{more}: {reason}"] if files else []
+    return f"{'; '.join(parts)}; choose another place for the result, or replace with --force"
 
 
 @contextmanager
@@ -254,67 +208,97 @@ def claimed(folder: Path, guard: OutputGuard, *, exclusive: bool) -> Iterator[No
             f"{folder}: another run of mjfim writes into this folder ({lock.holder()}); wait for "
             "its end, or choose another folder with -o"
         )
-
     try:
         with guarded_by(guard):
             yield
     finally:
         lock.release()
-        _remove_empty(new)
+        with suppress(OSError):
+            for place in new:
+                place.rmdir()
 
 
-def _remove_empty(folders: Sequence[Path]) -> None:
-    """Remove folders that are still empty; the innermost comes first."""
-    for place in folders:
+class FileLock:
+    """A lock on a file, which ends with the process that holds it.
+
+    The operating system holds the lock. If the process is killed, its file remains and the next
+    process takes it over. The file says which process holds it since when.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Describe a lock on a file, whose folder must exist."""
+        self._path = path
+        self._handle: int | None = None
+
+    def acquire(self, patience: float = 0.0) -> bool:
+        """Take the lock; wait at most some seconds, and return whether this process holds it."""
+        end = time.monotonic() + patience
+        while not self._try_once():
+            if time.monotonic() >= end:
+                return False
+            time.sleep(INTERVAL)
+        return True
+
+    def holder(self) -> str:
+        """Describe the process that holds the lock, if its file can be read."""
         try:
-            place.rmdir()
-        except OSError:
+            process, started = self._path.read_text(encoding="utf-8").split(maxsplit=1)
+            return f"process {int(process)}, since {started}"
+        except (OSError, ValueError):
+            return "another process"
+
+    def release(self) -> None:
+        """Give the lock back, and remove its file."""
+        if self._handle is None:
             return
+        if sys.platform == "win32":
+            os.close(self._handle)  # an open file cannot be removed there
+        with suppress(OSError):
+            self._path.unlink()
+        if sys.platform != "win32":
+            os.close(self._handle)
+        self._handle = None
+
+    def _try_once(self) -> bool:
+        """Open and lock the file; return False if another process holds the lock."""
+        handle = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+
+        # The last holder may have removed the file after it was opened here. Then a third process
+        # could make a new file and lock that one.
+        try:
+            is_mine = _is_lockable(handle) and os.path.samestat(os.fstat(handle), self._path.stat())
+        except FileNotFoundError:
+            is_mine = False
+        if not is_mine:
+            os.close(handle)
+            return False
+
+        started = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+        os.ftruncate(handle, 0)
+        os.write(handle, f"{os.getpid()} {started}".encode())
+        self._handle = handle
+        return True
 
 
-def _origins(files: Sequence[Path]) -> list[Origin]:
-    """Say who wrote some files, after the manifests of their folders."""
-    of_folder: dict[Path, list[Path]] = {}
-    for file in files:
-        if file.is_file():
-            of_folder.setdefault(file.parent, []).append(file)
+if sys.platform == "win32":
+    import msvcrt
 
-    found: dict[Path, Origin] = {}
-    for folder, members in of_folder.items():
-        found.update(zip(members, Manifest(folder).origins(members), strict=True))
-    return [found.get(file, Origin.UNKNOWN) for file in files]
-
-
-def _origin(file: Path, known: Sequence[Fingerprint] | None) -> Origin:
-    """Say who wrote a file, by the fingerprints that a manifest lists for it."""
-    if known is None:
-        return Origin.UNKNOWN
-    return Origin.WRITTEN_HERE if Fingerprint.of(file) in known else Origin.CHANGED
-
-
-def _is_same(file: Path, other: Path) -> bool:
-    """Whether two paths lead to one file, also by links or in another spelling."""
-    try:
-        return file.samefile(other)
-    except OSError:
+    def _is_lockable(handle: int) -> bool:
+        """Lock an open file unless another process holds the lock."""
+        with suppress(OSError):
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+            return True
         return False
 
+else:
+    import fcntl
 
-def _refusal(unknown: Sequence[Path], changed: Sequence[Path]) -> str:
-    """Say which files are not replaced, why, and what the user can do."""
-    parts = []
-    if unknown:
-        parts.append(
-            f"{_listed(unknown)}: not listed in {MANIFEST} beside it as written by mjfim (your "
-            "own, or from an older version)"
-        )
-    if changed:
-        parts.append(f"{_listed(changed)}: changed after mjfim wrote it")
-    return f"{'; '.join(parts)}; choose another place for the result, or replace with --force"
-
-
-def _listed(files: Sequence[Path]) -> str:
-    """List the files of a message; after the first one, names alone, and not too many."""
-    names = [str(files[0]), *(file.name for file in files[1:LISTED_FILES])]
-    more = len(files) - len(names)
-    return ", ".join(names) + (f" and {more} more" if more > 0 else "")
+    def _is_lockable(handle: int) -> bool:
+        """Lock an open file unless another process holds the lock."""
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            pass  # this file system has no locks; a run without a lock is better than none
+        return True

@@ -11,8 +11,7 @@ import pytest
 
 from mjfim.errors import OutputError
 from mjfim.output import folders
-from mjfim.output.file_lock import FileLock
-from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, OutputGuard, claimed
+from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, FileLock, OutputGuard, claimed
 from tests.support.cli import misused, names, run, write_experiment
 from tests.support.paths import SCRIPTS
 

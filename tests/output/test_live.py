@@ -21,8 +21,7 @@ from mjfim.cli.common import with_live_address
 from mjfim.errors import ExperimentError, InterruptedByUserError
 from mjfim.experiment.system import System
 from mjfim.output import live as live_module
-from mjfim.output.live import live
-from mjfim.output.live_address import HERE, url_of
+from mjfim.output.live import HERE, live, url_of
 from mjfim.output.rerun.live import OTHER_STARTS, UPDATE_SECONDS, LiveShow
 from mjfim.records.design import Design
 from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
@@ -331,34 +330,37 @@ class TestIndependence:
             "with `rerun`, and state its address, such as --live HOST:9876"
         ]
 
-    def test_a_viewer_that_fails_ends_the_view_only(self) -> None:
+    @pytest.mark.parametrize("error", [RuntimeError("lost"), InterruptedByUserError()])
+    def test_a_viewer_that_fails_ends_the_view_only(
+        self,
+        error: BaseException,
+        experiment: mjfim.Experiment,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """One sentence says so; Ctrl-C reaches the search."""
         calls: list[Event | None] = []
 
         class Failing:
             def __call__(self, event: Event) -> None:
                 calls.append(event)
-                raise RuntimeError("connection lost")
+                raise error
 
             def end(self) -> None:
                 calls.append(None)
 
         said: list[str] = []
-        show = live_module._Watched(Failing(), said.append)  # type: ignore[arg-type]
+        monkeypatch.setattr(live_module, "_connected", lambda *_, **__: Failing())
         event = FitEvent(phase="all data", iteration=0, cost=1.0, step=1.0)
-        for _ in range(3):
-            show(event)
-        show.end()
-        assert said == ["the live view ended: connection lost"]
+        if isinstance(error, InterruptedByUserError):
+            with pytest.raises(InterruptedByUserError), live(experiment, say=said.append) as show:
+                show(event)
+            assert (said, calls) == ([], [event, None])
+            return
+        with live(experiment, say=said.append) as show:
+            for _ in range(3):
+                show(event)
+        assert said == ["the live view ended: lost"]
         assert calls == [event]
-
-    def test_ctrl_c_reaches_the_search(self) -> None:
-        class Interrupted:
-            def __call__(self, event: Event) -> None:
-                raise InterruptedByUserError
-
-        show = live_module._Watched(Interrupted(), print)  # type: ignore[arg-type]
-        with pytest.raises(InterruptedByUserError):
-            show(FitEvent(phase="all data", iteration=0, cost=1.0, step=1.0))
 
     @pytest.mark.slow
     def test_with_a_server_the_result_is_the_same(

@@ -10,12 +10,10 @@ import pytest
 
 from mjfim.errors import OutputError
 from mjfim.files import remove_earlier_result, replacing
-from mjfim.output.file_lock import FileLock
 from mjfim.output.manifest import (
     FOLDER_LOCK,
     MANIFEST,
-    Manifest,
-    Origin,
+    FileLock,
     OutputGuard,
     claimed,
 )
@@ -46,12 +44,12 @@ def test_a_result_is_replaced_until_the_user_edits_it(tmp_path: Path) -> None:
 
 
 def test_files_that_are_not_listed_are_the_users(tmp_path: Path) -> None:
-    """The message lists them, and names --force; without a manifest and with a damaged one."""
+    """The message lists them, and names --force; without a manifest and with an unusable one."""
     files = [tmp_path / f"{i}.txt" for i in range(8)]
     for file in files:
         file.write_text("mine", encoding="utf-8")
 
-    for manifest in ("", "{", "[]", '{"files": 3}', '{"files": {"0.txt": [{"size": "x"}]}}'):
+    for manifest in ("", "{", "[]", '{"files": 3}'):
         if manifest:
             (tmp_path / MANIFEST).write_text(manifest, encoding="utf-8")
         with pytest.raises(OutputError, match=r"0\.txt, 1.*4\.txt and 3 more: not listed.*--force"):
@@ -122,12 +120,12 @@ def test_a_run_that_is_killed_while_it_writes_leaves_no_strange_file(tmp_path: P
     file, new = tmp_path / "a.txt", tmp_path / "new"
     write(file, "old")
     new.write_text("new", encoding="utf-8")
-    manifest = Manifest(tmp_path)
-    manifest.enter("a.txt", new)
-    assert manifest.origins([file]) == [Origin.WRITTEN_HERE]
+    guard = OutputGuard([], force=False)
+    guard.before_replacing(new, file)
+    guard.check([file])
 
     new.replace(file)
-    assert manifest.origins([file]) == [Origin.WRITTEN_HERE]
+    guard.check([file])
 
 
 def test_the_manifest_has_one_entry_per_file(tmp_path: Path) -> None:
@@ -171,7 +169,7 @@ def test_a_second_run_is_kept_out_of_a_folder(tmp_path: Path) -> None:
 
 def test_the_lock_of_a_killed_run_is_taken_over(tmp_path: Path) -> None:
     """Its file remains, but the operating system has given the lock back."""
-    (tmp_path / FOLDER_LOCK).write_text('{"pid": 1, "started": "2026-01-01"}', encoding="utf-8")
+    (tmp_path / FOLDER_LOCK).write_text("1 2026-01-01", encoding="utf-8")
     lock = FileLock(tmp_path / FOLDER_LOCK)
     assert lock.acquire()
     assert lock.holder().startswith(f"process {os.getpid()}, since ")
@@ -180,7 +178,7 @@ def test_the_lock_of_a_killed_run_is_taken_over(tmp_path: Path) -> None:
 
 
 def test_a_lock_file_without_a_holder_is_described(tmp_path: Path) -> None:
-    for text in ("", "{", "[1]", '{"pid": null, "started": 1}'):
+    for text in ("", "1", "who knows"):
         (tmp_path / "lock").write_text(text, encoding="utf-8")
         assert FileLock(tmp_path / "lock").holder() == "another process"
 
