@@ -584,7 +584,6 @@ def watched(address: str | None, system: System, display: Callback) -> Iterator[
         yield display
         return
 
-
     where = None if address == HERE else address
     with live_system(system, where, say=_announce) as show:
 

@@ -23,7 +23,6 @@ from mjfim.errors import ExperimentError, MjfimError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align
-from mjfim.identification.cad_prior import CadPrior
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.records.trajectory import Recording
 
@@ -46,7 +45,7 @@ class SysidProblem:
         sequences: `ModelSequences` of the recordings.
         parameters: `ParameterDict` at the guess.
         build_model: Gives the MjModel at a `ParameterDict`, as `build_model` of sysid.
-        residual: Residuals whitened by the stated noise, followed by those of the priors.
+        residual: Residuals whitened by the stated noise.
     """
 
     sequences: Any
@@ -58,8 +57,8 @@ class SysidProblem:
 def export_sysid(experiment: Experiment, recordings: Sequence[Recording]) -> SysidProblem:
     """State the fit of recordings for `mujoco.sysid`.
 
-    sysid takes neither robust losses nor estimated noise. A bound that is not stated is 1000 sizes
-    of the parameter from its guess.
+    sysid takes no priors, robust losses or estimated noise. A bound that is not stated is 1000
+    sizes of the parameter from its guess.
 
         problem = mjfim.export_sysid(experiment, [recording])
         fit, result = mujoco.sysid.optimize(problem.parameters, problem.residual)
@@ -111,17 +110,16 @@ def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProbl
         """The model at values of the parameters."""
         return system.model_at(np.array(parameters.as_vector()))
 
-    of_data: Callable[..., Any] = sysid.build_residual_fn(
-        models_sequences=[sequences],
-        build_model=build_model,
-        modify_residual=_whitened(system, columns, places),
-        resample_true=False,
-    )
     return SysidProblem(
         sequences=sequences,
         parameters=_parameters(system),
         build_model=build_model,
-        residual=_with_priors(system, of_data),
+        residual=sysid.build_residual_fn(
+            models_sequences=[sequences],
+            build_model=build_model,
+            modify_residual=_whitened(system, columns, places),
+            resample_true=False,
+        ),
     )
 
 
@@ -247,23 +245,6 @@ def _whitened(
         return system.noise.whiten_present(residual, present), *pair
 
     return modify
-
-
-def _with_priors(system: System, of_data: Callable[..., Any]) -> Callable[..., Any]:
-    """The residual function of sysid, with the residuals of the priors behind those of the data."""
-    parameters = system.parameters
-    weights = np.sqrt(np.diag(parameters.prior_information))
-    of_model = CadPrior.of(parameters)
-
-    def residual(theta: Array, values: Any, **options: Any) -> tuple[list[Array], Any, Any]:
-        """Residuals at theta (p,), or (p, k) where sysid computes finite differences."""
-        residuals, predicted, measured = of_data(theta, values, **options)
-        stated = (weights * (parameters.guess - theta.T)).T[weights > 0.0]
-        distances = [-of_model.rows(each)[:, -1] for each in np.atleast_2d(theta.T)]
-        from_model = np.array(distances).T.reshape(-1, *theta.shape[1:])
-        return [*residuals, stated, from_model], predicted, measured
-
-    return residual
 
 
 def _at_rows(values: Array, rows: Array) -> Array:

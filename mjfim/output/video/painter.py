@@ -30,10 +30,6 @@ TURNED_OFF = ("disable", "disabled", "off", "false", "0")
 BACKGROUND = (0.885, 0.905, 0.935, 1.0)
 FLOOR_COLOUR = (0.70, 0.74, 0.79, 1.0)
 
-# Sticks of bodies without geoms: colour (0..1), and radius as a share of the model's extent.
-STICK_COLOUR = (0.55, 0.55, 0.55, 1.0)
-STICK_RADIUS = 0.015
-
 # Number of lines of a floor to each side of the camera's target; width of these lines as a share of
 # their distance, and of other lines as a share of the distance of the camera.
 FLOOR_LINES = 16
@@ -97,13 +93,13 @@ class Painter:
         self._film = film
         self._data = mujoco.MjData(model)
         self._is_moving = model.body_weldid[model.geom_bodyid] != 0
-        bare = (model.body_geomnum == 0) & (model.body_weldid != 0)
-        self._bare_bodies = np.flatnonzero(bare).tolist()
         self._has_sky = bool(np.any(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)))
         self._camera = _camera(film.camera.offset)
         self._option = mujoco.MjvOption()
         if not np.any(model.geom_group[self._is_moving] < SHOWN_GROUPS):
             self._option.geomgroup[:] = 1
+        if not self._is_moving.any():
+            self._option.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
 
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.global_.fovy = np.degrees(FIELD_OF_VIEW)
@@ -170,7 +166,6 @@ class Painter:
             else:
                 self._renderer.update_scene(data, self._camera, self._option)
             self._paint(track, first)
-            self._add_sticks(track)
 
         colour = (*(np.array(view.tracks[0].term.rgb) / 255.0), 1.0)
         for begin, end in pairwise(view.trail):
@@ -188,22 +183,6 @@ class Painter:
                 _tint(geom, track)
                 if track.is_ghost:
                     geom.pos[:] += GHOST_SHIFT * self._film.camera.offset
-
-    def _add_sticks(self, track: Track) -> None:
-        """Add a ball and sticks to the children for each moving body without geoms."""
-        scene, model, places = self._renderer.scene, self._film.model, self._data.xpos
-        radius = STICK_RADIUS * float(model.stat.extent)
-        for body in self._bare_bodies:
-            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-            added = [_add(scene, sphere, np.full(3, 1.5 * radius), places[body], STICK_COLOUR)]
-            for child in np.flatnonzero(model.body_parentid == body):
-                capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
-                stick = _add(scene, capsule, np.zeros(3), np.zeros(3), STICK_COLOUR)
-                mujoco.mjv_connector(stick, capsule, radius, places[body], places[child])
-                added.append(stick)
-            for geom in added:
-                geom.category = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
-                _tint(geom, track)
 
     def _add_floor(self, target: Array) -> None:
         """Add the lines of a floor around the point at which the camera looks."""
@@ -230,30 +209,22 @@ class Painter:
         distance = BACKGROUND_DISTANCE * float(model.vis.map.zfar) * float(model.stat.extent)
         turn = np.stack([np.cross(forward, up), up, -forward], axis=1)
         size = distance * np.array([2.0, 2.0, 1e-3])
-        _add_shining(scene, size, position + distance * forward, BACKGROUND, turn)
+        _add_box(scene, size, position + distance * forward, turn, BACKGROUND)
 
 
-# Red, green, blue and opacity (0..1); and the orientation of what is not turned.
+# Red, green, blue and opacity (0..1).
 Colour = tuple[float, float, float, float]
-UPRIGHT: Array = np.eye(3)
 
 
-def _add(
-    scene: Any, kind: Any, size: Array, place: Array, colour: Colour, turn: Array = UPRIGHT
-) -> Any:
-    """Add a geom to a scene."""
-    geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(geom, kind, size, place, turn.ravel(), np.array(colour, np.float32))
-    scene.ngeom += 1
-    return geom
-
-
-def _add_shining(scene: Any, size: Array, place: Array, colour: Colour, turn: Array) -> None:
+def _add_box(scene: Any, size: Array, place: Array, turn: Array, colour: Colour) -> None:
     """Add a box that has its own colour whatever the lights are, and casts no shadow."""
-    geom = _add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, place, colour, turn)
+    geom = scene.geoms[scene.ngeom]
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    mujoco.mjv_initGeom(geom, box, size, place, turn.ravel(), np.array(colour, np.float32))
     geom.category = int(mujoco.mjtCatBit.mjCAT_DECOR)
     geom.rgba[:3] /= EMISSION
     geom.emission, geom.specular, geom.shininess = EMISSION, 0.0, 0.0
+    scene.ngeom += 1
 
 
 def _add_line(scene: Any, begin: Array, end: Array, width: float, colour: Colour) -> None:
@@ -264,7 +235,7 @@ def _add_line(scene: Any, begin: Array, end: Array, width: float, colour: Colour
         mujoco.mju_quatZ2Vec(quaternion, (end - begin) / length)
         mujoco.mju_quat2Mat(turn, quaternion)
         size = np.array([width, width, length]) / 2.0
-        _add_shining(scene, size, (begin + end) / 2.0, colour, turn)
+        _add_box(scene, size, (begin + end) / 2.0, turn, colour)
 
 
 def _tint(geom: Any, track: Track) -> None:
