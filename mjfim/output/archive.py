@@ -174,56 +174,37 @@ def read_design(path: Path) -> dict[str, Trajectory]:
             other. Pickles are refused.
     """
     arrays = read_arrays(path, "design")
-
-    found = {}
-    for name, prefix in (("initial", "initial_"), ("final", "")):
-        missing = [prefix + key for key in TRAJECTORY_ARRAYS if prefix + key not in arrays]
-        if not missing:
-            found[name] = _trajectory(path, prefix, arrays)
-        elif name == "final":
-            expected = ", ".join((*TRAJECTORY_ARRAYS, "gain", "sensitivity"))
-            raise RecordingError(
-                f"{path}: array {missing[0]!r} is missing; a design holds {expected}"
-            )
-    return found
+    missing = [key for key in TRAJECTORY_ARRAYS if key not in arrays]
+    if missing:
+        expected = ", ".join((*TRAJECTORY_ARRAYS, "gain", "sensitivity"))
+        raise RecordingError(f"{path}: array {missing[0]!r} is missing; a design holds {expected}")
+    has_initial = all(f"initial_{key}" in arrays for key in TRAJECTORY_ARRAYS)
+    initial = {"initial": _trajectory(path, "initial_", arrays)} if has_initial else {}
+    return {**initial, "final": _trajectory(path, "", arrays)}
 
 
 def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Trajectory:
     """Build a trajectory from arrays that are finite numbers and fit each other."""
-    times = arrays[f"{prefix}t"]
-    rows = len(times) if times.ndim == 1 else 0
-    if rows < MIN_ROWS:
-        raise RecordingError(
-            f"{path}: array '{prefix}t' must be a row of at least {MIN_ROWS} times"
-        )
-
-    for key in TRAJECTORY_ARRAYS:
-        array = arrays[prefix + key]
-        if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-            raise RecordingError(f"{path}: array '{prefix}{key}' must hold finite numbers only")
-
-        wanted_rows = rows - 1 if key == "ctrl" else rows
-        wanted_dimensions = 1 if key == "t" else 2
-        if array.ndim != wanted_dimensions or len(array) != wanted_rows:
-            wanted = f"({wanted_rows},)" if key == "t" else f"({wanted_rows}, columns)"
+    found = {key: arrays[prefix + key] for key in TRAJECTORY_ARRAYS}
+    rows = found["t"].size
+    for key, array in found.items():
+        count = rows - 1 if key == "ctrl" else max(rows, MIN_ROWS)
+        is_shaped = array.ndim == (1 if key == "t" else 2) and len(array) == count
+        if not is_shaped or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+            wanted = f"({count},)" if key == "t" else f"({count}, columns)"
             raise RecordingError(
-                f"{path}: array '{prefix}{key}' has shape {array.shape}, expected {wanted}"
+                f"{path}: array '{prefix}{key}' must hold finite numbers of the shape {wanted}; it "
+                f"has the shape {array.shape}"
             )
-    _require_equal_periods(path, f"{prefix}t", times)
-    return Trajectory(**{key: arrays[prefix + key] for key in TRAJECTORY_ARRAYS})
 
-
-def _require_equal_periods(path: Path, name: str, times: np.ndarray) -> None:
-    """Raise RecordingError unless times: (N+1,) [s] increase by equal periods."""
-    periods = np.diff(times.astype(np.float64))
+    periods = np.diff(found["t"].astype(np.float64))
     mean = float(periods.mean())
-    if mean > 0.0 and np.abs(periods - mean).max() <= SPACING_TOLERANCE * mean:
-        return
-
-    raise RecordingError(
-        f"{path}: array {name!r} must increase by equal periods; they are {periods.min():g} s to "
-        f"{periods.max():g} s"
-    )
+    if mean <= 0.0 or np.abs(periods - mean).max() > SPACING_TOLERANCE * mean:
+        raise RecordingError(
+            f"{path}: array '{prefix}t' must increase by equal periods; they are "
+            f"{periods.min():g} s to {periods.max():g} s"
+        )
+    return Trajectory(**found)
 
 
 def check_fits(path: Path, trajectory: Trajectory, system: System) -> None:

@@ -12,7 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mjfim
+from mjfim.errors import MjfimError
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
 from mjfim.model.paths import KINDS, fields_of
 from mjfim.output.models.mjcf import same_dynamics, write_identified
 from tests.support.examples import design_file
@@ -553,6 +555,54 @@ def test_actuators(element: str, field: str, words: str, tmp_path: Path) -> None
     lost, gained = changes(tmp_path / "model.xml", new)
     assert len(lost) == len(gained) == 1
     assert words in gained[0]
+
+
+# Entries of MjModel that the three parameters of the cart-pendulum set; the rest MuJoCo derives
+# from them.
+IDENTIFIED = {
+    "body_mass": [(3,)],
+    "body_pos": [(3, 2)],
+    "geom_pos": [(2, 2)],
+    "geom_size": [(2, 1)],
+    "dof_damping": [(1,)],
+}
+FOLLOWING = {
+    "actuator_acc0",
+    "body_invweight0",
+    "body_subtreemass",
+    "dof_M0",
+    "dof_invweight0",
+    "dof_length",
+    "geom_aabb",
+    "geom_rbound",
+    "light_poscom0",
+}
+
+
+def test_only_the_identified_values_differ(tmp_path: Path) -> None:
+    """All arrays of MjModel are compared; the user's model stays as it is."""
+    system = System.resolve(mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml"))
+    before = (MODELS / "cart_pendulum.xml").read_bytes()
+    path = tmp_path / "deep" / "identified.xml"
+    theta = np.array([2.3456789, 1.2345678, 0.7654321])
+    assert write_identified(path, system, theta) == []
+    found, stated = mujoco.MjModel.from_xml_path(str(path)), system.model
+    changed = {}
+    for name in dir(found):
+        a, b = getattr(found, name), getattr(stated, name)
+        if isinstance(a, np.ndarray) and a.dtype.kind in "biuf" and name not in FOLLOWING:
+            rows = np.argwhere(~np.isclose(a, b, rtol=1e-12, atol=1e-15))
+            changed |= {name: [tuple(row) for row in rows.tolist()]} if len(rows) else {}
+    assert changed == IDENTIFIED
+    assert found.body_mass[3] == theta[0]
+    assert (MODELS / "cart_pendulum.xml").read_bytes() == before
+
+    # A negative mass is named, and no invalid model is written.
+    before = path.read_bytes()
+    with pytest.raises(MjfimError, match="mass"):
+        write_identified(path, system, np.array([-1.0, 1.0, 1.0]))
+    assert path.read_bytes() == before
+    assert [each.name for each in path.parent.iterdir()] == ["identified.xml"]
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in MODELS.glob("*.toml")))
