@@ -106,9 +106,9 @@ def campaign(
     parameters = CampaignParameters.stated(run.task.parameters, simulated=simulated)
     out.print(render(describe_campaign(found, parameters), verbose=verbose))
     with writing(output):
-        warning = run.folder.write_campaign(found, simulated=simulated)
-    if warning:
-        errors.print(f"warning: {warning}", markup=False)
+        remarks = run.folder.write_campaign(found, simulated=simulated)
+    for remark in remarks:
+        errors.print(f"warning: {remark}", markup=False)
     if found.status is CampaignStatus.WAITING:
         waiting = run.folder.round(run.folder.designed)
         out.print(

@@ -14,12 +14,14 @@ from mjfim.excitation.target_accuracy import target_accuracies
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
-from mjfim.output.archive import write_recording
-from mjfim.output.campaign_folder import CampaignFolder, accuracy_sentence
-from mjfim.output.campaign_settings import (
+from mjfim.files import write_json
+from mjfim.output.archive import write_design, write_recording
+from mjfim.output.campaign_folder import (
+    SETTINGS_FILE,
+    CampaignFolder,
+    accuracy_sentence,
     campaign_settings,
     require_same_settings,
-    write_settings,
 )
 from mjfim.output.picture_format import PictureFormat
 from mjfim.recordings.read import read_recording
@@ -114,7 +116,7 @@ class CampaignRun:
             """Write the design of a round, and simulate its recording."""
             # A call that continues the campaign needs the settings as soon as there is a round.
             if not self.folder.has_rounds:
-                write_settings(self.folder.path, settings)
+                write_json(self.folder.path / SETTINGS_FILE, settings)
             self._write_design(design, number)
             return record(design, number)
 
@@ -178,7 +180,7 @@ class CampaignRun:
         """Write the design of a round, and the experiment with which it was made."""
         experiment = restate_experiment(self.task, design.theta, self._estimate)
         system = self.task.restated(experiment).system
-        self.folder.write_design(design, number, system)
+        write_design(self.folder.round(number), design, system)
 
     def _finish_round(self, event: Event) -> None:
         """Show the progress, and write and print the estimate of a complete round."""
@@ -189,7 +191,7 @@ class CampaignRun:
 
         finished = event.result
         self._estimate = finished.estimate
-        self.folder.write_round(finished)
+        finished.estimate.save(self.folder.round(finished.number))
         sentence = accuracy_sentence(finished.estimate, self._wanted)
         errors.print(f"round {finished.number}: {sentence}", markup=False)
         for warning in finished.warnings:

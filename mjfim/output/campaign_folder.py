@@ -5,8 +5,11 @@ A later call continues the campaign from the designs, recordings and estimates i
 
 from __future__ import annotations
 
+import itertools
+import json
+import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ModelError, RecordingError, first_ones, listed
+from mjfim.errors import ModelError, RecordingError, first_ones, listed, shortened
+from mjfim.experiment.input_files import input_files
+from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.files import read_json, replacing, write_json
+from mjfim.files import as_json, read_json, replacing, write_json
 from mjfim.output import plots
-from mjfim.output.archive import check_fits, origin_of, write_design
+from mjfim.output.archive import check_fits, origin_of
 from mjfim.output.campaign_parameters import CampaignParameters
-from mjfim.output.campaign_settings import SETTINGS_FILE
 from mjfim.output.folders import (
     DESIGN_ARCHIVE,
     IDENTIFIED,
@@ -29,18 +33,22 @@ from mjfim.output.folders import (
     write_pictures,
     write_tables,
 )
+from mjfim.output.manifest import fingerprint
 from mjfim.output.models.mjcf import write_identified
 from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import write_report
 from mjfim.recordings.read import read_recording
-from mjfim.records.campaign import Campaign, EarlierRound, Round
+from mjfim.records.campaign import Campaign, EarlierRound
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 
 if TYPE_CHECKING:
     from mjfim.output.plots.pictures import Pictures
+
+# The settings with which a simulated campaign began; the call that continues it needs the same.
+SETTINGS_FILE = "settings.json"
 
 # Files of a campaign beside the folders of its rounds.
 CAMPAIGN_FILES = (
@@ -58,10 +66,10 @@ ESTIMATE_ARCHIVE = ("estimate.json", "estimate.npz")
 
 
 class CampaignFolder:
-    """The folder of a campaign; `round_<number>/` holds the files of a round.
+    """The folder of a campaign; `round_<number>/` holds the files of a round, from 1.
 
     Attributes:
-        path: The folder.
+        path: The folder, which need not exist yet.
         system: The experiment as stated.
         picture_format: Format of the picture.
     """
@@ -69,13 +77,6 @@ class CampaignFolder:
     def __init__(
         self, path: Path, system: System, picture_format: PictureFormat = PictureFormat.PNG
     ) -> None:
-        """Describe a folder, which need not exist yet.
-
-        Args:
-            path: The folder.
-            system: The experiment as stated.
-            picture_format: Format of the picture.
-        """
         self.path = path
         self.system = system
         self.picture_format = picture_format
@@ -83,19 +84,11 @@ class CampaignFolder:
     # ---- contents of the folder
 
     def round(self, number: int) -> Path:
-        """Return the folder of a round.
-
-        Args:
-            number: Number of the round, from 1.
-        """
+        """Folder of a round."""
         return self.path / f"round_{number}"
 
     def recordings(self, number: int) -> list[Path]:
-        """Return the recordings of a round.
-
-        Args:
-            number: Number of the round, from 1.
-        """
+        """Recordings of a round."""
         return sorted(self.round(number).glob("recording*.csv"))
 
     @property
@@ -111,10 +104,24 @@ class CampaignFolder:
         except RecordingError:
             return False
 
+    @property
+    def designed(self) -> int:
+        """Number of rounds that have a design."""
+        numbers = itertools.takewhile(self._has_design, itertools.count(1))
+        return sum(1 for _ in numbers)
+
+    @property
+    def recorded(self) -> int:
+        """Number of rounds that have a design and recordings."""
+        return sum(1 for _ in itertools.takewhile(self.recordings, range(1, self.designed + 1)))
+
+    def _has_design(self, number: int) -> bool:
+        """Whether both files of a round's design exist."""
+        return all((self.round(number) / name).is_file() for name in ("design.json", "design.npz"))
+
     def unrecorded_rounds(self) -> list[int]:
         """Numbers of the rounds that have a design, but no recording."""
-        numbers = range(1, self.designed + 1)
-        return [number for number in numbers if not self.recordings(number)]
+        return [n for n in range(1, self.designed + 1) if not self.recordings(n)]
 
     def next_files(self, *, simulated: bool) -> list[str]:
         """List the files that the next call may write; in the folders of rounds, existing ones.
@@ -128,47 +135,18 @@ class CampaignFolder:
         files = self.picture_format.files(CAMPAIGN_FILES)
         names = [*files, *parts_of_identified(self.path, self.system.model_path)]
         designed, recorded = self.designed, self.recorded
-        for number in self._numbers():
+        for place in self.path.glob("round_*"):
+            number = int(place.name.removeprefix("round_") or 0)
+
             # Designs and recordings are kept, and all estimates are made again.
             of_round = list(ESTIMATE_ARCHIVE)
-            if number > designed:
-                of_round += DESIGN_ARCHIVE
-            if simulated and number > recorded:
-                of_round.append("recording.csv")
-            names += [f"{self.round(number).name}/{name}" for name in of_round]
+            of_round += DESIGN_ARCHIVE if number > designed else ()
+            of_round += ["recording.csv"] if simulated and number > recorded else []
+            names += [f"{place.name}/{name}" for name in of_round]
         return names
 
-    def _numbers(self) -> list[int]:
-        """Numbers of the rounds that have a folder, ascending."""
-        numbers = [path.name.removeprefix("round_") for path in self.path.glob("round_*")]
-        return sorted(int(number) for number in numbers if number.isdecimal())
-
-    @property
-    def designed(self) -> int:
-        """Number of rounds that have a design."""
-        number = 0
-        while self._has_design(number + 1):
-            number += 1
-        return number
-
-    @property
-    def recorded(self) -> int:
-        """Number of rounds that have a design and recordings."""
-        designed = self.designed
-        number = 0
-        while number < designed and self.recordings(number + 1):
-            number += 1
-        return number
-
-    def _has_design(self, number: int) -> bool:
-        """Return whether both files of a round's design exist."""
-        return all((self.round(number) / name).is_file() for name in ("design.json", "design.npz"))
-
     def recorded_rounds(self) -> Iterator[EarlierRound]:
-        """Yield the rounds that are recorded.
-
-        Yields:
-            The rounds, the first one first.
+        """Yield the rounds that are recorded, the first one first.
 
         Raises:
             RecordingError: A design or a recording cannot be read, or belongs to another
@@ -184,17 +162,15 @@ class CampaignFolder:
                     f"the experiment has {listed(names)}"
                 )
 
-            trajectory = design.trajectory
-            check_fits(folder / "design.npz", trajectory, self.system)
-            recordings = [
-                read_recording(path, self.system.channels) for path in self.recordings(number)
-            ]
+            check_fits(folder / "design.npz", design.trajectory, self.system)
             std = design.final.std
             yield EarlierRound(
-                recordings=tuple(recordings),
+                recordings=tuple(
+                    read_recording(path, self.system.channels) for path in self.recordings(number)
+                ),
                 theta=design.theta,
                 predicted=np.where(np.isnan(std), np.inf, std),
-                control=trajectory.ctrl,
+                control=design.trajectory.ctrl,
                 design=design,
             )
 
@@ -209,9 +185,8 @@ class CampaignFolder:
         Raises:
             RecordingError: A recording cannot be read, or no round lacks a recording.
         """
-        known: set[bytes] = set()
-        for number in range(1, self.designed + 1):
-            known.update(path.read_bytes() for path in self.recordings(number))
+        numbers = range(1, self.designed + 1)
+        known = {path.read_bytes() for number in numbers for path in self.recordings(number)}
 
         # Read all files first, so that none is copied if one of them is unusable.
         for file in files:
@@ -231,63 +206,38 @@ class CampaignFolder:
             with replacing(self.round(waiting) / name) as temporary:
                 shutil.copyfile(file, temporary)
 
-    def write_design(self, design: Design, number: int, system: System) -> None:
-        """Write the files of a round's design, which include those that the robot plays.
-
-        Args:
-            design: The design.
-            number: Number of the round, from 1.
-            system: The experiment for which the design was made.
-        """
-        write_design(self.round(number), design, system)
-
-    def write_round(self, finished: Round) -> None:
-        """Write the estimate after a round.
-
-        Args:
-            finished: The round.
-        """
-        finished.estimate.save(self.round(finished.number))
-
-    def write_campaign(self, campaign: Campaign, *, simulated: bool) -> str:
-        """Write campaign.json, campaign.npz, tables, the picture and identified.xml.
+    def write_campaign(self, campaign: Campaign, *, simulated: bool) -> list[str]:
+        """Write campaign.json, campaign.npz, tables, the picture and the identified model.
 
         Args:
             campaign: The campaign.
             simulated: True where the recordings were simulated at the true values.
 
         Returns:
-            A warning where identified.xml could not be written; else empty.
+            Sentences about the identified model.
         """
+        parameters = self.system.parameters
         campaign.save_archive(self.path)
-        write_json(self.path / "campaign.json", self._summary(campaign, simulated=simulated))
-        write_optional(REPORT, lambda: write_report(self.path, Campaign))
-        if campaign.estimate is None:
-            return ""
-
-        write_tables(self.path, campaign)
-        self._write_figure(campaign, simulated=simulated)
-        try:
-            write_identified(self.path / IDENTIFIED, self.system, campaign.estimate.theta)
-        except ModelError as error:
-            return str(error)
-        return ""
-
-    def _write_figure(self, campaign: Campaign, *, simulated: bool) -> None:
-        """Write the picture of the campaign."""
-        parameters = CampaignParameters.stated(self.system.parameters, simulated=simulated)
-        pictures: Pictures = {"campaign": partial(plots.campaign_figure, campaign, parameters)}
-        write_pictures(self.path, pictures, self.picture_format)
-
-    def _summary(self, campaign: Campaign, *, simulated: bool) -> dict[str, Any]:
-        """Return the contents of campaign.json."""
-        return {
+        values = {
             **origin_of(self.system, self.path),
             **campaign.summary(),
             "simulated": simulated,
             "units": list(self.system.units),
-            "true": self.system.parameters.true if simulated else None,
+            "true": parameters.true if simulated else None,
         }
+        write_json(self.path / "campaign.json", values)
+        write_optional(REPORT, lambda: write_report(self.path, Campaign))
+        if campaign.estimate is None:
+            return []
+
+        write_tables(self.path, campaign)
+        drawn = CampaignParameters.stated(parameters, simulated=simulated)
+        pictures: Pictures = {"campaign": partial(plots.campaign_figure, campaign, drawn)}
+        write_pictures(self.path, pictures, self.picture_format)
+        try:
+            return write_identified(self.path / IDENTIFIED, self.system, campaign.estimate.theta)
+        except ModelError as error:
+            return [str(error)]
 
 
 def accuracy_sentence(estimate: Estimate, wanted: Array) -> str:
@@ -307,3 +257,85 @@ def accuracy_sentence(estimate: Estimate, wanted: Array) -> str:
             value, std = float(estimate.theta[j]), float(estimate.std[j])
             parts.append(f"{name} {format_with_uncertainty(value, std)} (wanted {wanted[j]:.3g})")
     return first_ones(parts) if parts else ""
+
+
+# ---- settings of a simulated campaign
+
+
+def campaign_settings(experiment: Experiment, seed: int) -> dict[str, Any]:
+    """Collect what determines the designs and recordings of a simulated campaign.
+
+    Args:
+        experiment: The experiment as stated, with all target accuracies.
+        seed: Seed of the simulated noise.
+
+    Returns:
+        The settings as JSON values.
+    """
+    source = Path(experiment.source)
+    sums = {
+        os.path.relpath(file, experiment.directory): fingerprint(file)["sha256"]
+        for file in input_files(experiment)
+        if file != source and file.is_file()
+    }
+    values = experiment.model_dump(mode="json", exclude_unset=True)
+    stated = {key: value for key, value in values.items() if key not in ("directory", "source")}
+    settings: dict[str, Any] = json.loads(
+        as_json({"seed": seed, "experiment": stated, "files": sums})
+    )
+    return settings
+
+
+def require_same_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Check that a campaign is continued with the settings with which it began.
+
+    Args:
+        folder: Folder of the campaign, which has rounds.
+        settings: The settings of this call.
+
+    Raises:
+        RecordingError: A setting differs, or the folder does not hold the settings.
+    """
+    path = folder / SETTINGS_FILE
+    if not path.is_file():
+        raise RecordingError(
+            f"{path}: no such file, so --resume cannot check that this call has the settings of "
+            "the campaign (it may be from an older version); begin a campaign in another folder"
+        )
+
+    differences = list(_differences(read_json(path), settings))
+    if differences:
+        raise RecordingError(
+            f"{folder}: --resume needs the settings with which the campaign began: "
+            f"{first_ones(differences, '; ')}. Repeat the call with these settings, or begin a "
+            "campaign in another folder"
+        )
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    """Describe each setting that differs: `--seed was 5, is 6`."""
+    old, new = dict(_leaves(before)), dict(_leaves(now))
+    for place in sorted({*old, *new}):
+        if old.get(place) == new.get(place):
+            continue
+        table, *keys = place
+        if table == "files":
+            yield f"the file {keys[0]} was changed"
+        else:
+            # Targets of --wanted are part of the experiment.
+            name = ".".join(keys) if keys else f"--{table}"
+            yield f"{name} was {_shown(old.get(place))}, is {_shown(new.get(place))}"
+
+
+def _leaves(values: object, *place: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield all values of nested tables, each with its keys."""
+    if not isinstance(values, Mapping):
+        yield place, values
+        return
+    for key, value in values.items():
+        yield from _leaves(value, *place, str(key))
+
+
+def _shown(value: object) -> str:
+    """Return a value for a message."""
+    return "not stated" if value is None else shortened(json.dumps(value))

@@ -16,6 +16,7 @@ from mjfim.output import archive
 from mjfim.output.robots.ros2 import yaml_number
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats.read import read_table
+from tests.output.conftest import Designed, designed
 from tests.support.cli import misused, names, run
 from tests.support.paths import MODELS
 
@@ -25,33 +26,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
-# A short design; its accuracy does not matter.
-SHORT: dict[str, Any] = {"descent": {"max_iterations": 1}}
-
-
-def short_design(name: str, **tables: Any) -> tuple[mjfim.Experiment, mjfim.Design]:
-    """Experiment and design of an example, after one iteration."""
-    stated = mjfim.Experiment.from_file(MODELS / f"{name}.toml")
-    stated = stated.replace(**{**SHORT, **tables})
-    return stated, mjfim.design(stated)
-
 
 @pytest.fixture(scope="module")
-def cart() -> tuple[mjfim.Experiment, mjfim.Design]:
-    """A design with a motor on one of two joints."""
-    return short_design("cart_pendulum", horizon=1.0, measure_rate=100.0)
-
-
-@pytest.fixture(scope="module")
-def arm() -> tuple[mjfim.Experiment, mjfim.Design]:
-    """A design with a position servo on every joint."""
-    return short_design("servo_arm", horizon=0.5)
-
-
-@pytest.fixture(scope="module")
-def folder(
-    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def folder(cart: Designed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the design of the cart."""
     place = tmp_path_factory.mktemp("design")
     archive.write_design(place, cart[1], System.resolve(cart[0]))
@@ -69,7 +46,7 @@ def stack(points: list[dict[str, Any]], field: str) -> np.ndarray:
 
 
 def test_a_trajectory_holds_the_rows_of_the_reference(
-    cart: tuple[mjfim.Experiment, mjfim.Design], folder: Path, tmp_path: Path
+    cart: Designed, folder: Path, tmp_path: Path
 ) -> None:
     """The joint with the motor, with the force of the control, at the times of the rows."""
     remarks = mjfim.export_design(*cart, tmp_path / "trajectory.yaml", to="ros2")
@@ -101,9 +78,7 @@ def test_numbers_are_floats_in_old_and_new_yaml() -> None:
         assert float(yaml_number(value)) == value
 
 
-def test_servos_get_their_commands(
-    arm: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
-) -> None:
+def test_servos_get_their_commands(arm: Designed, tmp_path: Path) -> None:
     """Positions are the controls of the design; the planned motion is there on request."""
     remarks = mjfim.export_design(*arm, tmp_path / "command.yaml", to="ros2")
     found = load((tmp_path / "command.yaml").read_text(encoding="utf-8"))
@@ -124,7 +99,7 @@ def test_servos_get_their_commands(
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_bag_is_read_by_rosbags_and_by_identify(
-    storage: str, cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+    storage: str, cart: Designed, tmp_path: Path
 ) -> None:
     """The message is the trajectory; joint states and controls are a recording of the design."""
     experiment, design = cart
@@ -135,10 +110,10 @@ def test_a_bag_is_read_by_rosbags_and_by_identify(
         ((connection, _, raw),) = reader.messages(connections=wanted)
         message: Any = reader.deserialize(raw, connection.msgtype)
     assert connection.msgtype == "trajectory_msgs/msg/JointTrajectory"
-    assert message.joint_names == ["slide"] and len(message.points) == 101
+    assert message.joint_names == ["slide"] and len(message.points) == 401
     positions = np.array([point.positions for point in message.points])
     np.testing.assert_allclose(positions[:, 0], design.trajectory.qpos[:, 0], atol=1e-12)
-    assert message.points[-1].time_from_start.sec == 1
+    assert message.points[-1].time_from_start.sec == 4
 
     recording = read_recording(bag, System.resolve(experiment).channels)
     np.testing.assert_array_equal(recording.ctrl, design.trajectory.ctrl)
@@ -188,15 +163,14 @@ def test_misuse_is_one_sentence(words: list[str], said: str, folder: Path, tmp_p
 
 
 def test_a_robot_without_driven_joints_has_no_joint_trajectory(tmp_path: Path) -> None:
-    experiment = mjfim.Experiment.from_file(MODELS / "quadrotor.toml")
-    experiment = experiment.replace(horizon=0.3, **SHORT)
+    quadrotor = designed("quadrotor", horizon=0.3)
     with pytest.raises(ExperimentError, match="slides and hinges on which actuators act"):
-        mjfim.export_design(experiment, mjfim.design(experiment), tmp_path / "out.yaml", to="ros2")
+        mjfim.export_design(*quadrotor, tmp_path / "out.yaml", to="ros2")
 
 
 def test_a_design_of_another_model_is_refused(
-    cart: tuple[mjfim.Experiment, mjfim.Design],
-    arm: tuple[mjfim.Experiment, mjfim.Design],
+    cart: Designed,
+    arm: Designed,
     tmp_path: Path,
 ) -> None:
     with pytest.raises(RecordingError, match="the design: made for"):

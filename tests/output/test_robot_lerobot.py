@@ -15,6 +15,7 @@ import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.experiment import System
 from mjfim.recordings import read_recording
+from tests.output.conftest import Designed
 from tests.support.cli import misused, run
 from tests.support.paths import MODELS
 
@@ -57,21 +58,6 @@ INFO_KEYS = {
 STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
 
 
-@pytest.fixture(scope="module")
-def cart() -> tuple[mjfim.Experiment, mjfim.Design]:
-    """A design with one motor."""
-    stated = mjfim.Experiment.from_file(CART).replace(descent={"max_iterations": 1})
-    return stated, mjfim.design(stated)
-
-
-@pytest.fixture(scope="module")
-def arm() -> tuple[mjfim.Experiment, mjfim.Design]:
-    """A design with four position servos."""
-    stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
-    stated = stated.replace(horizon=0.5, descent={"max_iterations": 1})
-    return stated, mjfim.design(stated)
-
-
 def described(folder: Path) -> dict[str, Any]:
     """The contents of info.json."""
     info: dict[str, Any] = json.loads((folder / "meta" / "info.json").read_text(encoding="utf-8"))
@@ -83,9 +69,7 @@ def table(folder: Path, file: str) -> Any:
     return pyarrow.parquet.read_table(folder / file, partitioning=None)
 
 
-def test_the_files_follow_the_format(
-    arm: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
-) -> None:
+def test_the_files_follow_the_format(arm: Designed, tmp_path: Path) -> None:
     """Files, keys, columns and types are those of LeRobot 0.4; each feature has statistics."""
     mjfim.export_design(*arm, tmp_path, to="lerobot")
     found = {
@@ -145,9 +129,7 @@ def test_the_files_follow_the_format(
 
 
 @pytest.mark.parametrize("unit", ["rad", "deg"])
-def test_actions_are_the_controls_in_the_unit(
-    unit: str, arm: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
-) -> None:
+def test_actions_are_the_controls_in_the_unit(unit: str, arm: Designed, tmp_path: Path) -> None:
     mjfim.export_design(*arm, tmp_path, to="lerobot", unit=unit)
     data = table(tmp_path, "data/chunk-000/file-000.parquet")
     curve, factor = arm[1].trajectory, 180.0 / np.pi if unit == "deg" else 1.0
@@ -160,9 +142,7 @@ def test_actions_are_the_controls_in_the_unit(
 
 
 @pytest.mark.slow
-def test_identify_reads_the_dataset(
-    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
-) -> None:
+def test_identify_reads_the_dataset(cart: Designed, tmp_path: Path) -> None:
     """Names are found without a table `[recording]`; the values have single precision."""
     mjfim.export_design(*cart, tmp_path, to="lerobot")
     recording = read_recording(tmp_path, System.resolve(cart[0]).channels)
@@ -172,9 +152,7 @@ def test_identify_reads_the_dataset(
     np.testing.assert_allclose(list(estimate.theta), [2.0, 1.0, 1.0], rtol=1e-4)
 
 
-def test_the_verb_replaces_its_own_dataset(
-    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
-) -> None:
+def test_the_verb_replaces_its_own_dataset(cart: Designed, tmp_path: Path) -> None:
     """Twice into one folder; a file of the user and a wrong unit are refused."""
     cart[1].save(tmp_path / "design")
     words = ("export", tmp_path / "design", "--experiment", CART, "--to", "lerobot")
@@ -189,9 +167,7 @@ def test_the_verb_replaces_its_own_dataset(
     misused(run(*words, "-o", tmp_path / "set2", "--unit", "turn"), "--unit: unknown unit 'turn'")
 
 
-def test_a_rate_that_is_no_whole_number_is_refused(
-    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
-) -> None:
+def test_a_rate_that_is_no_whole_number_is_refused(cart: Designed, tmp_path: Path) -> None:
     stated = cart[0].replace(rate=100.0 / 3.0, measure_rate=100.0 / 3.0, horizon=0.3)
     with pytest.raises(ExperimentError, match=r"33\.3333 rows per second; state another rate"):
         mjfim.export_design(stated, mjfim.design(stated), tmp_path, to="lerobot")

@@ -24,11 +24,11 @@ from mjfim.output.robots.plan import RobotPlan
 from mjfim.output.robots.player_script import write_player
 from mjfim.recordings import read_recording
 from mjfim.recordings.formats.read import read_table
+from tests.output.conftest import Designed
 from tests.support.cli import run
 from tests.support.numerics import body_task
 from tests.support.paths import MODELS
 
-CART = MODELS / "cart_pendulum.toml"
 NAMES = ("qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge")
 
 
@@ -64,18 +64,7 @@ class SimulatedRobot:
 
 
 @pytest.fixture(scope="module")
-def cart() -> tuple[mjfim.Experiment, mjfim.Design]:
-    """A design of the cart-pendulum whose control has limits."""
-    stated = mjfim.Experiment.from_file(CART)
-    limits = {"control": {"force": [-20.0, 20.0]}}
-    stated = stated.replace(descent={"max_iterations": 2}, limits=limits)
-    return stated, mjfim.design(stated)
-
-
-@pytest.fixture(scope="module")
-def script(
-    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def script(cart: Designed, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The player of this design."""
     path = tmp_path_factory.mktemp("player") / "play.py"
     mjfim.export_design(*cart, path, to="player")
@@ -107,7 +96,7 @@ def played(player: ModuleType, robot: SimulatedRobot, path: Path, **options: Any
 def test_parameters_are_identified_from_what_the_player_records(
     feedback: bool,
     player: ModuleType,
-    cart: tuple[mjfim.Experiment, mjfim.Design],
+    cart: Designed,
     tmp_path: Path,
 ) -> None:
     """A robot with the true parameters and the stated noise, with and without the gains."""
@@ -128,7 +117,7 @@ def test_parameters_are_identified_from_what_the_player_records(
 
 
 def test_feedback_is_the_gain_times_the_deviation_within_limits(
-    player: ModuleType, cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+    player: ModuleType, cart: Designed, tmp_path: Path
 ) -> None:
     """Each control is that of a loop of its own; those beyond the limits are clipped."""
     robot = SimulatedRobot()
@@ -202,7 +191,7 @@ def test_an_early_end_makes_the_robot_safe_and_keeps_the_recording(
 
 
 def test_a_late_computer_leaves_rows_out_and_keeps_the_time(
-    player: ModuleType, cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+    player: ModuleType, cart: Designed, tmp_path: Path
 ) -> None:
     """After a pause of 30 ms the next row is that of the clock; the motion ends on time."""
     robot = SimulatedRobot()
@@ -252,17 +241,15 @@ def test_the_player_stands_alone(script: Path) -> None:
     assert found - set(sys.stdlib_module_names) == {"numpy"}
 
 
-def test_servos_hold_their_last_command(tmp_path: Path) -> None:
+def test_servos_hold_their_last_command(arm: Designed, tmp_path: Path) -> None:
     """The safe control of a position servo is no number."""
-    stated = mjfim.Experiment.from_file(MODELS / "servo_arm.toml")
-    stated = stated.replace(horizon=0.5, descent={"max_iterations": 1})
-    mjfim.export_design(stated, mjfim.design(stated), tmp_path / "play.py", to="player")
+    mjfim.export_design(*arm, tmp_path / "play.py", to="player")
     player = imported(tmp_path / "play.py")
     assert np.isnan(player.SAFE).all() and player.LOWER[0] == -2.6
 
 
 def test_the_header_of_the_design_says_when_to_use_the_gains(
-    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
+    cart: Designed, tmp_path: Path
 ) -> None:
     """Readers of columns are not disturbed: the note is the name of a last column of zeros."""
     archive.write_design(tmp_path, cart[1], System.resolve(cart[0]))
@@ -273,11 +260,10 @@ def test_the_header_of_the_design_says_when_to_use_the_gains(
     np.testing.assert_array_equal(DesignTask.resolve(again).initial.ctrl, cart[1].trajectory.ctrl)
 
 
-def test_the_verb_writes_the_player(
-    cart: tuple[mjfim.Experiment, mjfim.Design], tmp_path: Path
-) -> None:
+def test_the_verb_writes_the_player(cart: Designed, tmp_path: Path) -> None:
     cart[1].save(tmp_path / "design")
-    words = ("export", tmp_path / "design", "--experiment", CART, "--to", "player")
+    model = MODELS / "cart_pendulum.toml"
+    words = ("export", tmp_path / "design", "--experiment", model, "--to", "player")
     done = run(*words, "-o", tmp_path / "play.py")
     assert done.exit_code == 0, done.stderr
     assert imported(tmp_path / "play.py").COUNT == 400

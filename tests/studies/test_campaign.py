@@ -23,12 +23,13 @@ from mjfim.errors import ExperimentError, SimulationDivergedError, Unidentifiabl
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
+from mjfim.files import write_json
 from mjfim.identification.identify import identify_system
 from mjfim.identification.residual_tests import is_larger_than_noise
-from mjfim.output.campaign_settings import (
+from mjfim.output.campaign_folder import (
+    SETTINGS_FILE,
     campaign_settings,
     require_same_settings,
-    write_settings,
 )
 from mjfim.output.manifest import MANIFEST
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
@@ -556,7 +557,7 @@ def test_a_campaign_is_continued_with_its_own_settings_only(tmp_path: Path) -> N
     misused(run(*words, "--wanted", 0.1), "settings.json: no such file", "another folder")
 
     experiment = with_target_accuracies(mjfim.Experiment.from_file(study), 0.1)
-    write_settings(folder, campaign_settings(experiment, seed=5))
+    write_json(folder / SETTINGS_FILE, campaign_settings(experiment, seed=5))
     require_same_settings(folder, campaign_settings(experiment, seed=5))
     other = run(*words, "--wanted", 0.2, "--seed", 6)
     told = ("--seed was 5, is 6", "parameters.c.wanted was 0.13", "is 0.27")
