@@ -94,6 +94,6 @@ def check(
     print_result(as_json, values, describe(result), verbose=verbose)
     if output is not None:
         with writing(output) as results:
-            results.write_check_folder(output, result, system, pictures)
+            results.write_result(output, result, system, pictures)
         say_written(output)
     raise typer.Exit(0 if result.ok else 1)

@@ -94,7 +94,7 @@ def compare(
     values = archive.summary_with_origin(result, task.system, output)
     print_result(as_json, values, describe(result), verbose=verbose)
     with writing(output) as results:
-        results.write_comparison_folder(output, result, task.system, pictures)
+        results.write_result(output, result, task.system, pictures)
     say_written(output)
     if is_elsewhere(as_json) and not result.ok:
         errors.print(f"mjfim: {' '.join(result.verdict)}", markup=False)

@@ -70,7 +70,7 @@ def compare_robots(
     origin = {"first": _relative(first, output), "second": _relative(second, output)}
     print_result(as_json, {**origin, **result.summary()}, describe(result), verbose=verbose)
     with writing(output) as results:
-        results.write_robots_folder(output, result, origin, pictures)
+        results.write_result(output, result, None, pictures, origin)
     say_written(output)
     if is_elsewhere(as_json) and result.differs:
         errors.print(f"mjfim: {result}", markup=False)

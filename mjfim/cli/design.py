@@ -148,7 +148,7 @@ def design(
     summary = describe(result)
     print_result(as_json, values, summary, verbose=verbose)
     with writing(output) as results:
-        results.write_design_folder(output, result, task.system, pictures)
+        results.write_result(output, result, task.system, pictures)
         if found is not None:
             found.save(output)
     write_wanted_video(video, task.system, result)

@@ -160,7 +160,7 @@ def identify(
     values = archive.summary_with_origin(result, system, output)
     print_result(as_json, values, summary, verbose=verbose)
     with writing(output) as results:
-        remarks = results.write_estimate_folder(output, result, system, pictures)
+        remarks = results.write_result(output, result, system, pictures)
     for sentence in (*not_drawn, *remarks):
         errors.print(f"warning: {sentence}", markup=False)
     write_wanted_video(video, system, result)

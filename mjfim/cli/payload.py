@@ -133,7 +133,7 @@ def payload(
     values = archive.summary_with_origin(result, found.system, output)
     print_result(as_json, values, describe(result), verbose=verbose)
     with writing(output) as results:
-        remarks = results.write_estimate_folder(output, result, found.system, pictures)
+        remarks = results.write_result(output, result, found.system, pictures)
     for sentence in remarks:
         errors.print(f"warning: {sentence}", markup=False)
     say_written(output)

@@ -149,7 +149,8 @@ def robustness(
 
     out.print(render(describe(result), verbose=verbose))
     with writing(output) as results:
-        results.write_robustness_folder(output, result, System.resolve(stated), seconds, pictures)
+        system = System.resolve(stated)
+        results.write_result(output, result, system, pictures, {"seconds": seconds})
     say_written(output, f" ({result.runs} runs in {seconds:.0f} s)")
     if result.runs < runs:
         errors.print(f"mjfim: interrupted; only {result.runs} of {runs} robots are done")

@@ -157,7 +157,7 @@ def montecarlo(
     values = archive.summary_with_origin(study, system, output)
     print_result(as_json, values, summary, verbose=verbose)
     with writing(output) as results:
-        results.write_study_folder(output, study, system, pictures)
+        results.write_result(output, study, system, pictures)
     say_written(output)
     done = {name: found.trials for name, found in study.sets.items()}
     is_complete = done == dict.fromkeys(named, trials)

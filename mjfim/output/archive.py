@@ -52,18 +52,6 @@ def write_design(folder: Path, design: Design, system: System) -> None:
     write_json(folder / "design.json", {**origin_of(system, folder), **design.summary()})
 
 
-def save_with_origin(folder: Path, record: ShownRecord, system: System) -> None:
-    """Write the npz file of a result, and its JSON file with the experiment and the model.
-
-    Args:
-        folder: Folder for the files; made if it does not exist.
-        record: The result.
-        system: The experiment of the result.
-    """
-    record.save_archive(folder)
-    write_json(folder / f"{record.file_stem}.json", summary_with_origin(record, system, folder))
-
-
 def summary_with_origin(
     record: ShownRecord, system: System, folder: Path | None
 ) -> dict[str, object]:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from mjfim.errors import ModelError, RecordingError
@@ -28,14 +29,10 @@ from mjfim.output.report.build import records_in, write_report
 from mjfim.output.robot_samples import clear_samples, write_samples
 from mjfim.output.video.video import report_video
 from mjfim.records.base import ShownRecord
-from mjfim.records.check import Check
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import begin_stage
-from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.robots import RobotComparison
-from mjfim.records.robustness import Robustness
 
 if TYPE_CHECKING:
     from mjfim.output.plots.pictures import DrawPicture, Pictures
@@ -43,11 +40,19 @@ if TYPE_CHECKING:
 # The identified model.
 IDENTIFIED = "identified.xml"
 
+# Names of files of an earlier run that may not be written again, by the kind of the result.
+ENDINGS = "|".join(PictureFormat)
+STALE: dict[type[ShownRecord], str] = {
+    Comparison: r"control_[\w-]+\.csv",
+    Estimate: r"((fit|held_out)(_\d+)?|predictions|pairs|trace|selection|horizons|inverse_dynamics"
+    rf"|samples|recordings)\.({ENDINGS})|identified(_.*)?\.(xml|urdf)",
+}
+
+# Further entries of a JSON file: none.
+NOTHING: Mapping[str, object] = MappingProxyType({})
+
 # Tables of a result, as Markdown and as LaTeX.
 TABLE_FILES = ("tables.md", "tables.tex")
-
-# Files of earlier versions in place of which tables are written.
-EARLIER_TABLES = ("table_eigenvalues.png", "table_covariance.png")
 
 # Files that a design consists of, without figures.
 DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
@@ -127,8 +132,13 @@ def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
     Args:
         methods: Keys of the baselines.
     """
-    controls = tuple(_control_name(method) for method in dict.fromkeys((*methods, DESIGN)))
+    controls = tuple(control_name(method) for method in dict.fromkeys((*methods, DESIGN)))
     return ("compare.json", "compare.npz", REPORT, "compare.png", *TABLE_FILES, *controls)
+
+
+def control_name(method: str) -> str:
+    """Name of the table with the control of a method."""
+    return f"control_{method}.csv"
 
 
 def find_rerun_file(source: Path) -> Path:
@@ -211,230 +221,112 @@ def check_file(path: Path) -> None:
     check_folder(path.parent)
 
 
-def write_design_folder(
-    folder: Path, design: Design, system: System, picture_format: PictureFormat = PictureFormat.PNG
-) -> None:
-    """Write a design's files, its report, its Rerun file and its figures.
+def write_result(
+    folder: Path,
+    record: ShownRecord,
+    system: System | None = None,
+    picture_format: PictureFormat = PictureFormat.PNG,
+    further: Mapping[str, object] = NOTHING,
+) -> list[str]:
+    """Write all files of a result: its data, and then what a result is complete without.
+
+    Files that an earlier run wrote and that are not written again are removed.
 
     Args:
         folder: Folder for the results.
-        design: The design.
-        system: The experiment for which it was made.
+        record: The result.
+        system: The experiment of the result; None for a comparison of robots.
         picture_format: Format of the pictures.
+        further: Further entries of its JSON file.
+
+    Returns:
+        Sentences about models that could not be written completely.
     """
-    # Other processes draw the pictures, while this one writes the other files.
-    begin_pictures(design, picture_format)
-    archive.write_design(folder, design, system)
-    write_tables(folder, design)
+    # Another process draws the pictures, while this one writes the other files.
+    begin_pictures(record, picture_format)
+    if type(record) in STALE:
+        clear(folder, STALE[type(record)])
+    remarks = _write_data(folder, record, system, further)
 
-    write_optional(REPORT, lambda: write_report(folder, Design))
-    write_optional("design.rrd", lambda: _write_design_log(folder, design, system))
-    _write_figures(folder, design, picture_format)
-    write_optional("the video", lambda: _add_video(folder, design, system))
+    write_tables(folder, record)
+    write_optional(REPORT, lambda: write_report(folder, type(record), made=record))
+    _write_figures(folder, record, picture_format)
+    if system is not None and isinstance(record, Design | Estimate):
+        log = f"{record.file_stem}.rrd"
+        write_optional(log, lambda: _write_log(folder / log, record, system))
+        write_optional("the video", lambda: _add_video(folder, record, system))
+    return remarks
 
 
-def _add_video(folder: Path, result: Design | Estimate, system: System) -> None:
+def _write_data(
+    folder: Path, record: ShownRecord, system: System | None, further: Mapping[str, object]
+) -> list[str]:
+    """Write the data of a result, and the models that it identifies."""
+    if system is not None and isinstance(record, Design):
+        archive.write_design(folder, record, system)
+        return []
+
+    record.save_archive(folder)
+    origin = {} if system is None else archive.origin_of(system, folder)
+    write_json(folder / f"{record.file_stem}.json", {**origin, **record.summary(), **further})
+    if system is not None and isinstance(record, Comparison):
+        for row in record.rows:
+            if row.control is not None:
+                archive.write_control(folder / control_name(row.method), row.control, system)
+    if system is None or not isinstance(record, Estimate):
+        return []
+
+    clear_samples(folder)
+    try:
+        remarks = write_identified(folder / IDENTIFIED, system, record.theta)
+    except ModelError as error:
+        remarks = [str(error)]
+    if record.draws is not None:
+        begin_stage("writing the models of the drawn robots")
+        write_optional(
+            "the drawn robots", lambda: remarks.extend(write_samples(folder, record, system))
+        )
+    return remarks
+
+
+def _write_log(file: Path, record: Design | Estimate, system: System) -> None:
+    """Write the Rerun file of a result that holds a motion."""
+    labels = labels_of_system(system)
+    if isinstance(record, Design):
+        rerun_log.log_design(file, system.model_at(system.theta), record, labels)
+    elif record.motion is not None:
+        end = float(record.motion.t[-1])
+        measured = measured_trajectory(system, record.recordings[0], end)
+        model = system.model_at(record.theta)
+        rerun_log.log_estimate(file, model, record, measured, record.motion, labels)
+
+
+def _add_video(folder: Path, record: Design | Estimate, system: System) -> None:
     """Write the report once more, with its video or with the sentence why there is none."""
     interruption = current_interruption()
     if interruption is not None and interruption.presses:
         return  # who has pressed Ctrl-C does not wait for a video
     begin_stage("drawing the video of the report")
-    found, sentence = report_video(system, result)
-    write_report(folder, type(result), found, sentence, made=result)
-
-
-def _write_design_log(folder: Path, design: Design, system: System) -> None:
-    """Write the Rerun file of a design."""
-    labels = labels_of_system(system)
-    rerun_log.log_design(folder / "design.rrd", system.model_at(system.theta), design, labels)
-
-
-def write_check_folder(
-    folder: Path, check: Check, system: System, picture_format: PictureFormat = PictureFormat.PNG
-) -> None:
-    """Write check.json, check.npz, report.html and a figure of accuracies and correlations.
-
-    Args:
-        folder: Folder for the results.
-        check: The check.
-        system: The experiment that was checked.
-        picture_format: Format of the pictures.
-    """
-    archive.save_with_origin(folder, check, system)
-    _write_views(folder, check, picture_format)
-
-
-def write_robots_folder(
-    folder: Path,
-    comparison: RobotComparison,
-    origin: Mapping[str, str],
-    picture_format: PictureFormat = PictureFormat.PNG,
-) -> None:
-    """Write robots.json, robots.npz, report.html and a figure of the differences.
-
-    Args:
-        folder: Folder for the results.
-        comparison: The comparison.
-        origin: Folders of both estimates, relative to the folder, by their key in robots.json.
-        picture_format: Format of the pictures.
-    """
-    comparison.save_archive(folder)
-    write_json(folder / "robots.json", {**origin, **comparison.summary()})
-    _write_views(folder, comparison, picture_format)
-
-
-def write_robustness_folder(
-    folder: Path,
-    result: Robustness,
-    system: System,
-    seconds: float,
-    picture_format: PictureFormat = PictureFormat.PNG,
-) -> None:
-    """Write playback.json, playback.npz, report.html and a figure of limits, errors and coverage.
-
-    Args:
-        folder: Folder for the results.
-        result: The study.
-        system: The experiment of the design.
-        seconds: Time that the study took [s].
-        picture_format: Format of the pictures.
-    """
-    result.save_archive(folder)
-    values = {**archive.origin_of(system, folder), **result.summary(), "seconds": seconds}
-    write_json(folder / "playback.json", values)
-    _write_views(folder, result, picture_format)
-
-
-def write_comparison_folder(
-    folder: Path,
-    comparison: Comparison,
-    system: System,
-    picture_format: PictureFormat = PictureFormat.PNG,
-) -> None:
-    """Write compare.json, compare.npz, report.html, a figure, and the control of each method.
-
-    An experiment can read each control as its `initial.control`.
-
-    Args:
-        folder: Folder for the results; the controls that an earlier comparison wrote
-            are removed.
-        comparison: The comparison.
-        system: The experiment that was compared.
-        picture_format: Format of the pictures.
-    """
-    _clear(folder, r"control_[\w-]+\.csv")
-    archive.save_with_origin(folder, comparison, system)
-    for row in comparison.rows:
-        if row.control is not None:
-            archive.write_control(folder / _control_name(row.method), row.control, system)
-    _write_views(folder, comparison, picture_format)
-
-
-def write_estimate_folder(
-    folder: Path,
-    estimate: Estimate,
-    system: System,
-    picture_format: PictureFormat = PictureFormat.PNG,
-) -> list[str]:
-    """Write estimate.json, estimate.npz, identified.xml, report.html, estimate.rrd and figures.
-
-    Args:
-        folder: Folder for the results; those that an earlier estimate wrote and that are not
-            replaced are removed.
-        estimate: The estimate.
-        system: The experiment that was identified.
-        picture_format: Format of the pictures.
-
-    Returns:
-        Sentences about results that could not be written completely.
-    """
-    endings = "|".join(PictureFormat)
-    _clear(
-        folder,
-        r"((fit|held_out)(_\d+)?|predictions|pairs|trace|selection|horizons|inverse_dynamics"
-        rf"|samples|recordings)\.({endings})|identified(_.*)?\.(xml|urdf)",
-    )
-    clear_samples(folder)
-    archive.save_with_origin(folder, estimate, system)
-    write_tables(folder, estimate)
-
-    remarks = []
-    try:
-        remarks += write_identified(folder / IDENTIFIED, system, estimate.theta)
-    except ModelError as error:
-        remarks.append(str(error))
-    if estimate.draws is not None:
-        begin_stage("writing the models of the drawn robots")
-        write_optional(
-            "the drawn robots", lambda: remarks.extend(write_samples(folder, estimate, system))
-        )
-
-    write_optional(REPORT, lambda: write_report(folder, Estimate, made=estimate))
-    _write_figures(folder, estimate, picture_format)
-    write_optional("estimate.rrd", lambda: _write_estimate_log(folder, estimate, system))
-    write_optional("the video", lambda: _add_video(folder, estimate, system))
-    return remarks
-
-
-def _write_estimate_log(folder: Path, estimate: Estimate, system: System) -> None:
-    """Write the Rerun file of an estimate, if it holds a motion."""
-    labels = labels_of_system(system)
-    if estimate.motion is not None:
-        measured = measured_trajectory(system, estimate.recordings[0], float(estimate.motion.t[-1]))
-        model = system.model_at(estimate.theta)
-        target = folder / "estimate.rrd"
-        rerun_log.log_estimate(target, model, estimate, measured, estimate.motion, labels)
-
-
-def write_study_folder(
-    folder: Path,
-    study: MonteCarloStudy,
-    system: System,
-    picture_format: PictureFormat = PictureFormat.PNG,
-) -> None:
-    """Write montecarlo.json, montecarlo.npz, report.html, tables and a histogram per parameter.
-
-    Args:
-        folder: Folder for the results.
-        study: The Monte Carlo study.
-        system: The experiment that was studied.
-        picture_format: Format of the pictures.
-    """
-    archive.save_with_origin(folder, study, system)
-    _write_views(folder, study, picture_format)
-
-
-def _write_views(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
-    """Write the tables, the report and the figures of a result, from its files and its record."""
-    begin_pictures(record, picture_format)
-    write_tables(folder, record)
-    write_optional(REPORT, lambda: write_report(folder, type(record)))
-    _write_figures(folder, record, picture_format)
+    video, sentence = report_video(system, record)
+    write_report(folder, type(record), video, sentence, made=record)
 
 
 def write_tables(folder: Path, record: ShownRecord) -> None:
-    """Write the tables of a result as Markdown and as LaTeX, if that is possible.
+    """Write the tables of a result as Markdown and as LaTeX, if that is possible."""
 
-    Args:
-        folder: Folder for the results; pictures of tables that an earlier version wrote are
-            removed.
-        record: The result.
-    """
-    write_guarded(" and ".join(TABLE_FILES), lambda: _write_tables(folder, record))
-    _clear(folder, "|".join(re.escape(name) for name in EARLIER_TABLES))
+    def write() -> None:
+        """Write both files."""
+        summary = describe(record)
+        texts = (markdown.render_tables(summary), latex.render_tables(summary))
+        for name, text in zip(TABLE_FILES, texts, strict=True):
+            with replacing(folder / name) as temporary:
+                temporary.write_text(text, encoding="utf-8")
 
-
-def _write_tables(folder: Path, record: ShownRecord) -> None:
-    """Write the tables of a result."""
-    summary = describe(record)
-    texts = (markdown.render_tables(summary), latex.render_tables(summary))
-    for name, text in zip(TABLE_FILES, texts, strict=True):
-        with replacing(folder / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    write_guarded(" and ".join(TABLE_FILES), write)
 
 
 def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:
-    """Write all figures of a result, which another process may have drawn."""
+    """Write all pictures of a result, which another process may have drawn."""
     contents: dict[str, bytes] = {}
     write_optional("the pictures", lambda: contents.update(picture_contents(record)))
     if contents:
@@ -508,7 +400,7 @@ def _write_picture_files(
     Those of an earlier run in another format are removed.
     """
     others = "|".join(other for other in PictureFormat if other is not picture_format)
-    _clear(folder, rf"({'|'.join(re.escape(name) for name in writers)})\.({others})")
+    clear(folder, rf"({'|'.join(re.escape(name) for name in writers)})\.({others})")
 
     for name, write in writers.items():
         file = folder / picture_format.file_of(name)
@@ -528,15 +420,14 @@ def _write_picture(draw: DrawPicture, file: Path) -> None:
     plots.save(draw(), file)
 
 
-def _control_name(method: str) -> str:
-    """Name of the table with the control of a method."""
-    return f"control_{method}.csv"
-
-
-def _clear(folder: Path, names: str) -> None:
-    """Remove the files that an earlier run wrote, by their exact names.
+def clear(folder: Path, names: str) -> None:
+    """Remove the files that an earlier run wrote, by the pattern of their names.
 
     Files of the user that have such a name remain.
+
+    Args:
+        folder: The folder.
+        names: Regular expression for whole names.
     """
     for stale in list(folder.iterdir()):
         if re.fullmatch(names, stale.name):

@@ -57,5 +57,4 @@ def identified(home: Path, study: Path, recorded: Path) -> Result:
 @pytest.fixture
 def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write no files, in tests that do not look at them: to draw figures takes seconds."""
-    for name in ("write_design_folder", "write_estimate_folder", "write_study_folder"):
-        monkeypatch.setattr(folders, name, lambda *_: [])
+    monkeypatch.setattr(folders, "write_result", lambda *_: [])

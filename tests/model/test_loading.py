@@ -83,7 +83,7 @@ def test_a_short_design_improves_and_writes_all_files(
     design = design_task(task)
     assert design.final.cost < design.initial.cost
     folder = tmp_path / "out"
-    results.write_design_folder(folder, design, task.system)
+    results.write_result(folder, design, task.system)
     assert names(folder) == DESIGN | ({"limits.png"} if design.usage else set())
     told = read(folder / "design.json")
     assert len(told["final"]["std"]) == len(told["parameters"])

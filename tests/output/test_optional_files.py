@@ -49,14 +49,13 @@ def test_one_bad_picture_does_not_keep_the_others_away(
     tmp_path: Path, empty_figures: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The report, the tables and the other pictures of a folder are drawn."""
-    results.check().save(tmp_path)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         pictures: Any = {"first": fail, "second": lambda: None}
         folders.write_pictures(tmp_path, pictures, PictureFormat.PNG)
-        monkeypatch.setattr(folders, "write_report", lambda *_: fail())
+        monkeypatch.setattr(folders, "write_report", lambda *_, **__: fail())
         monkeypatch.setattr(picture_module, "pictures_of", lambda _: {"check": lambda: None})
-        folders._write_views(tmp_path, results.check(), PictureFormat.PNG)
+        folders.write_result(tmp_path, results.check())
 
     drawn = {path.name for path in tmp_path.iterdir()}
     assert {"second.png", "tables.md", "check.png"} <= drawn
