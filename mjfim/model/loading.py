@@ -108,18 +108,6 @@ def compile_spec(spec: Any, path: Path, *, tells: bool = False, files: Any = Non
     return model
 
 
-def load_written_model(path: Path) -> Any:
-    """MjModel of a file that mjfim wrote, without MuJoCo's warnings.
-
-    The user knows them from the original file.
-
-    Args:
-        path: The file.
-    """
-    with collected_warnings():
-        return mujoco.MjModel.from_xml_path(str(path))
-
-
 # Largest number of compiled models of edited specs that a source keeps; a search revisits few
 # parameter values.
 MAX_EDITED_MODELS = 512

@@ -142,9 +142,7 @@ def _entries(folder: Path) -> Entries:
 
 def _enter(file: Path, new: dict[str, Any]) -> None:
     """Enter the contents of a file that is about to be replaced, and keep the present ones."""
-    lock = FileLock(file.parent / MANIFEST_LOCK)
-    lock.acquire(PATIENCE)
-    try:
+    with locked(file.parent / MANIFEST_LOCK, PATIENCE):
         entries = _entries(file.parent)
         present = fingerprint(file) if file.is_file() else {}
         kept = [entry for entry in entries.get(file.name, []) if entry == present != new]
@@ -154,8 +152,6 @@ def _enter(file: Path, new: dict[str, Any]) -> None:
         text = json.dumps({"format": FORMAT, "files": dict(sorted(entries.items()))})
         with replacing(file.parent / MANIFEST) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    finally:
-        lock.release()
 
 
 def _refusal(unknown: Sequence[Path], changed: Sequence[Path]) -> str:
@@ -202,82 +198,73 @@ def claimed(folder: Path, guard: OutputGuard, *, exclusive: bool) -> Iterator[No
         raise OutputError(
             f"{folder}: this folder cannot be created: {error.strerror}; choose another one with -o"
         ) from None
-    lock = FileLock(folder / FOLDER_LOCK)
-    if not lock.acquire():
-        raise OutputError(
-            f"{folder}: another run of mjfim writes into this folder ({lock.holder()}); wait for "
-            "its end, or choose another folder with -o"
-        )
     try:
-        with guarded_by(guard):
-            yield
+        with locked(folder / FOLDER_LOCK) as is_mine:
+            if not is_mine:
+                raise OutputError(
+                    f"{folder}: another run of mjfim writes into this folder "
+                    f"({holder(folder / FOLDER_LOCK)}); wait for its end, or choose another folder "
+                    "with -o"
+                )
+            with guarded_by(guard):
+                yield
     finally:
-        lock.release()
         with suppress(OSError):
             for place in new:
                 place.rmdir()
 
 
-class FileLock:
-    """A lock on a file, which ends with the process that holds it.
+@contextmanager
+def locked(path: Path, patience: float = 0.0) -> Iterator[bool]:
+    """Lock a file for this process, and remove it at the end.
 
-    The operating system holds the lock. If the process is killed, its file remains and the next
+    The operating system holds the lock. If the process is killed, the file remains and the next
     process takes it over. The file says which process holds it since when.
+
+    Args:
+        path: The file.
+        patience: Time to wait while another process holds it [s].
+
+    Yields:
+        Whether this process holds the lock.
     """
-
-    def __init__(self, path: Path) -> None:
-        """Describe a lock on a file, whose folder must exist."""
-        self._path = path
-        self._handle: int | None = None
-
-    def acquire(self, patience: float = 0.0) -> bool:
-        """Take the lock; wait at most some seconds, and return whether this process holds it."""
-        end = time.monotonic() + patience
-        while not self._try_once():
-            if time.monotonic() >= end:
-                return False
-            time.sleep(INTERVAL)
-        return True
-
-    def holder(self) -> str:
-        """Describe the process that holds the lock, if its file can be read."""
-        try:
-            process, started = self._path.read_text(encoding="utf-8").split(maxsplit=1)
-            return f"process {int(process)}, since {started}"
-        except (OSError, ValueError):
-            return "another process"
-
-    def release(self) -> None:
-        """Give the lock back, and remove its file."""
-        if self._handle is None:
-            return
-        if sys.platform == "win32":
-            os.close(self._handle)  # an open file cannot be removed there
-        with suppress(OSError):
-            self._path.unlink()
-        if sys.platform != "win32":
-            os.close(self._handle)
-        self._handle = None
-
-    def _try_once(self) -> bool:
-        """Open and lock the file; return False if another process holds the lock."""
-        handle = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
-
-        # The last holder may have removed the file after it was opened here. Then a third process
-        # could make a new file and lock that one.
-        try:
-            is_mine = _is_lockable(handle) and os.path.samestat(os.fstat(handle), self._path.stat())
-        except FileNotFoundError:
-            is_mine = False
-        if not is_mine:
+    end = time.monotonic() + patience
+    handle = _lock(path)
+    while handle is None and time.monotonic() < end:
+        time.sleep(INTERVAL)
+        handle = _lock(path)
+    try:
+        yield handle is not None
+    finally:
+        if handle is not None:
+            with suppress(OSError):  # an open file stays on Windows
+                path.unlink()
             os.close(handle)
-            return False
 
-        started = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-        os.ftruncate(handle, 0)
-        os.write(handle, f"{os.getpid()} {started}".encode())
-        self._handle = handle
-        return True
+
+def holder(path: Path) -> str:
+    """Describe the process that holds the lock on a file, if the file can be read."""
+    try:
+        process, started = path.read_text(encoding="utf-8").split(maxsplit=1)
+        return f"process {int(process)}, since {started}"
+    except (OSError, ValueError):
+        return "another process"
+
+
+def _lock(path: Path) -> int | None:
+    """Open and lock a file; None if another process holds the lock."""
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+
+    # The last holder may have removed the file after it was opened here. Then a third process could
+    # make a new file and lock that one.
+    with suppress(FileNotFoundError):
+        if _is_lockable(handle) and os.path.samestat(os.fstat(handle), path.stat()):
+            started = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+            os.ftruncate(handle, 0)
+            os.write(handle, f"{os.getpid()} {started}".encode())
+            return handle
+    os.close(handle)
+    return None
 
 
 if sys.platform == "win32":

@@ -48,14 +48,9 @@ def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Pl
     rows = system.grid.substeps // steps
     held = np.repeat(trajectory.ctrl, rows, axis=0)
 
-    simulator = BatchSimulator(system.plant.simulator.model, substeps=steps)
-    model = system.plant.model(system.theta)
-    out = simulator.rollout([model], trajectory.state[:1], held[None])
-    if not out.finite[0]:
-        raise SimulationDivergedError("the designed control diverges when it is simulated again")
-
+    states = _rollout(system, trajectory.state[:1], held, steps)
     t = np.arange(len(held) + 1, dtype=np.float64) * (system.dt / rows)
-    return Playback(t=t, state=out.states[0], ctrl=held, gain=np.repeat(gain, rows, axis=0))
+    return Playback(t=t, state=states, ctrl=held, gain=np.repeat(gain, rows, axis=0))
 
 
 def design_columns(playback: Playback, system: System) -> dict[str, Array]:
@@ -69,20 +64,16 @@ def design_columns(playback: Playback, system: System) -> dict[str, Array]:
         playback: The design by periods of the controller, M of them.
         system: The system.
     """
-    M = len(playback.ctrl)
-    no_control = np.full((1, len(system.controls)), np.nan)
-    ctrl = np.concatenate([playback.ctrl, no_control])
-
-    gain = playback.gain.reshape(M, -1)
-    no_gain = np.full((1, gain.shape[1]), np.nan)
-    gain = np.concatenate([gain, no_gain])
+    rows = len(playback.ctrl)
+    held = np.concatenate([playback.ctrl, playback.gain.reshape(rows, -1)], axis=1)
+    held = np.concatenate([held, np.full((1, held.shape[1]), np.nan)])
+    controls = [f"ctrl:{name}" for name in system.controls]
+    gains = gain_names(system.model, system.controls)
 
     columns = {"t": playback.t}
     columns |= dict(zip(state_names(system.model), playback.state.T, strict=True))
-    columns |= {f"ctrl:{name}": ctrl[:, i] for i, name in enumerate(system.controls)}
-    columns |= dict(zip(gain_names(system.model, system.controls), gain.T, strict=True))
-    columns[f"note: {GAIN_NOTE}"] = np.zeros(M + 1)
-    return columns
+    columns |= dict(zip([*controls, *gains], held.T, strict=True))
+    return columns | {f"note: {GAIN_NOTE}": np.zeros(rows + 1)}
 
 
 def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
@@ -106,33 +97,28 @@ def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
     qpos, qvel, act = system.space.split(playback.state)
     rows = Trajectory(t=playback.t, qpos=qpos, qvel=qvel, act=act, ctrl=held)
 
-    qacc = _accelerations(playback, system)
     force = np.empty_like(qvel)
     for k, data in forward_samples(system.model_at(system.theta), rows, range(len(held))):
         force[k] = data.qfrc_actuator
 
-    names = [component.name for component in state_components(system.model)]
-    motion = np.concatenate([qpos, qvel], axis=1)
-    columns = {"t": playback.t}
-    columns |= dict(zip(names, motion.T, strict=True))
-    dofs = dof_names(system.model)
-    columns |= {f"qacc:{name}": qacc[:, i] for i, name in enumerate(dofs)}
-    columns |= {f"force:{name}": force[:, i] for i, name in enumerate(dofs)}
-    return columns
-
-
-def _accelerations(playback: Playback, system: System) -> Array:
-    """(M+1, nv) changes of the velocity over an engine step, divided by the timestep.
-
-    Those of the M periods belong to the first engine step of the period, the last one to the last
-    engine step of the last period.
-    """
+    # The changes of the velocity over single engine steps.
     steps = system.stated_grid.playback_steps
-    held = np.repeat(playback.ctrl, steps, axis=0)
-    simulator = BatchSimulator(system.plant.simulator.model)
-    model = system.plant.model(system.theta)
-    out = simulator.rollout([model], playback.state[:1], held[None])
+    states = _rollout(system, playback.state[:1], np.repeat(playback.ctrl, steps, axis=0), 1)
+    change = np.diff(system.space.split(states)[1], axis=0) / float(system.model.opt.timestep)
+    qacc = np.concatenate([change[::steps], change[-1:]])
 
-    _, velocity, _ = system.space.split(out.states[0])
-    change = np.diff(velocity, axis=0) / float(model.opt.timestep)
-    return np.concatenate([change[::steps], change[-1:]])
+    names = [component.name for component in state_components(system.model)]
+    dofs = dof_names(system.model)
+    columns = {"t": playback.t}
+    columns |= dict(zip(names, np.concatenate([qpos, qvel], axis=1).T, strict=True))
+    columns |= {f"qacc:{name}": qacc[:, i] for i, name in enumerate(dofs)}
+    return columns | {f"force:{name}": force[:, i] for i, name in enumerate(dofs)}
+
+
+def _rollout(system: System, start: Array, ctrl: Array, steps: int) -> Array:
+    """(M+1, nq+nv+na) states of the design's model under controls (M, nu) of some engine steps."""
+    simulator = BatchSimulator(system.plant.simulator.model, substeps=steps)
+    out = simulator.rollout([system.plant.model(system.theta)], start, ctrl[None])
+    if not out.finite[0]:
+        raise SimulationDivergedError("the designed control diverges when it is simulated again")
+    return np.asarray(out.states[0])

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mjfim.arrays import Array
 from mjfim.errors import ModelError
 from mjfim.experiment.system import System
 from mjfim.files import remove_earlier_result
@@ -16,14 +15,16 @@ from mjfim.identification.parameter_draws import complete_theta
 from mjfim.output.archive import write_table
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.models.mjcf import identified_files, write_identified
-from mjfim.records.estimate import Estimate, ParameterDraws
+from mjfim.records.estimate import Estimate
 
 # Table of the drawn robots, and folder of their models.
 SAMPLES_TABLE = "samples.csv"
 SAMPLES_FOLDER = "samples"
 
-# Names of all files that an earlier run has written into the folder.
-SAMPLE_NAMES = r"robot_\d+(_.*)?\.(xml|urdf)"
+# Name of the model of a robot without its ending, by its number from 1; and names of all files that
+# an earlier run has written into the folder.
+ROBOT = "robot_{:04d}"
+ROBOT_FILES = r"robot_\d+(_.*)?\.(xml|urdf)"
 
 
 def sample_files(folder: Path, count: int, model: Path) -> tuple[str, ...]:
@@ -37,17 +38,12 @@ def sample_files(folder: Path, count: int, model: Path) -> tuple[str, ...]:
     if not count:
         return ()
 
-    # The names of copies begin with the name of the robot, so that one robot shows all of them.
-    first = _model_name(0)
-    stem = Path(first).stem
-    others = identified_files(folder / SAMPLES_FOLDER / first, model)
-    endings = [name.removeprefix(stem) for name in (first, *others)]
-    names = [
-        f"{SAMPLES_FOLDER}/{Path(_model_name(i)).stem}{ending}"
-        for i in range(count)
-        for ending in endings
-    ]
-    return (SAMPLES_TABLE, *names)
+    # The names of all files begin with the name of the robot.
+    first = ROBOT.format(1)
+    others = identified_files(folder / SAMPLES_FOLDER / f"{first}.xml", model)
+    endings = [".xml", *(name.removeprefix(first) for name in others)]
+    robots = [f"{SAMPLES_FOLDER}/{ROBOT.format(i + 1)}" for i in range(count)]
+    return (SAMPLES_TABLE, *(f"{robot}{ending}" for robot in robots for ending in endings))
 
 
 def write_samples(folder: Path, estimate: Estimate, system: System) -> list[str]:
@@ -65,29 +61,26 @@ def write_samples(folder: Path, estimate: Estimate, system: System) -> list[str]
     """
     draws = estimate.draws
     assert draws is not None
-    write_table(folder / SAMPLES_TABLE, _columns(draws))
+    columns: dict[str, np.ndarray] = {"robot": np.arange(1, len(draws) + 1)}
+    for name, unit, values in zip(draws.parameters, draws.units, draws.values.T, strict=True):
+        columns[f"{name} [{unit}]" if unit else name] = values
+    write_table(folder / SAMPLES_TABLE, columns)
 
     # Robots differ in their numbers alone, so that a remark stands for all of them.
     remarks: Counter[str] = Counter()
     for i in range(len(draws)):
+        path = folder / SAMPLES_FOLDER / f"{ROBOT.format(i + 1)}.xml"
         try:
-            found = _write_robot(folder, i, system, complete_theta(system, estimate, draws, i))
+            found = write_identified(path, system, complete_theta(system, estimate, draws, i))
         except ModelError as error:
-            _clear_models(folder)
+            _clear_models(folder / SAMPLES_FOLDER)
             return [f"no models of drawn robots were written: {error}"]
-        remarks.update(found)
+        remarks.update(remark.replace(path.stem, "robot") for remark in found)
     return [
         f"{SAMPLES_FOLDER}/: {remark}"
         + (f" ({count} of {len(draws)} robots)" if count < len(draws) else "")
         for remark, count in remarks.items()
     ]
-
-
-def _write_robot(folder: Path, robot: int, system: System, theta: Array) -> list[str]:
-    """Write the models of one robot; return sentences that do not name it."""
-    path = folder / SAMPLES_FOLDER / _model_name(robot)
-    remarks = write_identified(path, system, theta)
-    return [remark.replace(path.stem, "robot") for remark in remarks]
 
 
 def clear_samples(folder: Path) -> None:
@@ -98,31 +91,16 @@ def clear_samples(folder: Path) -> None:
     """
     if (folder / SAMPLES_TABLE).is_file():
         remove_earlier_result(folder / SAMPLES_TABLE)
-    _clear_models(folder)
+    _clear_models(folder / SAMPLES_FOLDER)
 
 
-def _clear_models(folder: Path) -> None:
+def _clear_models(place: Path) -> None:
     """Remove the models of drawn robots, and their folder where nothing else is in it."""
-    place = folder / SAMPLES_FOLDER
     if not place.is_dir():
         return
-
     for stale in list(place.iterdir()):
-        if re.fullmatch(SAMPLE_NAMES, stale.name):
+        if re.fullmatch(ROBOT_FILES, stale.name):
             remove_earlier_result(stale)
     if {file.name for file in place.iterdir()} <= {MANIFEST}:
         (place / MANIFEST).unlink(missing_ok=True)
         place.rmdir()
-
-
-def _model_name(robot: int) -> str:
-    """Name of the model of a robot, by its index."""
-    return f"robot_{robot + 1:04d}.xml"
-
-
-def _columns(draws: ParameterDraws) -> dict[str, np.ndarray]:
-    """Columns of the table: the number of the robot, and every parameter with its unit."""
-    columns: dict[str, np.ndarray] = {"robot": np.arange(1, len(draws) + 1)}
-    for j, (name, unit) in enumerate(zip(draws.parameters, draws.units, strict=True)):
-        columns[f"{name} [{unit}]" if unit else name] = draws.values[:, j]
-    return columns

@@ -11,7 +11,7 @@ import pytest
 
 from mjfim.errors import OutputError
 from mjfim.output import folders
-from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, FileLock, OutputGuard, claimed
+from mjfim.output.manifest import FOLDER_LOCK, MANIFEST, OutputGuard, claimed, locked
 from tests.support.cli import misused, names, run, write_experiment
 from tests.support.paths import SCRIPTS
 
@@ -110,11 +110,9 @@ def test_a_folder_of_an_older_version_is_kept(
 
 def test_a_second_run_does_not_enter_the_folder_of_the_first(study: Path, tmp_path: Path) -> None:
     """Exit code 2; the message names the folder and the process."""
-    lock = FileLock(tmp_path / FOLDER_LOCK)
-    assert lock.acquire()
-    result = run("design", study, "-o", tmp_path)
+    with locked(tmp_path / FOLDER_LOCK):
+        result = run("design", study, "-o", tmp_path)
     misused(result, f"{tmp_path}: another run of mjfim writes", f"process {os.getpid()}, since")
-    lock.release()
     assert names(tmp_path) == set()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from mjfim.errors import ModelWarning
-from mjfim.model.loading import ModelSource, load_written_model
+from mjfim.model.loading import ModelSource
 from tests.support.cli import run
 
 # MuJoCo says of both attributes that a later version will not have them.
@@ -57,7 +57,7 @@ def told(path: Path) -> list[Any]:
 def test_what_is_deprecated_but_holds_is_not_told(tmp_path: Path, capfd: Any) -> None:
     path = file(tmp_path, "old.xml", DEPRECATED)
     assert told(path) == []
-    assert load_written_model(path).body_mass[1] == pytest.approx(2.0)
+    assert ModelSource(path).model.body_mass[1] == pytest.approx(2.0)
     assert capfd.readouterr() == ("", "")
 
 

@@ -29,7 +29,6 @@ from mjfim.output import archive
 from mjfim.recordings import read as logs
 from mjfim.records.design import MAX_MOTIONS, MOTION_SAMPLES, Design
 from mjfim.records.trajectory import Recording
-from mjfim.studies.monte_carlo import monte_carlo_system
 from tests.support.paths import MODELS
 
 Array = NDArray[np.float64]
@@ -119,14 +118,11 @@ def test_npz_holds_the_documented_arrays(folder: Path, design: Design) -> None:
 def test_npz_round_trip(folder: Path, design: Design) -> None:
     """Every number is read back exactly."""
     named = archive.read_design(folder / "design.npz")
-    assert set(named) == {"initial", "final"}
-    for name, evaluation in (("initial", design.initial), ("final", design.final)):
+    stated = {"initial": design.initial.trajectory, "final": design.trajectory}
+    assert named.keys() == stated.keys()
+    for name, curve in stated.items():
         for key in ("t", "qpos", "qvel", "act", "ctrl"):
-            assert np.array_equal(getattr(named[name], key), getattr(evaluation.trajectory, key)), (
-                name,
-                key,
-            )
-    assert np.abs(named["final"].ctrl - named["initial"].ctrl).max() > 1e-3
+            assert np.array_equal(getattr(named[name], key), getattr(curve, key)), (name, key)
 
 
 def test_json_holds_the_documented_keys(folder: Path, design: Design) -> None:
@@ -203,7 +199,7 @@ def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
     with (folder / "design.csv").open(newline="", encoding="utf-8") as stream:
         (*header, note), *rows = csv.reader(stream)
     states = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
-    assert note.startswith("note: gains are for")
+    assert note.startswith("note: gains are for") and "Use them where" in note
     assert header == ["t", *states, "ctrl:force", *(f"gain:force:{name}" for name in states)]
     assert len(rows) == N + 1
     assert rows[-1][5] == ""
@@ -517,13 +513,3 @@ def test_estimate_summary(task: DesignTask, recording: Recording) -> None:
     assert data["misfit"] is False
     assert (data["parameters"], data["units"]) == (["m", "l", "c"], list(task.system.units))
     assert data["prior"] == np.zeros((P, P)).tolist()
-
-
-@pytest.mark.slow
-def test_study_summary(task: DesignTask, design: Design) -> None:
-    """montecarlo.json has the documented keys for each trajectory."""
-    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    data = strict_json(as_json(monte_carlo_system(task.system, curves, trials=4).summary()))
-    for name in curves:
-        assert {"mean", "covariance", "crlb", "efficiency", "trials", "failed"} <= set(data[name])
-        assert (data[name]["trials"], np.array(data[name]["crlb"]).shape) == (4, (P, P))

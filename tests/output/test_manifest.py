@@ -13,9 +13,10 @@ from mjfim.files import remove_earlier_result, replacing
 from mjfim.output.manifest import (
     FOLDER_LOCK,
     MANIFEST,
-    FileLock,
     OutputGuard,
     claimed,
+    holder,
+    locked,
 )
 
 
@@ -169,24 +170,17 @@ def test_a_second_run_is_kept_out_of_a_folder(tmp_path: Path) -> None:
 
 def test_the_lock_of_a_killed_run_is_taken_over(tmp_path: Path) -> None:
     """Its file remains, but the operating system has given the lock back."""
-    (tmp_path / FOLDER_LOCK).write_text("1 2026-01-01", encoding="utf-8")
-    lock = FileLock(tmp_path / FOLDER_LOCK)
-    assert lock.acquire()
-    assert lock.holder().startswith(f"process {os.getpid()}, since ")
-    lock.release()
+    lock = tmp_path / FOLDER_LOCK
+    lock.write_text("1 2026-01-01", encoding="utf-8")
+    with locked(lock) as is_mine:
+        assert is_mine
+        assert holder(lock).startswith(f"process {os.getpid()}, since ")
+        with locked(lock, patience=0.05) as is_mine_too:
+            assert not is_mine_too
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_lock_file_without_a_holder_is_described(tmp_path: Path) -> None:
     for text in ("", "1", "who knows"):
         (tmp_path / "lock").write_text(text, encoding="utf-8")
-        assert FileLock(tmp_path / "lock").holder() == "another process"
-
-
-def test_two_holders_take_turns(tmp_path: Path) -> None:
-    first, second = FileLock(tmp_path / "lock"), FileLock(tmp_path / "lock")
-    assert first.acquire()
-    assert not second.acquire(patience=0.05)
-    first.release()
-    assert second.acquire()
-    second.release()
+        assert holder(tmp_path / "lock") == "another process"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.errors import ExperimentError, RecordingError
+from mjfim.errors import ExperimentError
 from mjfim.experiment import System
 from mjfim.output import archive
 from mjfim.output.robots.ros2 import yaml_number
@@ -166,12 +166,3 @@ def test_a_robot_without_driven_joints_has_no_joint_trajectory(tmp_path: Path) -
     quadrotor = designed("quadrotor", horizon=0.3)
     with pytest.raises(ExperimentError, match="slides and hinges on which actuators act"):
         mjfim.export_design(*quadrotor, tmp_path / "out.yaml", to="ros2")
-
-
-def test_a_design_of_another_model_is_refused(
-    cart: Designed,
-    arm: Designed,
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(RecordingError, match="the design: made for"):
-        mjfim.export_design(cart[0], arm[1], tmp_path / "out.yaml", to="ros2")

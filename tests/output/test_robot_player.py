@@ -16,10 +16,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation.task import DesignTask
 from mjfim.experiment import System
-from mjfim.output import archive
-from mjfim.output.playback import GAIN_NOTE
 from mjfim.output.robots.plan import RobotPlan
 from mjfim.output.robots.player_script import write_player
 from mjfim.recordings import read_recording
@@ -155,7 +152,7 @@ def test_rotations_are_subtracted_as_mujoco_does(tmp_path: Path) -> None:
     model, rng = task.system.model, np.random.default_rng(1)
     for planned in player.X:
         state = planned + 0.5 * rng.standard_normal(len(planned))
-        for q, _ in player.QUATERNIONS:
+        for q, _ in player.DESIGN["quaternions"]:
             state[q : q + 4] /= np.linalg.norm(state[q : q + 4])
         wanted = np.zeros(model.nv)
         mujoco.mj_differentiatePos(model, wanted, 1.0, state[: model.nq], planned[: model.nq])
@@ -221,7 +218,7 @@ def test_the_player_runs_as_a_program(script: Path, tmp_path: Path) -> None:
     python = (sys.executable, str(script))
     said = subprocess.run(python, capture_output=True, text=True, check=True).stdout
     assert "4 s, 400 rows at 100 Hz" in said and "Use them where small errors grow" in said
-    assert "limits of force: [-20.0] to [20.0]" in said
+    assert "limits of force: [-20.] to [20.]" in said
 
     robot = tmp_path / "my_robot.py"
     robot.write_text("def read_state():\n    return {}\n\nsend_control = print\n", "utf-8")
@@ -246,18 +243,6 @@ def test_servos_hold_their_last_command(arm: Designed, tmp_path: Path) -> None:
     mjfim.export_design(*arm, tmp_path / "play.py", to="player")
     player = imported(tmp_path / "play.py")
     assert np.isnan(player.SAFE).all() and player.LOWER[0] == -2.6
-
-
-def test_the_header_of_the_design_says_when_to_use_the_gains(
-    cart: Designed, tmp_path: Path
-) -> None:
-    """Readers of columns are not disturbed: the note is the name of a last column of zeros."""
-    archive.write_design(tmp_path, cart[1], System.resolve(cart[0]))
-    lines = (tmp_path / "design.csv").read_text(encoding="utf-8").splitlines()
-    assert lines[0].split(",")[-1] == f'"note: {GAIN_NOTE}"' and "Use them where" in lines[0]
-    assert {line.split(",")[-1] for line in lines[1:]} == {"0"}
-    again = cart[0].replace(initial={"control": str(tmp_path / "design.csv")})
-    np.testing.assert_array_equal(DesignTask.resolve(again).initial.ctrl, cart[1].trajectory.ctrl)
 
 
 def test_the_verb_writes_the_player(cart: Designed, tmp_path: Path) -> None:

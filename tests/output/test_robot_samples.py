@@ -24,10 +24,11 @@ from mjfim.records.estimate import Estimate, PriorDirections
 from tests.identification.test_parameter_draws import COVARIANCE, estimated
 from tests.support.paths import MODELS
 
-# A robot whose link stands in an included file.
+# A robot of which one link stands in an included file, and one in a URDF.
 MAIN = """
 <mujoco>
-  <worldbody><include file="link.xml"/></worldbody>
+  <asset><model name="arm" file="arm.urdf"/></asset>
+  <worldbody><include file="link.xml"/><attach model="arm" prefix="x_"/></worldbody>
   <actuator><motor name="drive" joint="hinge"/></actuator>
 </mujoco>
 """
@@ -38,6 +39,14 @@ LINK = """
     <inertial pos="0 0 -0.3" mass="1" diaginertia="0.01 0.01 0.001"/>
   </body>
 </mujocoinclude>
+"""
+ARM = """<robot name="arm">
+  <link name="base"/>
+  <link name="upper">
+    <inertial><mass value="2"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+  </link>
+  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/></joint>
+</robot>
 """
 
 
@@ -77,26 +86,30 @@ def test_every_model_is_the_one_in_memory(system: System, tmp_path: Path) -> Non
     np.testing.assert_array_equal(table, estimate.draws.values)
 
 
-def test_included_files_are_written_for_each_robot(tmp_path: Path) -> None:
-    (tmp_path / "main.xml").write_text(MAIN, encoding="utf-8")
-    (tmp_path / "link.xml").write_text(LINK, encoding="utf-8")
+def test_included_files_and_urdfs_are_written_for_each_robot(tmp_path: Path) -> None:
+    for name, text in {"main.xml": MAIN, "link.xml": LINK, "arm.urdf": ARM}.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
     tables: dict[str, Any] = {
         "model": "main.xml",
         "directory": tmp_path,
         "rate": 100.0,
         "noise": {"state": 0.01},
-        "parameters": {"mass": {"target": "body/link:mass"}},
+        "parameters": {
+            "mass": {"target": "body/link:mass"},
+            "other": {"target": "body/x_upper:mass"},
+        },
     }
     system = System.resolve(mjfim.Experiment(**tables))
-    estimate = drawn(system, [[1e-4]], 3)
+    estimate = drawn(system, np.diag([1e-4, 1e-4]), 3)
     out = tmp_path / "out"
-    write_samples(out, estimate, system)
+    assert write_samples(out, estimate, system) == []
     assert estimate.draws is not None
     found = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
     assert found == set(sample_files(out, 3, system.model_path))
     for i in range(3):
         model = mujoco.MjModel.from_xml_path(str(out / "samples" / f"robot_{i + 1:04d}.xml"))
-        assert model.body("link").mass[0] == estimate.draws.values[i, 0]
+        masses = [model.body(name).mass[0] for name in ("link", "x_upper")]
+        assert masses == estimate.draws.values[i].tolist()
 
 
 def test_without_robots_there_are_no_files(system: System, tmp_path: Path) -> None:

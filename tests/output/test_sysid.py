@@ -57,18 +57,11 @@ def residual(problem: SysidProblem, theta: Array) -> Array:
 @installed
 @pytest.mark.parametrize("noise", [{"state": 0.05}, UNEQUAL, SENSED])
 def test_sysid_recovers_the_truth_without_lag(noise: dict[str, float]) -> None:
-    """Also where its own residuals show the lag of its sensors."""
     task = cart(noise=noise)
     problem = sysid_problem(task.system, [noiseless(task)])
     with silenced():
         fit, _ = sysid.optimize(problem.parameters, problem.residual, verbose=False)
     np.testing.assert_allclose(fit.as_vector(), task.parameters.true, rtol=1e-6)
-
-    own = sysid.build_residual_fn(
-        models_sequences=[problem.sequences], build_model=problem.build_model
-    )
-    theirs = np.concatenate(own(task.parameters.true, fit)[0])
-    assert (np.abs(theirs).max() > 1e-3) == (noise is SENSED)
 
 
 @installed

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,7 @@ from mjfim.experiment.system import System
 from mjfim.model.urdf_sources import urdf_sources
 from mjfim.output.manifest import MANIFEST
 from mjfim.output.models.mjcf import identified_files, same_dynamics, write_identified
-from mjfim.output.robot_samples import sample_files, write_samples
 from tests.output.test_mjcf import changes
-from tests.output.test_robot_samples import drawn
 from tests.support.cli import names, run
 from tests.support.numerics import Array
 
@@ -337,24 +334,6 @@ def test_meshes_are_found_from_another_folder(
     assert written(out, system, np.array([2.0])) == []
     assert said in (out / "identified.urdf").read_text(encoding="utf-8")
     assert mujoco.MjModel.from_xml_path(str(out / "identified.urdf")).nmesh == 1
-
-
-def test_drawn_robots_are_urdfs_as_well(tmp_path: Path) -> None:
-    system = system_of(tmp_path, "driven.xml")
-    estimate = drawn(system, np.diag((1e-3 * system.parameters.magnitude) ** 2), 3)
-    estimate = replace(estimate, theta=other_values(system))
-    out = tmp_path / "out"
-    assert write_samples(out, estimate, system) == []
-    found = {path.relative_to(out).as_posix() for path in out.rglob("*.*")}
-    assert found == set(sample_files(out, 3, system.model_path))
-    assert "samples/robot_0002.urdf" in found
-    assert estimate.draws is not None
-    for i in range(3):
-        file = out / "samples" / f"robot_{i + 1:04d}.xml"
-        assert f'file="robot_{i + 1:04d}.urdf"' in file.read_text(encoding="utf-8")
-        model = mujoco.MjModel.from_xml_path(str(file))
-        j = estimate.draws.parameters.index("upper_mass")
-        assert model.body("upper").mass[0] == estimate.draws.values[i, j]
 
 
 @pytest.mark.parametrize(

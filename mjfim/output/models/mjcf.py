@@ -16,7 +16,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ModelError, first_ones, listed
 from mjfim.experiment.system import System
 from mjfim.model.control_laws import remove_numbers
-from mjfim.model.loading import ModelSource, compile_spec, load_written_model
+from mjfim.model.loading import ModelSource, compile_spec
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS
 from mjfim.model.targets import OutputBiasField, OutputDelayField, OutputScaleField, SpecField
@@ -28,6 +28,7 @@ from mjfim.output.models.model_xml import (
     add_element,
     all_digits,
     child,
+    loading,
 )
 from mjfim.output.models.urdf import urdf_files, write_identified_urdfs
 
@@ -50,6 +51,9 @@ NOT_COMPARED = (
 # one of its array. MuJoCo prints six digits.
 TOLERANCE, ROUNDING = 1e-9, 1e-12
 PRINTED_TOLERANCE = 1e-4
+
+# Errors of sensors, which no element can state.
+OF_SENSORS = (OutputBiasField, OutputScaleField, OutputDelayField)
 
 # Longest list of actuators in a remark [characters].
 REMARK_TEXT = 120
@@ -131,12 +135,9 @@ def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) 
         _extend_keyframes(xml, source)
 
     xml.attach(urdfs)
-    has_masses = _state_masses_of_geoms(xml, system.parameters, theta)
-    compiled = xml.compiled() if urdfs or has_masses else (source.spec, source.model)
+    is_changed = _state_others(xml, system.parameters, theta) or urdfs
+    compiled = xml.compiled() if is_changed else (source.spec, source.model)
     state_differences(xml, compiled, wanted)
-    outside = _errors_of_sensors(system.parameters, theta)
-    if outside:
-        add_comment(xml.root, f"not part of an MJCF: {', '.join(outside)}", first=True)
     return xml
 
 
@@ -162,11 +163,8 @@ def _save(xml: ModelXml, path: Path, wanted: Any, tolerance: float) -> None:
 
     def check(written: Path) -> None:
         """Raise ModelError if the file gives another model."""
-        try:
-            found = load_written_model(written)
-        except (ValueError, mujoco.FatalError) as error:
-            reason = " ".join(str(error).split())
-            raise ModelError(f"MuJoCo does not load the text ({reason})") from None
+        with loading("MuJoCo does not load the text"):
+            found = mujoco.MjModel.from_xml_path(str(written))
         different = _differences(found, wanted, tolerance)
         if different:
             raise ModelError(
@@ -202,30 +200,25 @@ def _is_equal(x: Any, y: Any, tolerance: float) -> bool:
     return bool(np.isclose(x, y, rtol=tolerance, atol=rounding).all())
 
 
-def _state_masses_of_geoms(xml: ModelXml, parameters: ParameterSet, theta: Array) -> bool:
-    """State masses and densities of geoms, which MjModel does not keep; whether there are any."""
+def _state_others(xml: ModelXml, parameters: ParameterSet, theta: Array) -> bool:
+    """State what MjModel does not keep: masses of geoms, and errors of sensors in a comment.
+
+    Returns whether the model may have changed.
+    """
     has_masses = False
+    errors = []
     for parameter, value in zip(parameters.parameters, theta, strict=True):
         for target in parameter.targets:
-            field = target.field
+            field, number = target.field, target.scale * float(value) + target.offset
             if isinstance(field, SpecField) and field.field in ("mass", "density"):
-                element = xml.named(field.kind, field.name)
-                element.set(field.field, all_digits(target.scale * float(value) + target.offset))
+                xml.named(field.kind, field.name).set(field.field, all_digits(number))
                 has_masses = True
-    return has_masses
-
-
-def _errors_of_sensors(parameters: ParameterSet, theta: Array) -> list[str]:
-    """Values of biases, scales and delays that are not zero, which no element can state."""
-    kinds = (OutputBiasField, OutputScaleField, OutputDelayField)
-    found = []
-    for parameter, value in zip(parameters.parameters, theta, strict=True):
-        for target in parameter.targets:
-            written = target.scale * float(value) + target.offset
-            if isinstance(target.field, kinds) and written != 0.0:
+            elif isinstance(field, OF_SENSORS) and number != 0.0:
                 unit = parameter.unit if target.scale == 1.0 else ""
-                found.append(f"{target.path} = {all_digits(written)} {unit}".rstrip())
-    return found
+                errors.append(f"{target.path} = {all_digits(number)} {unit}".rstrip())
+    if errors:
+        add_comment(xml.root, f"not part of an MJCF: {', '.join(errors)}", first=True)
+    return has_masses
 
 
 # ---- physical terms

@@ -5,8 +5,10 @@ Comments, the order of elements and attributes, and the spelling of other number
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,9 +53,6 @@ ROUNDING = 1e-12
 
 # What some editors of Windows put before a text in UTF-8.
 BYTE_ORDER_MARK = "\ufeff".encode()
-
-# Indentation of a child.
-STEP = "  "
 
 # Attributes of an element that has none.
 NO_ATTRIBUTES: Mapping[str, str] = MappingProxyType({})
@@ -163,15 +162,9 @@ class ModelXml:
             parent[place : place + 1] = list(include)
 
         text = etree.tostring(root, encoding="unicode")
-        try:
-            with collected_warnings():
-                spec = mujoco.MjSpec.from_string(text)
-                return spec, spec.compile()
-        except (ValueError, mujoco.FatalError) as error:
-            reason = " ".join(str(error).split())
-            raise ModelError(
-                f"MuJoCo does not load the text with the identified values ({reason})"
-            ) from None
+        with loading("MuJoCo does not load the text with the identified values"):
+            spec = mujoco.MjSpec.from_string(text)
+            return spec, spec.compile()
 
     def save(self, path: Path, check: Callable[[Path], None]) -> None:
         """Write the model for the folder of a new file; afterwards it cannot be edited.
@@ -211,26 +204,20 @@ class ModelXml:
             raise
 
     def copies(self, path: Path) -> list[str]:
-        """Names that copies of the included files have beside a new main file.
-
-        A copy is called after both files. Files of the model keep their names in its folder.
+        """Names that copies of the included files have beside a new main file, after both files.
 
         Args:
             path: The new main file.
         """
         folder = path.resolve().parent
         files = (self._main, *self._included)
-        taken = {file.path.name.lower() for file in files if file.path.parent == folder}
-        taken.add(path.name.lower())
-        names = []
+        taken = {path.name, *(file.path.name for file in files if file.path.parent == folder)}
+        names: list[str] = []
         for file in self._included:
             stem = f"{path.stem}_{file.path.stem.removeprefix(f'{path.stem}_')}"
-            name, number = f"{stem}{file.path.suffix}", 1
-            while name.lower() in taken:
-                number += 1
-                name = f"{stem}_{number}{file.path.suffix}"
-            taken.add(name.lower())
-            names.append(name)
+            numbered = (f"{stem}_{k}{file.path.suffix}" for k in itertools.count(2))
+            candidates = itertools.chain([f"{stem}{file.path.suffix}"], numbered)
+            names.append(next(name for name in candidates if name not in {*taken, *names}))
         return names
 
     # ---- names of files
@@ -282,6 +269,16 @@ class ModelXml:
         compiler = child(parent, "compiler")
         compiler.set("assetdir", str(self._main.path.parent))
         self._main.references.append((compiler, "assetdir", ""))
+
+
+@contextmanager
+def loading(fault: str) -> Iterator[None]:
+    """Raise ModelError with a fault and MuJoCo's reason where it refuses a model; no warnings."""
+    try:
+        with collected_warnings():
+            yield
+    except (ValueError, mujoco.FatalError) as error:
+        raise ModelError(f"{fault} ({' '.join(str(error).split())})") from None
 
 
 # ---- elements
@@ -338,18 +335,9 @@ def add_comment(parent: Any, comment: str, *, first: bool = False) -> None:
 
 def _insert(parent: Any, added: Any, place: int) -> None:
     """Add a node as the first or the last child, on a line of its own where others are."""
-    if not len(parent):
-        before = parent.getprevious()
-        around = parent.getparent().text if before is None else before.tail
-        line_break = "\n" + (around or "").rpartition("\n")[2] if "\n" in (around or "") else ""
-        parent.text = line_break and f"{line_break}{STEP}"
-        added.tail = line_break
-    elif place == 0:
-        added.tail = parent.text
-    else:
-        added.tail = parent[-1].tail
-        parent[-1].tail = parent.text
-    tail = added.tail
+    tail = parent.text
+    if place > 0:
+        tail, parent[-1].tail = parent[-1].tail, parent.text
     parent.insert(place, added)
     added.tail = tail
 

@@ -1,9 +1,9 @@
 """An experiment and its recordings in the types of `mujoco.sysid`, MuJoCo's own toolbox for fits.
 
 sysid gives the sensor values of a step the time after the step, although they belong to the state
-before it; states are not delayed. Therefore positions and velocities become state signals, and
-sensors are read one step earlier. sysid divides residuals by the norm of each measured signal,
-whatever its noise; here they are also whitened by the stated noise.
+before it, and divides residuals by the norm of each measured signal, whatever its noise. Here the
+outputs are signals of their own, sensors are read at their time, and residuals are whitened by the
+stated noise.
 """
 
 from __future__ import annotations
@@ -32,9 +32,6 @@ UNSTATED_BOUND = 1e3
 
 # Largest distance of a time from an engine step at which it counts as on that step [engine steps].
 ON_STEP = 1e-6
-
-# Names that sysid gives to the state of joints without a name.
-UNNAMED_SIGNALS = ("_qpos", "_qvel")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,23 +75,15 @@ def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProbl
     if not hasattr(sysid, "ModelSequences"):
         raise MjfimError("mujoco.sysid is not installed; pip install 'mjfim[sysid]'")
     _check_expressible(system)
-    signals, places = _signals(system)
-    columns = [place for _, group in signals.values() for place in group]
     mapping = {
-        name: (kind, np.array([columns.index(place) for place in group]))
-        for name, (kind, group) in signals.items()
+        name: (sysid.SignalType.CustomObs, np.array([i]))
+        for i, name in enumerate(system.outputs.names)
     }
-
     aligned = [align(system, recording) for recording in recordings]
     qpos, qvel, act = system.space.split(system.plant.initial_state(system.parameters.guess))
     start = sysid.create_initial_state(system.model, qpos, qvel, act)
-    measured = []
-    for recording in aligned:
-        data = np.full((len(recording.t), len(columns)), np.nan)
-        data[:, [columns.index(place) for place in places]] = recording.y
-        measured.append(sysid.TimeSeries(np.array(recording.t), data, mapping))
 
-    # sysid warns, because it counts state signals among the sensors.
+    # sysid warns, because it expects the sensors of the model.
     with silenced():
         sequences = sysid.ModelSequences(
             system.model_path.stem,
@@ -102,7 +91,7 @@ def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProbl
             [recording.name for recording in aligned],
             [start] * len(aligned),
             [_control(system, recording) for recording in aligned],
-            measured,
+            [sysid.TimeSeries(np.array(each.t), each.y, mapping) for each in aligned],
             allow_missing_sensors=True,
         )
 
@@ -117,7 +106,7 @@ def sysid_problem(system: System, recordings: Sequence[Recording]) -> SysidProbl
         residual=sysid.build_residual_fn(
             models_sequences=[sequences],
             build_model=build_model,
-            modify_residual=_whitened(system, columns, places),
+            modify_residual=_whitened(system),
             resample_true=False,
         ),
     )
@@ -134,35 +123,6 @@ def silenced() -> Iterator[None]:
             yield
     finally:
         logger.setLevel(before)
-
-
-# Whether a value is that of a sensor, and its index in sensordata or in the state.
-Place = tuple[bool, int]
-
-
-def _signals(system: System) -> tuple[dict[str, tuple[Any, list[Place]]], list[Place]]:
-    """The whole signals of sysid that have measured components, and the place of each output."""
-    qpos, qvel, act, _ = sysid.TimeSeries.compute_all_state_mappings(system.model)
-    sensors = sysid.TimeSeries.compute_all_sensor_mapping(system.model)
-    known = [(False, name, each) for name, each in {**qpos, **qvel, **act}.items()]
-    known += [(True, name, each) for name, each in sensors.items()]
-
-    found: dict[str, tuple[Any, list[Place]]] = {}
-    places: list[Place] = []
-    for output in system.outputs.outputs:
-        sensed = output.sensor is not None
-        index = output.sensor if sensed else output.state
-        for of_sensor, name, (kind, indices) in known:
-            if of_sensor == sensed and index in indices and name not in UNNAMED_SIGNALS:
-                found[name] = kind, [(sensed, int(each)) for each in indices]
-                places.append((sensed, int(index or 0)))
-                break
-        else:
-            raise ExperimentError(
-                f"output {output.name!r}: sysid finds signals by name; name the joint and the body "
-                "in the MJCF"
-            )
-    return found, places
 
 
 def _control(system: System, recording: AlignedRecording) -> Any:
@@ -210,17 +170,8 @@ def _check_expressible(system: System) -> None:
         raise ExperimentError(f"{experiment.source}: {fault}")
 
 
-def _whitened(
-    system: System, columns: Sequence[Place], places: Sequence[Place]
-) -> Callable[..., Any]:
-    """The `modify_residual` of sysid that gives all residuals in units of their noise.
-
-    Args:
-        system: The experiment.
-        columns: Place of each column of a measured TimeSeries.
-        places: Place of each of the ny outputs.
-    """
-    chosen = [columns.index(place) for place in places]
+def _whitened(system: System) -> Callable[..., Any]:
+    """The `modify_residual` of sysid that gives all residuals in units of their noise."""
 
     def modify(
         _: Any, predicted: Any, measured: Any, model: Any, __: bool, state: Array, **___: Any
@@ -231,17 +182,18 @@ def _whitened(
         column) is after the first engine step.
         """
         after_start = measured.times > 0.0
-        t, data = measured.times[after_start], measured.data[after_start]
+        t, y = measured.times[after_start], measured.data[after_start]
         steps = t / float(model.opt.timestep)
-        found = np.empty_like(data)
-        for i, (is_sensed, index) in enumerate(columns):
-            values = predicted.data[:, index] if is_sensed else state[:, 1 + index]
-            found[:, i] = _at_rows(values, steps - (0 if is_sensed else 1))
+        found = np.empty_like(y)
+        for i, output in enumerate(system.outputs.outputs):
+            if output.sensor is not None:
+                found[:, i] = _at_rows(predicted.data[:, output.sensor], steps)
+            else:
+                found[:, i] = _at_rows(state[:, 1 + (output.state or 0)], steps - 1)
 
-        y = data[:, chosen]
         present = np.isfinite(y)
-        residual = np.where(present, y - found[:, chosen], 0.0)
-        pair = [sysid.TimeSeries(t, each, measured.signal_mapping) for each in (found, data)]
+        residual = np.where(present, y - found, 0.0)
+        pair = [sysid.TimeSeries(t, each, measured.signal_mapping) for each in (found, y)]
         return system.noise.whiten_present(residual, present), *pair
 
     return modify

@@ -11,7 +11,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, first_ones
@@ -26,7 +25,6 @@ from mjfim.model.inertia import (
     from_barycentric,
     to_barycentric,
 )
-from mjfim.model.mujoco_log import collected_warnings
 from mjfim.model.parameters import Parameter
 from mjfim.model.paths import INERTIAL_FIELDS, ParameterPath
 from mjfim.model.targets import (
@@ -39,9 +37,9 @@ from mjfim.model.urdf_sources import UrdfSource, urdf_sources
 from mjfim.output.models.model_xml import (
     ROUNDING,
     ModelXml,
-    all_digits,
     child,
     floats,
+    loading,
     nearly_equal,
     own_child,
     same_inertia,
@@ -68,9 +66,8 @@ UNCHANGED = (
 # Relative difference of an inertia that is the rounding of MuJoCo's compiler.
 TOLERANCE = 1e-9
 
-# Attributes of <inertia>, in the order of the entries of a matrix, and digits of the largest one.
+# Attributes of <inertia>, in the order of the entries of a matrix.
 ENTRIES = tuple("i" + "xyz"[row] + "xyz"[column] for row, column in INERTIA_ENTRIES)
-DIGITS = 15
 
 
 def urdf_files(path: Path, model: Path) -> tuple[str, ...]:
@@ -188,13 +185,10 @@ def _check(
 
 def _loaded(path: Path, fault: str) -> Any:
     """MjModel of a URDF in which every link is a body of its own, also where it is fixed."""
-    try:
-        with collected_warnings():
-            spec = mujoco.MjSpec.from_file(str(path))
-            spec.compiler.fusestatic = False
-            return spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise ModelError(f"{fault} ({' '.join(str(error).split())})") from None
+    with loading(fault):
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.fusestatic = False
+        return spec.compile()
 
 
 def _changed(link: str, own: BodyInertia, before: BodyInertia, after: BodyInertia) -> BodyInertia:
@@ -223,37 +217,34 @@ def _changed(link: str, own: BodyInertia, before: BodyInertia, after: BodyInerti
 
 
 def _state_inertia(link: Any, own: BodyInertia, new: BodyInertia) -> None:
-    """State an inertia in the axes in which the link states its present one."""
-    inertial = own_child(link, "inertial")
-    is_new = inertial is None
+    """State another inertia of a link; one with another matrix in the axes of the link."""
+    is_new = own_child(link, "inertial") is None
     inertial = child(link, "inertial")
     mass, origin, inertia = (child(inertial, tag) for tag in ("mass", "origin", "inertia"))
+    _state(mass, "value", new.mass)
+    _state(origin, "xyz", *new.com)
 
-    turn = Rotation.from_euler("xyz", floats(origin.get("rpy", "0 0 0"))).as_matrix()
-    old_mass, old_com = np.array([own.mass]), own.com
-    if is_new:
-        old_mass, old_com = np.full(1, np.nan), np.full(3, np.nan)
-    set_numbers(mass, "value", old_mass, np.array([new.mass]))
-    set_numbers(origin, "xyz", old_com, new.com, 3)
-
-    # The rounding errors of the rotation are not written.
-    trace = float(np.trace(new.inertia))
-    decimals = DIGITS - 1 - int(np.floor(np.log10(trace)))
-    for i, name in enumerate(ENTRIES):
-        entry = (turn.T @ new.inertia @ turn)[INERTIA_ROWS[i], INERTIA_COLUMNS[i]]
-        old_entry = float(inertia.get(name, "nan"))
-        if not abs(entry - old_entry) <= ROUNDING * trace:
-            inertia.set(name, all_digits(round(float(entry), decimals)))
+    rounding = ROUNDING * float(np.trace(new.inertia))
+    if is_new or not np.allclose(own.inertia, new.inertia, 0.0, rounding):
+        origin.attrib.pop("rpy", None)
+        for name, entry in zip(ENTRIES, new.inertia[INERTIA_ROWS, INERTIA_COLUMNS], strict=True):
+            _state(inertia, name, entry)
 
 
 def _state_friction(joint: Any, friction: Array) -> None:
-    """State viscous and dry friction of a joint where they differ from what it states."""
-    dynamics = own_child(joint, "dynamics")
-    for name, value in zip(("damping", "friction"), friction, strict=True):
-        old = 0.0 if dynamics is None else float(dynamics.get(name, "0"))
-        if not nearly_equal(np.array([old]), np.array([value])).all():
-            dynamics = child(joint, "dynamics")
-            dynamics.set(name, all_digits(value))
+    """State viscous and dry friction of a joint, which are 0 where it states none."""
+    if friction.any() or own_child(joint, "dynamics") is not None:
+        dynamics = child(joint, "dynamics")
+        for name, value in zip(("damping", "friction"), friction, strict=True):
+            if value != 0.0 or name in dynamics.attrib:
+                _state(dynamics, name, value)
+
+
+def _state(element: Any, attribute: str, *values: float) -> None:
+    """State numbers of an attribute; those that it states already keep their spelling."""
+    stated = floats(element.get(attribute, ""))
+    before = stated if len(stated) == len(values) else np.full(len(values), np.nan)
+    set_numbers(element, attribute, before, np.array(values), len(values))
 
 
 def _friction(model: Any, joint: str) -> Array | None:

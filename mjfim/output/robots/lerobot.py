@@ -97,6 +97,23 @@ def write_lerobot_dataset(folder: Path, plan: RobotPlan, unit: str = "rad") -> N
     columns = {name: values.astype(np.float32) for name, (_, values) in named.items()} | defaults
     stats = {name: _statistics(values) for name, values in columns.items()}
     task = f"mjfim design {plan.name}"
+    tasks = {"task_index": [0], TASK_INDEX: [task]}
+    _write_parquet(folder / DATA_FILE, {name: _column(each) for name, each in columns.items()})
+    _write_parquet(folder / EPISODES_FILE, _episode(task, rows, stats))
+    _write_parquet(folder / TASKS_FILE, tasks, {b"pandas": json.dumps(PANDAS).encode()})
+    write_json(folder / STATS_FILE, stats)
+
+    features: dict[str, Any] = {
+        key: {"dtype": "float32", "shape": [len(names)], "names": names}
+        for key, (names, _) in named.items()
+    }
+    for key, values in defaults.items():
+        features[key] = {"dtype": values.dtype.name, "shape": [1], "names": None}
+    write_json(folder / INFO_FILE, _info(plan.name, rows, fps, features))
+
+
+def _episode(task: str, rows: int, stats: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The table of episodes, with one row."""
     episode: dict[str, Any] = {
         "episode_index": [0],
         "tasks": [[task]],
@@ -110,16 +127,14 @@ def write_lerobot_dataset(folder: Path, plan: RobotPlan, unit: str = "rad") -> N
     }
     for name, numbers in stats.items():
         episode |= {f"stats/{name}/{key}": [value] for key, value in numbers.items()}
+    return episode
 
-    features: dict[str, Any] = {
-        key: {"dtype": "float32", "shape": [len(names)], "names": names}
-        for key, (names, _) in named.items()
-    }
-    for key, values in defaults.items():
-        features[key] = {"dtype": values.dtype.name, "shape": [1], "names": None}
-    info = {
+
+def _info(name: str, rows: int, fps: int, features: Mapping[str, Any]) -> dict[str, Any]:
+    """The contents of info.json."""
+    return {
         "codebase_version": "v3.0",
-        "robot_type": plan.name,
+        "robot_type": name,
         "total_episodes": 1,
         "total_frames": rows,
         "total_tasks": 1,
@@ -132,13 +147,6 @@ def write_lerobot_dataset(folder: Path, plan: RobotPlan, unit: str = "rad") -> N
         "video_path": None,
         "features": features,
     }
-
-    tasks = {"task_index": [0], TASK_INDEX: [task]}
-    _write_parquet(folder / DATA_FILE, {name: _column(each) for name, each in columns.items()})
-    _write_parquet(folder / EPISODES_FILE, episode)
-    _write_parquet(folder / TASKS_FILE, tasks, {b"pandas": json.dumps(PANDAS).encode()})
-    write_json(folder / STATS_FILE, stats)
-    write_json(folder / INFO_FILE, info)
 
 
 def _actions(plan: RobotPlan, factor: float) -> tuple[list[str], Array]:

@@ -7,18 +7,19 @@ functions of your robot into a file of yours, as in the class `Robot` below but 
     python play.py my_robot.py -o recording.csv   # plays it and records
     python play.py my_robot.py -o recording.csv --feedback
 
-With feedback the control is `u = u_ref + K (x_ref - x)`, otherwise `u = u_ref`; GAINS says when it
-helps. Each row is sent at its own time after the start; rows whose time has passed are left out.
+With feedback the control is `u = u_ref + K (x_ref - x)`, otherwise `u = u_ref`. Each row is sent at
+its own time after the start; rows whose time has passed are left out. The design is at the end.
 `mjfim identify EXPERIMENT recording.csv -o fit` reads the recording.
 """
 
 import csv
+import json
 import os
 import runpy
 import signal
 import sys
 import time
-from math import inf, nan  # noqa: F401  numbers of the design
+from math import nan
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,29 +27,6 @@ import numpy as np
 
 # Largest deviation from the start of the design, as a share of the range of each coordinate.
 START_TOLERANCE = 0.5
-
-# ---- the design, which `mjfim export` writes
-
-NAME, GAINS = "", ""
-STATE: list[str] = []  # names: nq positions, nv velocities, na activations
-CONTROLS: list[str] = []  # names of the nu controls
-SIZES = (0, 0)  # nq, nv
-SCALARS: list[tuple[int, int]] = []  # places in positions and velocities of slides and hinges
-QUATERNIONS: list[tuple[int, int]] = []  # and of rotations in space
-SIGMA: list[float] = []  # noise of the measured state
-LOWER: list[float] = []  # limits of the controls
-UPPER: list[float] = []
-SAFE: list[float] = []  # controls at the end; nan keeps the last one
-ROWS = "0"  # design.csv: time, state, controls, gains; the last row has no control
-
-# ---- end of the design
-
-T, X, U, K = np.split(
-    np.genfromtxt(ROWS.split("\n"), delimiter=",", ndmin=2),
-    np.cumsum([1, len(STATE), len(CONTROLS)]),
-    axis=1,
-)
-COUNT, END = len(T) - 1, float(T[-1, 0])
 
 
 class Robot:
@@ -114,9 +92,9 @@ def measured(robot: Any) -> dict[str, float]:
 
 def check_start(found: dict[str, float]) -> None:
     """Refuse to begin where the robot is far from the start of the design."""
-    for q, _ in SCALARS:
+    for q, _ in DESIGN["scalars"]:
         name, motion = STATE[q], X[:, q]
-        allowed = START_TOLERANCE * np.ptp(motion) + 6.0 * SIGMA[q]
+        allowed = START_TOLERANCE * np.ptp(motion) + 6.0 * DESIGN["sigma"][q]
         if abs(found.get(name, nan) - motion[0]) > allowed > 0.0:
             raise ValueError(
                 f"{name} is {found[name]:g}, but the design begins at {motion[0]:g}; bring the "
@@ -128,11 +106,11 @@ def deviation(planned: np.ndarray, found: dict[str, float]) -> np.ndarray:
     """(2 nv + na,) planned minus measured state; zero where nothing is measured."""
     state = np.array([found.get(name, nan) for name in STATE])
     state = np.where(np.isfinite(state), state, planned)
-    nq, nv = SIZES
+    nq, nv = DESIGN["sizes"]
     move = np.zeros(nv)
-    for q, v in SCALARS:
+    for q, v in DESIGN["scalars"]:
         move[v] = planned[q] - state[q]
-    for q, v in QUATERNIONS:
+    for q, v in DESIGN["quaternions"]:
         # The rotation vector in the frame of the measured body, along the shorter way.
         p, m = planned[q : q + 4], state[q : q + 4]
         axis = m[0] * p[1:] - p[0] * m[1:] - np.cross(m[1:], p[1:])
@@ -153,6 +131,16 @@ def write(output: str, log: list[tuple[float, np.ndarray, dict[str, float]]]) ->
             table.writerow(["" if np.isnan(value) else repr(value) for value in values])
 
 
+# The design: names of the state (nq positions, nv velocities, na activations) and of the nu
+# controls; places in positions and velocities of scalars, and of rotations in space; noise of the
+# measured state; limits of the controls, and their values at the end (NaN keeps the last one). A
+# row holds time, state, controls and gains; the last one has no control.
+DESIGN: dict[str, Any] = json.loads(r"""{}""")
+STATE, CONTROLS = DESIGN["state"], DESIGN["controls"]
+LOWER, UPPER, SAFE = (np.array(DESIGN[key]) for key in ("lower", "upper", "safe"))
+T, X, U, K = np.split(np.array(DESIGN["rows"]), np.cumsum([1, len(STATE), len(CONTROLS)]), axis=1)
+COUNT, END = len(T) - 1, float(T[-1, 0])
+
 if __name__ == "__main__":
     words = [word for word in sys.argv[1:] if word not in ("-o", "--feedback")]
     if words:
@@ -161,6 +149,6 @@ if __name__ == "__main__":
         output = words[1] if len(words) > 1 else "recording.csv"
         print(play(mine, output, feedback="--feedback" in sys.argv))
     else:
-        print(f"design {NAME}: {END:g} s, {COUNT} rows at {COUNT / END:g} Hz; start:")
+        print(f"design {DESIGN['name']}: {END:g} s, {COUNT} rows at {COUNT / END:g} Hz; start:")
         print(dict(zip(STATE, X[0].tolist(), strict=True)))
-        print(f"limits of {', '.join(CONTROLS)}: {LOWER} to {UPPER}\n\n{GAINS}")
+        print(f"limits of {', '.join(CONTROLS)}: {LOWER} to {UPPER}\n\n{DESIGN['gains']}")

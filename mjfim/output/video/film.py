@@ -225,18 +225,18 @@ def film_of_motions(
         for view in motions
     ]
     poses = [[body_poses(model, t, track.qpos) for track in view] for view in tracks]
+    nothing, points = np.zeros((0, 3)), evenly_spread_indices(frames, TRAIL_POINTS)
     paths = _followed_paths(model, poses)
     shifts = [_smooth(path - path[0]) for path in paths] or [np.zeros((frames, 3))] * len(poses)
     camera = _camera(model, poses, shifts)
-    points = evenly_spread_indices(frames, TRAIL_POINTS)
-    trails = [path[points] for path in paths] or [np.zeros((0, 3))] * len(poses)
+    views = []
+    for k, view in enumerate(tracks):
+        trail = paths[k][points] if paths else nothing
+        views.append(FilmView(tracks=view, target=camera.target + shifts[k], trail=trail))
     return Film(
         model=model,
         t=t,
-        views=tuple(
-            FilmView(tracks=view, target=camera.target + shift, trail=trail)
-            for view, shift, trail in zip(tracks, shifts, trails, strict=True)
-        ),
+        views=tuple(views),
         camera=camera,
         speed=speed,
         left_out=end - begin - shown,
