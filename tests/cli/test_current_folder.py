@@ -24,7 +24,6 @@ def trap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / f"{name}.py").write_text(
             f"open({str(tmp_path / 'imported')!r}, 'a').write({name!r})\n", encoding="utf-8"
         )
-    (tmp_path / "matplotlibrc").write_bytes(b"figure.dpi : \xff\xfe\n")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

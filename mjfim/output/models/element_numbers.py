@@ -6,8 +6,8 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import scipy
 from lxml import etree
-from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, listed
@@ -258,10 +258,12 @@ def _in_frames(element: Any, attribute: str, numbers: Array) -> Array:
     for each in reversed(frames):
         if set(ALTERNATIVES["quat"]) & set(each.attrib):
             raise ModelError(f"{element.tag} {element.get('name')!r} is inside a turned <frame>")
-        back = Rotation.from_quat(floats(each.get("quat", "1 0 0 0")), scalar_first=True).inv()
+        back = scipy.spatial.transform.Rotation.from_quat(
+            floats(each.get("quat", "1 0 0 0")), scalar_first=True
+        ).inv()
         if attribute == "pos":
             numbers = back.apply(numbers - floats(each.get("pos", "0 0 0")))
         elif np.isfinite(numbers).all():
-            turn = back * Rotation.from_quat(numbers, scalar_first=True)
+            turn = back * scipy.spatial.transform.Rotation.from_quat(numbers, scalar_first=True)
             numbers = turn.as_quat(scalar_first=True)
     return numbers
