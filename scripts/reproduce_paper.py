@@ -26,7 +26,6 @@ from mjfim.files import write_json
 from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design
-from mjfim.output.folders import write_tables
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
@@ -205,7 +204,7 @@ def efficiency_table(study: MonteCarloStudy) -> Table:
 
 
 def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCarloStudy) -> None:
-    """Write Figures 2-6 as PNG, the tables as Markdown and LaTeX, and the Rerun file.
+    """Write Figures 2-6 as PNG and the Rerun file.
 
     Args:
         folder: Folder that receives the files.
@@ -226,8 +225,6 @@ def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCa
 
     for name, figure in figures.items():
         plots.save(figure, folder / f"{name}.png")
-    write_tables(folder / "table_1", design)
-    write_tables(folder / "table_2_3", study)
     rerun_log.log_design(folder / "design.rrd", task.system.model_at(task.theta), design, names)
 
 
@@ -269,9 +266,7 @@ def main() -> None:
     write_json(args.output / "montecarlo_25Hz.json", studies[25.0].summary())
     write_json(args.output / "montecarlo_100Hz.json", studies[100.0].summary())
     write_figures(args.output, task, design, studies[25.0])
-    console.print(
-        f"wrote {args.output}/: figures 2-6, tables, design.rrd (mjfim replay {args.output})"
-    )
+    console.print(f"wrote {args.output}/: figures 2-6, design.rrd (mjfim replay {args.output})")
 
 
 if __name__ == "__main__":

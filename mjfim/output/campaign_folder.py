@@ -28,10 +28,8 @@ from mjfim.output.campaign_parameters import CampaignParameters
 from mjfim.output.folders import (
     DESIGN_ARCHIVE,
     IDENTIFIED,
-    TABLE_FILES,
     parts_of_identified,
     write_pictures,
-    write_tables,
 )
 from mjfim.output.manifest import fingerprint
 from mjfim.output.models.mjcf import write_identified
@@ -57,7 +55,6 @@ CAMPAIGN_FILES = (
     "campaign.npz",
     REPORT,
     "campaign.png",
-    *TABLE_FILES,
     IDENTIFIED,
 )
 
@@ -230,7 +227,6 @@ class CampaignFolder:
         if campaign.estimate is None:
             return []
 
-        write_tables(self.path, campaign)
         drawn = CampaignParameters.stated(parameters, simulated=simulated)
         pictures: Pictures = {"campaign": partial(plots.campaign_figure, campaign, drawn)}
         write_pictures(self.path, pictures, self.picture_format)

@@ -16,14 +16,13 @@ from mjfim.experiment.system import System
 from mjfim.files import read_json, remove_earlier_result, replacing, write_json
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.interruption import current_interruption
-from mjfim.output import archive, latex, markdown, plots
+from mjfim.output import archive, plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.drawing import begin_pictures, picture_contents
 from mjfim.output.models.mjcf import identified_files, write_identified
-from mjfim.output.optional_files import write_guarded, write_optional
+from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.plots.names import fit_names, held_out_names, histogram_name
-from mjfim.output.presentation import describe
 from mjfim.output.report import REPORT
 from mjfim.output.report.build import records_in, write_report
 from mjfim.output.robot_samples import clear_samples, write_samples
@@ -51,9 +50,6 @@ STALE: dict[type[ShownRecord], str] = {
 # Further entries of a JSON file: none.
 NOTHING: Mapping[str, object] = MappingProxyType({})
 
-# Tables of a result, as Markdown and as LaTeX.
-TABLE_FILES = ("tables.md", "tables.tex")
-
 # Files that a design consists of, without figures.
 DESIGN_ARCHIVE = ("design.npz", "design.csv", "reference.csv", "design.json")
 
@@ -68,14 +64,13 @@ DESIGN_FILES = (
     "convergence.png",
     "standard_deviations.png",
     "limits.png",
-    *TABLE_FILES,
 )
 SHORTEST_FILES = ("shortest.json", "shortest.npz")
 
 # Files that `mjfim check`, `mjfim compare-robots` and `mjfim robustness` may write.
-CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "pairs.png", *TABLE_FILES)
-ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png", *TABLE_FILES)
-ROBUSTNESS_FILES = ("playback.json", "playback.npz", REPORT, "playback.png", *TABLE_FILES)
+CHECK_FILES = ("check.json", "check.npz", REPORT, "check.png", "pairs.png")
+ROBOT_FILES = ("robots.json", "robots.npz", REPORT, "robots.png")
+ROBUSTNESS_FILES = ("playback.json", "playback.npz", REPORT, "playback.png")
 
 
 def parts_of_identified(folder: Path, model: Path) -> tuple[str, ...]:
@@ -113,7 +108,7 @@ def estimate_files(
     figures = tuple(f"{name}.png" for name in names)
     fits = tuple(f"{name}.png" for name in (*fit_names(recordings), *held_out_names(held_out)))
     data = ("estimate.json", "estimate.npz", IDENTIFIED, REPORT, "estimate.rrd")
-    return (*data, *figures, *fits, *TABLE_FILES)
+    return (*data, *figures, *fits)
 
 
 def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
@@ -123,7 +118,7 @@ def study_files(parameters: Iterable[str]) -> tuple[str, ...]:
         parameters: Names of the parameters.
     """
     histograms = tuple(f"{histogram_name(name)}.png" for name in parameters)
-    return ("montecarlo.json", "montecarlo.npz", REPORT, "overview.png", *histograms, *TABLE_FILES)
+    return ("montecarlo.json", "montecarlo.npz", REPORT, "overview.png", *histograms)
 
 
 def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
@@ -133,7 +128,7 @@ def comparison_files(methods: Sequence[str]) -> tuple[str, ...]:
         methods: Keys of the baselines.
     """
     controls = tuple(control_name(method) for method in dict.fromkeys((*methods, DESIGN)))
-    return ("compare.json", "compare.npz", REPORT, "compare.png", *TABLE_FILES, *controls)
+    return ("compare.json", "compare.npz", REPORT, "compare.png", *controls)
 
 
 def control_name(method: str) -> str:
@@ -248,7 +243,6 @@ def write_result(
         clear(folder, STALE[type(record)])
     remarks = _write_data(folder, record, system, further)
 
-    write_tables(folder, record)
     write_optional(REPORT, lambda: write_report(folder, type(record), made=record))
     _write_figures(folder, record, picture_format)
     if system is not None and isinstance(record, Design | Estimate):
@@ -309,20 +303,6 @@ def _add_video(folder: Path, record: Design | Estimate, system: System) -> None:
     begin_stage("drawing the video of the report")
     video, sentence = report_video(system, record)
     write_report(folder, type(record), video, sentence, made=record)
-
-
-def write_tables(folder: Path, record: ShownRecord) -> None:
-    """Write the tables of a result as Markdown and as LaTeX, if that is possible."""
-
-    def write() -> None:
-        """Write both files."""
-        summary = describe(record)
-        texts = (markdown.render_tables(summary), latex.render_tables(summary))
-        for name, text in zip(TABLE_FILES, texts, strict=True):
-            with replacing(folder / name) as temporary:
-                temporary.write_text(text, encoding="utf-8")
-
-    write_guarded(" and ".join(TABLE_FILES), write)
 
 
 def _write_figures(folder: Path, record: ShownRecord, picture_format: PictureFormat) -> None:

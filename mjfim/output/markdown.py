@@ -1,30 +1,15 @@
-"""Tables of results as Markdown, for texts, wikis and the text panel of the viewer."""
+"""Tables of results as Markdown, for the text panel of the viewer."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
 
-from mjfim.output.summary_parts import Cell, Column, Summary, SummaryTable
+from mjfim.output.summary_parts import Cell, Column, SummaryTable
 from mjfim.output.vocabulary import shown_word
 
 # Characters that Markdown would take for its own marks; an underscore only at the edge of a word.
 MARKS = re.compile(r"[\\|*`<>\[\]~]|(?<!\w)_|_(?!\w)")
-
-
-def render_tables(summary: Summary) -> str:
-    """Render all tables of a summary, each with its title and its note.
-
-    Args:
-        summary: The summary.
-    """
-    blocks = [f"# {escape(summary.title)}"] if summary.title else []
-    for table in summary.tables:
-        blocks += [f"## {escape(table.title)}"] if table.title else []
-        blocks.append(render_table(table))
-        if table.note:
-            blocks.append(escape(table.note))
-    return "\n\n".join(blocks) + "\n"
 
 
 def render_table(table: SummaryTable, *, details_last: bool = False) -> str:

@@ -40,8 +40,6 @@ def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
         "check.png",
         "report.html",
         "pairs.png",
-        "tables.md",
-        "tables.tex",
         MANIFEST,
     }
     assert imread(tmp_path / "out" / "check.png").shape[0] > 300

@@ -17,8 +17,6 @@ FILES = {
     "robots.npz",
     "robots.png",
     "report.html",
-    "tables.md",
-    "tables.tex",
     MANIFEST,
 }
 

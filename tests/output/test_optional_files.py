@@ -48,7 +48,7 @@ def test_files_that_may_not_be_written_remain_errors() -> None:
 def test_one_bad_picture_does_not_keep_the_others_away(
     tmp_path: Path, empty_figures: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The report, the tables and the other pictures of a folder are drawn."""
+    """The data and the other pictures of a folder are drawn."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         pictures: Any = {"first": fail, "second": lambda: None}
@@ -58,7 +58,7 @@ def test_one_bad_picture_does_not_keep_the_others_away(
         folders.write_result(tmp_path, results.check())
 
     drawn = {path.name for path in tmp_path.iterdir()}
-    assert {"second.png", "tables.md", "check.png"} <= drawn
+    assert {"second.png", "check.json", "check.png"} <= drawn
     assert "first.png" not in drawn
     sentences = [str(warning.message).split(",")[0] for warning in told]
     assert sentences == ["could not draw first.png", "could not draw report.html"]

@@ -327,8 +327,6 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         "compare.npz",
         "compare.png",
         "report.html",
-        "tables.md",
-        "tables.tex",
         *controls,
     }
     assert imread(out / "compare.png").shape[0] > 300
@@ -342,8 +340,6 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         "compare.npz",
         "compare.png",
         "report.html",
-        "tables.md",
-        "tables.tex",
         "control_chirp.csv",
         f"control_{DESIGN}.csv",
     }

@@ -32,12 +32,10 @@ DESIGN = {
     "sensitivity_phase.png",
     "convergence.png",
     "standard_deviations.png",
-    "tables.md",
-    "tables.tex",
 }
 
 # Files that `mjfim identify` writes.
-ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml", "tables.md", "tables.tex"}
+ESTIMATE_DATA = {"estimate.json", "estimate.npz", "identified.xml"}
 ESTIMATE = {*ESTIMATE_DATA, "report.html", "estimate.rrd"} | {
     f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions", "pairs", "trace")
 }
@@ -51,8 +49,6 @@ STUDY = {
     "histogram_m.png",
     "histogram_l.png",
     "histogram_c.png",
-    "tables.md",
-    "tables.tex",
 }
 
 # Command that runs `mjfim` in a new process, where every warning is an error.
