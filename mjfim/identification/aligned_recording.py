@@ -19,7 +19,6 @@ from mjfim.experiment.system import System
 from mjfim.identification.law_inputs import inputs_of_laws
 from mjfim.model.variants import STATED
 from mjfim.plant.outputs import outputs_by_state
-from mjfim.recordings.log_file import LogFile, file_of
 from mjfim.records.trajectory import Recording, Trajectory
 
 # Largest distance from the grid [sample periods] at which a time stamp counts as lying on it.
@@ -52,7 +51,6 @@ class AlignedRecording:
             what control laws read (`mjfim.model.control_laws.ControlLaws`).
         dt: Sample period of the grid [s].
         on_grid: True where every time stamp lies on the grid.
-        file: The file from which it was read; None where it was not read from one.
     """
 
     name: str
@@ -61,7 +59,6 @@ class AlignedRecording:
     ctrl: Array
     dt: float
     on_grid: bool
-    file: LogFile | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "t", "y", "ctrl")
@@ -182,7 +179,6 @@ def align(system: System, recording: Recording) -> AlignedRecording:
         ctrl=ctrl,
         dt=dt,
         on_grid=on_grid,
-        file=file_of(recording),
     )
 
 

@@ -6,7 +6,7 @@ the other parts. The initial state of a predicted part is estimated from that pa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -18,8 +18,7 @@ from mjfim.arrays import Array
 from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.batch_workers import LARGEST_SENT_BYTES, ProblemWork
-from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_problem import FitProblem, ProblemWork
 from mjfim.identification.leave_out_fits import (
     LeaveOutStep,
     fit_to_others,
@@ -153,19 +152,8 @@ def of_folds(problem: FitProblem, folds: Sequence[ProblemWork[T]], budget: Budge
         folds: Work on each part.
         budget: Ends the work early.
     """
-    # A worker that does a whole fold waits for nobody, but needs all recordings. Where they are
-    # large, or where there would be nothing to do for many workers, the workers share each pass
-    # over the data instead.
-    workers = problem.workers
-    is_large = problem.recording_bytes > LARGEST_SENT_BYTES
-    found: Iterable[T]
-    if workers is None or is_large or len(folds) < workers.count:
-        found = (fold(problem, budget) for fold in folds)
-    else:
-        found = workers.of_whole(problem, folds, budget)
-
     begin_stage("predicting each part from the others", 0, len(folds))
-    for number, prediction in enumerate(found, start=1):
+    for number, prediction in enumerate(problem.of_whole(folds, budget), start=1):
         if number < len(folds):
             begin_stage("predicting each part from the others", number, len(folds))
         yield prediction

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
-from mjfim.identification.batch_workers import BatchWork, BatchWorkers
 from mjfim.identification.fit_segments import has_free_starts, segments_of_fit
 from mjfim.identification.pins import Pins
 from mjfim.identification.prior_rows import PriorRows
@@ -40,6 +40,29 @@ from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
 from mjfim.records.trajectory import Recording, Trajectory
 
 T = TypeVar("T")
+
+# Work on one batch of a problem, at values of the unknowns.
+BatchWork = Callable[["FitProblem", UnknownValues, SegmentBatch], T | None]
+
+# A task on a whole problem, which ends early when the budget is exhausted.
+ProblemWork = Callable[["FitProblem", Budget], T]
+
+
+class ProblemWorkers(Protocol):
+    """Workers that do tasks on a problem."""
+
+    @property
+    def count(self) -> int:
+        """Number of workers."""
+
+    def of_batches(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> Sequence[T]:
+        """Do works that are one pass over the data."""
+
+    def of_whole(
+        self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
+    ) -> Iterator[T]:
+        """Do works that do not depend on each other, each of them in one worker."""
+
 
 # Number of stated samples of the longest recording along which difference steps are calibrated.
 CALIBRATION_SAMPLES = 1000
@@ -72,7 +95,7 @@ class FitProblem:
     with_priors: bool
     difference_step: float = SENSITIVITY_STEP
     central: bool | None = None
-    workers: BatchWorkers | None = None
+    workers: ProblemWorkers | None = None
 
     @classmethod
     def of(
@@ -150,7 +173,7 @@ class FitProblem:
 
     # ---- variants
 
-    def on_workers(self, workers: BatchWorkers) -> FitProblem:
+    def on_workers(self, workers: ProblemWorkers) -> FitProblem:
         """This problem, the batches of which are simulated by workers.
 
         Args:
@@ -293,12 +316,6 @@ class FitProblem:
     def row_count(self) -> int:
         """Number of rows of all recordings."""
         return sum(len(recording.t) for recording in self.recordings)
-
-    @property
-    def recording_bytes(self) -> int:
-        """Size of the recordings that have segments [bytes]."""
-        needed = {segment.recording for segment in self.segments}
-        return sum(self.recordings[i].size for i in needed)
 
     @property
     def value_count(self) -> int:
@@ -693,12 +710,38 @@ class FitProblem:
             batches: The batches.
             at: The unknowns.
         """
-        if self.workers is not None:
-            yield from self.workers.of_batches(self, work, list(batches), at)
+        if self.workers is None:
+            yield from (work(self, at, batch) for batch in batches)
             return
+        works = [partial(_work_on_batch, work=work, at=at, batch=batch) for batch in batches]
+        yield from self.workers.of_batches(self, works)
 
-        for batch in batches:
-            yield work(self, at, batch)
+    def of_whole(self, works: Sequence[ProblemWork[T]], budget: Budget) -> Iterator[T]:
+        """Results of independent works, in this process or by a worker each.
+
+        Returns:
+            The results in their order; those that a request to stop has prevented are missing.
+        """
+        if self.workers is not None and len(works) >= self.workers.count:
+            yield from self.workers.of_whole(self, works, budget)
+            return
+        # Few works would leave workers idle, which share each pass over the data instead.
+        for work in works:
+            if budget.exhausted is not None:
+                return
+            yield work(self, budget)
+
+
+def _work_on_batch(
+    problem: FitProblem,
+    _: Budget,
+    *,
+    work: BatchWork[T],
+    at: UnknownValues,
+    batch: SegmentBatch,
+) -> T | None:
+    """A work on one batch as a task on the whole problem."""
+    return work(problem, at, batch)
 
 
 def have_same_initial_states(problem: FitProblem, other: FitProblem) -> bool:

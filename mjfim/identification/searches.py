@@ -29,7 +29,7 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from mjfim.plant.noise import Noise
-from mjfim.records.events import FitEvent
+from mjfim.records.events import FitEvent, begin_stage
 
 # Settings of the paper's Newton-Raphson iteration.
 NEWTON = SearchSettings(max_iterations=50, tolerance=1e-5, damped=False)
@@ -546,24 +546,15 @@ class FitSearch:
         )
 
         # The first sample is the stated start, which was searched before.
-        if problem.workers is not None:
-            works = [
-                partial(_short_search, begin=problem.begin(theta), settings=settings)
-                for theta in samples[1:]
-            ]
-            searched = problem.workers.of_whole(problem, works, self.budget)
-            return [solution for solution in searched if solution is not None]
-
-        found = []
-        for number, theta in enumerate(samples[1:], start=2):
-            phase = f"start {number} of {starts}"
-            begin = problem.begin(theta)
-            solution = minimise(problem, begin, settings, self.budget, self._reporter(phase))
-            if solution is not None:
-                found.append(solution)
-            if self.interrupted():
-                break
-        return found
+        works = [
+            partial(_short_search, begin=problem.begin(theta), settings=settings)
+            for theta in samples[1:]
+        ]
+        searched = []
+        for number, solution in enumerate(problem.of_whole(works, self.budget), start=2):
+            begin_stage("searching from random starts", number, starts)
+            searched.append(solution)
+        return [solution for solution in searched if solution is not None]
 
     def minimise(
         self, problem: Problem, begin: UnknownValues, settings: SearchSettings, phase: str

@@ -10,8 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.identification.batch_workers import BatchWork
-from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.fit_problem import BatchWork, FitProblem
 from mjfim.identification.segment_simulation import SegmentBatch, SegmentRows
 from mjfim.information.null_space import COARSER_STEP_FACTOR
 from mjfim.optimize.condensed_least_squares import triangle

@@ -26,7 +26,6 @@ from mjfim.recordings.law_columns import (
     require_one_source,
     units_of_inputs,
 )
-from mjfim.recordings.log_file import FileState, remember_file
 from mjfim.recordings.spec import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
 from mjfim.recordings.summary import LogSummary, summarize
 from mjfim.recordings.validity import (
@@ -95,7 +94,6 @@ def read_log(path: Path, channels: Channels) -> Log:
     check_spec(channels)
     spec = channels.spec
 
-    before = FileState.of(path)
     table = formats.read_columns(path, spec)
     if "time" not in spec.model_fields_set:
         _require_default(table, "time", spec.time, key="[recording] time")
@@ -131,7 +129,6 @@ def read_log(path: Path, channels: Channels) -> Log:
         outputs=measured,
         name=str(path),
     )
-    remember_file(recording, before, channels)
     return Log(recording=recording, summary=summary)
 
 
