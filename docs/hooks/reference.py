@@ -18,7 +18,7 @@ from typer.main import get_command
 
 from mjfim.cli.main import app
 from mjfim.experiment.schema import json_schema
-from mjfim.model.terms.catalogue import NUMBERS, TERMS, CatalogueEntry
+from mjfim.model.terms.library import NUMBERS, TERMS, CatalogueEntry
 
 SCHEMA_FILE = "reference/experiment.schema.json"  # Place of the JSON schema on the site.
 

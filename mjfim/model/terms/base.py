@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,15 +11,15 @@ import scipy
 
 from mjfim.errors import ExperimentError
 from mjfim.model.sizes import model_length
-from mjfim.model.terms.changes import ChangedElement, MjcfChange, NewElement
 from mjfim.model.terms.term import (
     FieldDescription,
     Term,
     TermQuantity,
     TermTable,
+    add_body,
     named_element,
     require_free_name,
-    resolved_values,
+    stated_quantities,
 )
 
 # Axes of the world, and of the frame of a body.
@@ -59,6 +59,8 @@ class Tilt(Term):
         for axis in AXES
     )
     sources = (SWEVERS_2007,)
+    # All components of gravity depend on all components of the rotation.
+    is_written_as_a_whole = True
 
     gravity: tuple[float, float, float]
 
@@ -71,28 +73,13 @@ class Tilt(Term):
         if not np.any(model.opt.gravity):
             raise ExperimentError("kind: the model has no gravity that could be turned")
 
-        values = resolved_values(cls.kind, table, dict.fromkeys(AXES, 0.0))
         numbers = tuple((f"option:gravity[{i}]", 1.0) for i in range(3))
-        quantities = tuple(
-            (
-                axis,
-                TermQuantity(
-                    value=values[axis],
-                    unit="rad",
-                    size=1.0,
-                    bounds=(-np.pi, np.pi),
-                    numbers=numbers,
-                ),
-            )
-            for axis in AXES
+        angle = TermQuantity(
+            value=0.0, unit="rad", size=1.0, bounds=(-np.pi, np.pi), numbers=numbers
         )
+        quantities = stated_quantities(cls.kind, table, dict.fromkeys(AXES, angle))
         x, y, z = (float(number) for number in model.opt.gravity)
         return cls(name=table.name, gravity=(x, y, z), quantities=quantities)
-
-    @property
-    def is_written_as_a_whole(self) -> bool:
-        """All components of gravity depend on all components of the rotation."""
-        return True
 
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Turn gravity."""
@@ -100,19 +87,7 @@ class Tilt(Term):
 
     def edit(self, spec: Any) -> None:
         """Turn gravity in an MjSpec."""
-        spec.option.gravity = self._turned(dict.fromkeys(AXES, 0.0) | self._values)
-
-    def changes(self) -> tuple[MjcfChange, ...]:
-        """Gravity in the text; none where it is not turned yet."""
-        if not any(self._values.values()):
-            return ()
-        gravity = tuple(self._turned(self._values).tolist())
-        return (ChangedElement(kind="option", name="", attributes=(("gravity", gravity),)),)
-
-    @property
-    def _values(self) -> dict[str, float]:
-        """Values of the fields in the model."""
-        return {axis: self.value(axis) for axis in AXES}
+        spec.option.gravity = self._turned(self.values)
 
     def _turned(self, values: Mapping[str, float]) -> np.ndarray:
         """(3,) gravity after the rotation [m/s²]."""
@@ -160,61 +135,34 @@ class Payload(Term):
         if name == WORLD or int(model.body_weldid[number]) == 0:
             raise ExperimentError(f"body: {name!r} does not move, so that a load has no effect")
 
-        fields = ("mass", *AXES, "inertia")
-        values = resolved_values(cls.kind, table, dict.fromkeys(fields, 0.0))
+        load, length = f"body/{table.name}", model_length(model)
         tree_mass = float(model.body_subtreemass[model.body_rootid[number]])
         mass = TermQuantity(
-            value=values["mass"],
+            value=0.0,
             unit="kg",
             size=tree_mass,
             bounds=(0.0, np.inf),
-            numbers=((f"body/{table.name}:mass", 1.0),),
-        )
-        length = model_length(model)
-        places = (
-            (
-                axis,
-                TermQuantity(
-                    value=values[axis],
-                    unit="m",
-                    size=length,
-                    numbers=((f"body/{table.name}:pos[{i}]", 1.0),),
-                ),
-            )
-            for i, axis in enumerate(AXES)
+            numbers=((f"{load}:mass", 1.0),),
         )
         inertia = TermQuantity(
-            value=values["inertia"],
+            value=0.0,
             unit="kg m²",
             size=tree_mass * length**2,
             bounds=(0.0, np.inf),
-            numbers=tuple((f"body/{table.name}:inertia[{i}]", 1.0) for i in range(3)),
+            numbers=tuple((f"{load}:inertia[{i}]", 1.0) for i in range(3)),
         )
-        quantities = (("mass", mass), *places, ("inertia", inertia))
+        place = TermQuantity(value=0.0, unit="m", size=length)
+        places = {
+            axis: replace(place, numbers=((f"{load}:pos[{i}]", 1.0),))
+            for i, axis in enumerate(AXES)
+        }
+        quantities = stated_quantities(
+            cls.kind, table, {"mass": mass, **places, "inertia": inertia}
+        )
         return cls(name=table.name, body=name, quantities=quantities)
 
     def edit(self, spec: Any) -> None:
         """Add the body of the load."""
-        load = spec.body(self.body).add_body(name=self.name)
+        mass, inertia = self.value("mass"), self.value("inertia")
+        load = add_body(spec.body(self.body), self.name, mass, inertia, np.zeros(3))
         load.pos = [self.value(axis) for axis in AXES]
-        load.mass = self.value("mass")
-        load.ipos = np.zeros(3)
-        load.inertia = np.full(3, self.value("inertia"))
-        load.explicitinertial = True
-
-    def changes(self) -> tuple[MjcfChange, ...]:
-        """The body in the text."""
-        inertial = (
-            ("pos", (0.0, 0.0, 0.0)),
-            ("mass", (self.value("mass"),)),
-            ("diaginertia", (self.value("inertia"),) * 3),
-        )
-        place = tuple(self.value(axis) for axis in AXES)
-        load = NewElement(
-            parent_kind="body",
-            parent=self.body,
-            tag="body",
-            attributes=(("name", self.name), ("pos", place)),
-            children=(("inertial", inertial),),
-        )
-        return (load,)

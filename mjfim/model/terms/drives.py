@@ -13,25 +13,21 @@ from mjfim.errors import ExperimentError
 from mjfim.model.integrators import is_rk4
 from mjfim.model.servos import actuator_gear
 from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, control_sizes, model_length
-from mjfim.model.terms.changes import Attributes, ChangedElement, MjcfChange
 from mjfim.model.terms.term import (
     FieldDescription,
     Term,
     TermQuantity,
     TermTable,
     named_element,
-    resolved_values,
+    stated_quantities,
 )
 from mjfim.model.units import FORCE_UNITS, LENGTH, force_unit
 
 # Types of gain for which an activation may take the place of the control.
 PLAIN_GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
 
-# Types of bias that the element <general> states by its numbers.
-PLAIN_BIASES = {
-    int(mujoco.mjtBias.mjBIAS_NONE): "none",
-    int(mujoco.mjtBias.mjBIAS_AFFINE): "affine",
-}
+# Types of bias that such an actuator may have.
+PLAIN_BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
 
 # Time constant over the timestep where none is stated. It delays by less than a timestep, and yet
 # the motion depends on it: a shorter lag has no effect at all, so that no fit could begin there.
@@ -55,7 +51,6 @@ class ActuatorLag(Term):
     Attributes:
         actuator: Name of the actuator.
         explicit: Whether the integrator is RK4, which takes the lag through its stages.
-        of_shorthand: Gain and bias of the actuator, for elements such as `position`.
     """
 
     kind = "actuator_lag"
@@ -73,7 +68,6 @@ class ActuatorLag(Term):
 
     actuator: str
     explicit: bool
-    of_shorthand: Attributes
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> ActuatorLag:
@@ -86,25 +80,25 @@ class ActuatorLag(Term):
         timestep = float(model.opt.timestep)
         explicit = is_rk4(model)
         least = (LEAST_LAG_RK4 if explicit else LEAST_LAG) * timestep
-        values = resolved_values(cls.kind, table, {"time_constant": SHORT_LAG * timestep})
-        if values["time_constant"] < least:
-            raise ExperimentError(
-                f"values.time_constant: {values['time_constant']:g} s is too short to have an "
-                f"effect; state at least {least:g} s"
-            )
-        quantity = TermQuantity(
-            value=values["time_constant"],
+        lag = TermQuantity(
+            value=SHORT_LAG * timestep,
             unit="s",
             size=period,
             bounds=(least, np.inf),
             numbers=((f"actuator/{name}:dynprm[0]", 1.0),),
         )
+        quantities = stated_quantities(cls.kind, table, {"time_constant": lag})
+        (_, stated), *_ = quantities
+        if stated.value < least:
+            raise ExperimentError(
+                f"values.time_constant: {stated.value:g} s is too short to have an effect; state "
+                f"at least {least:g} s"
+            )
         return cls(
             name=table.name,
             actuator=name,
             explicit=explicit,
-            quantities=(("time_constant", quantity),),
-            of_shorthand=_gain_and_bias(model, number),
+            quantities=quantities,
         )
 
     def edit(self, spec: Any) -> None:
@@ -117,22 +111,6 @@ class ActuatorLag(Term):
         dynamics = np.array(actuator.dynprm)
         dynamics[0] = self.value("time_constant")
         actuator.dynprm = dynamics
-
-    def changes(self) -> tuple[MjcfChange, ...]:
-        """The actuator in the text as a `general` one with a lag."""
-        attributes: Attributes = (
-            ("dyntype", "filter" if self.explicit else "filterexact"),
-            ("dynprm", (self.value("time_constant"),)),
-            ("actearly", "false" if self.explicit else "true"),
-        )
-        changed = ChangedElement(
-            kind="actuator",
-            name=self.actuator,
-            tag="general",
-            attributes=attributes,
-            of_shorthand=self.of_shorthand,
-        )
-        return (changed,)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +135,8 @@ class BackEmf(Term):
         ),
     )
     sources = (KRAUSE_2013, MUJOCO_DCMOTOR)
+    # The damping depends on the gain, which may be a parameter as well.
+    is_written_as_a_whole = True
 
     actuator: str
 
@@ -179,18 +159,14 @@ class BackEmf(Term):
         length = model_length(model) if slides else 1.0
         size = control * time / (length * (abs(actuator_gear(model, number)) or 1.0))
         quantity = TermQuantity(
-            value=resolved_values(cls.kind, table, {"constant": 0.0})["constant"],
+            value=0.0,
             unit="",
             size=size,
             bounds=(0.0, np.inf),
             numbers=((f"actuator/{name}:biasprm[2]", 1.0),),
         )
-        return cls(name=table.name, actuator=name, quantities=(("constant", quantity),))
-
-    @property
-    def is_written_as_a_whole(self) -> bool:
-        """The damping depends on the gain, which may be a parameter as well."""
-        return True
+        quantities = stated_quantities(cls.kind, table, {"constant": quantity})
+        return cls(name=table.name, actuator=name, quantities=quantities)
 
     def write(self, model: Any, values: Mapping[str, float]) -> None:
         """Write the damping that belongs to the gain in the model."""
@@ -206,39 +182,14 @@ class BackEmf(Term):
         bias[2] = -float(actuator.gainprm[0]) * self.value("constant")
         actuator.biasprm = bias
 
-    def changes(self) -> tuple[MjcfChange, ...]:
-        """The motor in the text as a `general` actuator with a bias."""
-        changed = ChangedElement(
-            kind="actuator",
-            name=self.actuator,
-            tag="general",
-            attributes=(("biastype", "affine"),),
-        )
-        return (changed,)
-
 
 def _require_plain(model: Any, name: str, number: int, kind: str) -> None:
     """Raise ExperimentError for an actuator with dynamics, or with a gain of another type."""
     has_dynamics = int(model.actuator_dyntype[number]) != int(mujoco.mjtDyn.mjDYN_NONE)
     is_plain = int(model.actuator_gaintype[number]) in [int(gain) for gain in PLAIN_GAINS]
-    has_bias = int(model.actuator_biastype[number]) in PLAIN_BIASES
+    has_bias = int(model.actuator_biastype[number]) in [int(bias) for bias in PLAIN_BIASES]
     if has_dynamics or not (is_plain and has_bias) or int(model.actuator_ctrlnum[number]) != 1:
         raise ExperimentError(
             f"actuator: {name!r} has dynamics or a gain of its own; a term of kind {kind!r} needs "
             "an actuator without dynamics, such as <motor>, <position> or <velocity>"
         )
-
-
-def _gain_and_bias(model: Any, number: int) -> Attributes:
-    """Attributes of `general` that state gain and bias of an actuator, and its range."""
-    is_affine = int(model.actuator_gaintype[number]) == int(mujoco.mjtGain.mjGAIN_AFFINE)
-    attributes: Attributes = (
-        ("gaintype", "affine" if is_affine else "fixed"),
-        ("gainprm", tuple(model.actuator_gainprm[number, :3].tolist())),
-        ("biastype", PLAIN_BIASES[int(model.actuator_biastype[number])]),
-        ("biasprm", tuple(model.actuator_biasprm[number, :3].tolist())),
-    )
-    control = int(model.actuator_ctrladr[number])
-    if not model.actuator_ctrllimited[control]:
-        return attributes
-    return (*attributes, ("ctrlrange", tuple(model.actuator_ctrlrange[control].tolist())))

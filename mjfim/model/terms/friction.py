@@ -7,24 +7,25 @@ the joint and from the timestep.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
 from mjfim.model.integrators import is_rk4
-from mjfim.model.terms.changes import Attributes, ChangedElement, MjcfChange, NewElement
-from mjfim.model.terms.joint_sizes import JointSizes, rounded
 from mjfim.model.terms.term import (
     FieldDescription,
+    JointSizes,
     Term,
     TermQuantity,
     TermTable,
     require_free_name,
-    resolved_values,
+    rounded,
+    stated_quantities,
 )
 from mjfim.model.units import FORCE_UNITS, JOINT_FIELD_UNITS, per_second
 
@@ -65,26 +66,74 @@ OLSSON_1998 = (
 )
 
 
+# Numbers of a passive device that each field is part of, as `<array>[<place>]`.
+Places = dict[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True, kw_only=True)
 class _PassiveDevice(Term):
     """A term that is one `dcmotor` without control at a joint.
 
     Attributes:
+        places: Numbers of the actuator that each field is part of, by the name of the field.
         joint: Name of the joint.
+        fixed: Further numbers of the actuator that are not zero.
+        replaces_friction: Whether it takes the place of the dry friction of the joint.
     """
 
+    places: ClassVar[Places]
+
     joint: str
+    fixed: tuple[tuple[str, float], ...]
+    replaces_friction: bool
 
-    @property
-    def _attributes(self) -> Attributes:
-        """Attributes of the `dcmotor` besides its name and its joint."""
-        raise NotImplementedError
+    @classmethod
+    def of(cls, table: TermTable, model: Any, period: float) -> Self:
+        """Resolve the term."""
+        at = JointSizes.of(table, model, period, cls.kind)
+        require_free_name(model, "actuator", table.name)
+        defaults = {
+            field: replace(
+                quantity,
+                numbers=tuple((f"actuator/{table.name}:{n}", 1.0) for n in cls.places[field]),
+            )
+            for field, quantity in cls._defaults(at, model).items()
+        }
+        return cls(
+            name=table.name,
+            joint=at.joint,
+            quantities=stated_quantities(cls.kind, table, defaults),
+            fixed=cls._fixed(at, model),
+            replaces_friction="coulomb" in defaults and float(model.dof_frictionloss[at.dof]) > 0.0,
+        )
 
-    def _set(self, actuator: Any) -> None:
-        """Set the numbers of the actuator in an MjSpec."""
-        raise NotImplementedError
+    @classmethod
+    @abstractmethod
+    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
+        """Fields where the table states nothing, without their numbers."""
+
+    @classmethod
+    @abstractmethod
+    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
+        """Further numbers of the actuator."""
+
+    def _numbers(self, values: Mapping[str, float]) -> dict[str, dict[int, float]]:
+        """Numbers of the actuator at values of the fields, by array and place."""
+        found: dict[str, dict[int, float]] = {"biasprm": {}, "dynprm": {}}
+        of_fields = [(place, values[field]) for field in values for place in self.places[field]]
+        for place, value in (*self.fixed, *of_fields):
+            array, _, index = place.rstrip("]").partition("[")
+            found[array][int(index)] = found[array].get(int(index), 0.0) + value
+        return found
+
+    def write(self, model: Any, values: Mapping[str, float]) -> None:
+        """Write all numbers of the actuator."""
+        row = model.actuator(self.name).id
+        for array, numbers in self._numbers(values).items():
+            getattr(model, f"actuator_{array}")[row, list(numbers)] = list(numbers.values())
 
     def edit(self, spec: Any) -> None:
-        """Add the passive device."""
+        """Add the passive device, and take the dry friction from the joint where it replaces it."""
         actuator = spec.add_actuator(name=self.name)
         actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
         actuator.target = self.joint
@@ -95,35 +144,25 @@ class _PassiveDevice(Term):
         actuator.ctrlspec = int(mujoco.mjtCtrlInput.mjINPUT_NONE)
 
         # The motor constant is zero, so that the resistance has no effect.
-        for name in ("gainprm", "biasprm", "dynprm"):
-            setattr(actuator, name, np.zeros(len(getattr(actuator, name))))
-        actuator.gainprm = _with(actuator.gainprm, {0: 1.0})
+        numbers = {"gainprm": {0: 1.0}, **self._numbers(self.values)}
+        for array, stated in numbers.items():
+            values = np.zeros(len(getattr(actuator, array)))
+            values[list(stated)] = list(stated.values())
+            setattr(actuator, array, values)
         actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
         actuator.actearly = True
-        self._set(actuator)
-
-    def changes(self) -> tuple[MjcfChange, ...]:
-        """The element in the text."""
-        attributes = (
-            ("name", self.name),
-            ("joint", self.joint),
-            ("gear", "1"),
-            ("input", "none"),
-            ("motorconst", "0"),
-            ("resistance", "1"),
-            *self._attributes,
-        )
-        return (NewElement(parent="actuator", tag="dcmotor", attributes=attributes),)
+        if numbers["dynprm"]:
+            actuator.actdim = 1
+        if "damping" in self.places:
+            actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            actuator.forcerange = np.array([-NO_ELECTRICAL_FORCE, NO_ELECTRICAL_FORCE])
+        if self.replaces_friction:
+            spec.joint(self.joint).frictionloss = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stribeck(_PassiveDevice):
-    """Friction that falls from its static to its Coulomb value with the speed.
-
-    Attributes:
-        joint: Name of the joint.
-        stiffness: Stiffness of the bristle [N/m or N m/rad].
-    """
+    """Friction that falls from its static to its Coulomb value with the speed."""
 
     kind = "stribeck"
     description = (
@@ -140,62 +179,30 @@ class Stribeck(_PassiveDevice):
         FieldDescription(name="speed", description="Stribeck speed", unit="rad/s"),
     )
     sources = (DE_WIT_1995, ARMSTRONG_1994)
-
-    joint: str
-    stiffness: float
+    places: ClassVar[Places] = {"excess": ("biasprm[4]",), "speed": ("biasprm[5]",)}
 
     @classmethod
-    def of(cls, table: TermTable, model: Any, period: float) -> Stribeck:
-        """Resolve the term; RK4 is refused, whose stages would make the bristle unstable."""
-        at = JointSizes.of(table, model, period, cls.kind)
-        require_free_name(model, "actuator", table.name)
+    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
+        """Refuse RK4, whose stages would make the bristle unstable."""
         if is_rk4(model):
             raise ExperimentError(
                 "kind: with the integrator RK4, the bristle of 'stribeck' is unstable; use the "
                 "kind 'lugre', or the integrator implicitfast in the MJCF"
             )
+        return {"excess": _friction(at, 0.0), "speed": _stribeck_speed(at)}
 
-        values = resolved_values(
-            cls.kind, table, {"excess": 0.0, "speed": STRIBECK_SHARE * at.speed}
-        )
-        place = f"actuator/{table.name}:biasprm"
-        quantities = (
-            (
-                "excess",
-                TermQuantity(
-                    value=values["excess"],
-                    unit=FORCE_UNITS[at.unit],
-                    size=at.force,
-                    bounds=(0.0, np.inf),
-                    numbers=((f"{place}[4]", 1.0),),
-                ),
-            ),
-            ("speed", _stribeck_speed(values["speed"], at, f"{place}[5]")),
-        )
-        stiffness = rounded(BRISTLE_STIFFNESS * at.inertia / float(model.opt.timestep) ** 2)
-        return cls(name=table.name, joint=at.joint, quantities=quantities, stiffness=stiffness)
-
-    @property
-    def _attributes(self) -> Attributes:
-        """The friction without a Coulomb part and without damping of the bristle."""
-        numbers = (self.stiffness, 0.0, 0.0, self.value("excess"), self.value("speed"))
-        return (("lugre", numbers),)
-
-    def _set(self, actuator: Any) -> None:
-        """Set the numbers of the actuator in an MjSpec."""
-        actuator.actdim = 1
-        actuator.dynprm = _with(actuator.dynprm, {5: self.stiffness})
-        friction = {4: self.value("excess"), 5: self.value("speed")}
-        actuator.biasprm = _with(actuator.biasprm, friction)
+    @classmethod
+    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
+        """The stiffness of the bristle."""
+        stiffness = BRISTLE_STIFFNESS * at.inertia / float(model.opt.timestep) ** 2
+        return (("dynprm[5]", rounded(stiffness)),)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LuGre(_PassiveDevice):
     """Dynamic friction with a displacement before sliding, in place of the joint's dry friction.
 
-    Attributes:
-        joint: Name of the joint.
-        has_frictionloss: Whether the stated joint has dry friction, which the term replaces.
+    MuJoCo keeps the static friction, which is the sum of two fields.
     """
 
     kind = "lugre"
@@ -219,148 +226,52 @@ class LuGre(_PassiveDevice):
         FieldDescription(name="damping", description="damping of the bristle", unit="N m s/rad"),
     )
     sources = (DE_WIT_1995, OLSSON_1998)
-
-    joint: str
-    has_frictionloss: bool
+    is_written_as_a_whole = True
+    places: ClassVar[Places] = {
+        "coulomb": ("biasprm[3]", "biasprm[4]"),
+        "excess": ("biasprm[4]",),
+        "speed": ("biasprm[5]",),
+        "stiffness": ("dynprm[5]",),
+        "damping": ("dynprm[6]",),
+    }
 
     @classmethod
-    def of(cls, table: TermTable, model: Any, period: float) -> LuGre:
-        """Resolve the term."""
-        at = JointSizes.of(table, model, period, cls.kind)
-        require_free_name(model, "actuator", table.name)
-
+    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
+        """Fields where the table states nothing."""
         stiffness, damping = BRISTLE_STIFFNESS, BRISTLE_DAMPING
         if is_rk4(model):
             stiffness, damping = BRISTLE_STIFFNESS_RK4, BRISTLE_DAMPING_RK4
         timestep = float(model.opt.timestep)
-        frictionloss = float(model.dof_frictionloss[at.dof])
-        defaults = {
-            "coulomb": frictionloss,
-            "excess": 0.0,
-            "speed": STRIBECK_SHARE * at.speed,
-            "stiffness": rounded(stiffness * at.inertia / timestep**2),
-            "damping": rounded(damping * at.inertia / timestep),
+        stiffness = rounded(stiffness * at.inertia / timestep**2)
+        damping = rounded(damping * at.inertia / timestep)
+        return {
+            "coulomb": _friction(at, float(model.dof_frictionloss[at.dof])),
+            "excess": _friction(at, 0.0),
+            "speed": _stribeck_speed(at),
+            # Without stiffness there is no bristle, which MuJoCo decides at the compile.
+            "stiffness": TermQuantity(
+                value=stiffness,
+                unit=JOINT_FIELD_UNITS["stiffness"][at.unit],
+                size=stiffness,
+                bounds=(LEAST_STRIBECK_SHARE * stiffness, np.inf),
+            ),
+            "damping": TermQuantity(
+                value=damping,
+                unit=JOINT_FIELD_UNITS["damping"][at.unit],
+                size=damping,
+                bounds=(0.0, np.inf),
+            ),
         }
-        values = resolved_values(cls.kind, table, defaults)
 
-        actuator = f"actuator/{table.name}"
-        positive = (0.0, np.inf)
-        quantities = (
-            (
-                "coulomb",
-                TermQuantity(
-                    value=values["coulomb"],
-                    unit=FORCE_UNITS[at.unit],
-                    size=at.force,
-                    bounds=positive,
-                    numbers=((f"{actuator}:biasprm[3]", 1.0), (f"{actuator}:biasprm[4]", 1.0)),
-                ),
-            ),
-            (
-                "excess",
-                TermQuantity(
-                    value=values["excess"],
-                    unit=FORCE_UNITS[at.unit],
-                    size=at.force,
-                    bounds=positive,
-                    numbers=((f"{actuator}:biasprm[4]", 1.0),),
-                ),
-            ),
-            ("speed", _stribeck_speed(values["speed"], at, f"{actuator}:biasprm[5]")),
-            (
-                "stiffness",
-                TermQuantity(
-                    value=values["stiffness"],
-                    unit=JOINT_FIELD_UNITS["stiffness"][at.unit],
-                    size=defaults["stiffness"],
-                    # Without stiffness there is no bristle, which MuJoCo decides at the compile.
-                    bounds=(LEAST_STRIBECK_SHARE * defaults["stiffness"], np.inf),
-                    numbers=((f"{actuator}:dynprm[5]", 1.0),),
-                ),
-            ),
-            (
-                "damping",
-                TermQuantity(
-                    value=values["damping"],
-                    unit=JOINT_FIELD_UNITS["damping"][at.unit],
-                    size=defaults["damping"],
-                    bounds=positive,
-                    numbers=((f"{actuator}:dynprm[6]", 1.0),),
-                ),
-            ),
-        )
-        return cls(
-            name=table.name,
-            joint=at.joint,
-            quantities=quantities,
-            has_frictionloss=frictionloss > 0.0,
-        )
-
-    @property
-    def is_written_as_a_whole(self) -> bool:
-        """MuJoCo keeps the static friction, which is the sum of two fields."""
-        return True
-
-    def write(self, model: Any, values: Mapping[str, float]) -> None:
-        """Write all fields."""
-        row = model.actuator(self.name).id
-        model.actuator_biasprm[row, 3] = values["coulomb"]
-        model.actuator_biasprm[row, 4] = values["coulomb"] + values["excess"]
-        model.actuator_biasprm[row, 5] = values["speed"]
-        model.actuator_dynprm[row, 5] = values["stiffness"]
-        model.actuator_dynprm[row, 6] = values["damping"]
-
-    def edit(self, spec: Any) -> None:
-        """Add the passive device, and take the dry friction from the joint."""
-        super().edit(spec)
-        if self.has_frictionloss:
-            spec.joint(self.joint).frictionloss = 0.0
-
-    def changes(self) -> tuple[MjcfChange, ...]:
-        """The element in the text, and the joint without dry friction."""
-        added = super().changes()
-        if not self.has_frictionloss:
-            return added
-        joint = ChangedElement(
-            kind="joint", name=self.joint, attributes=(("frictionloss", (0.0,)),)
-        )
-        return (*added, joint)
-
-    @property
-    def _attributes(self) -> Attributes:
-        """The friction, and a range that keeps its damping explicit."""
-        static = self.value("coulomb") + self.value("excess")
-        numbers = (
-            self.value("stiffness"),
-            self.value("damping"),
-            self.value("coulomb"),
-            static,
-            self.value("speed"),
-        )
-        return (("saturation", (NO_ELECTRICAL_FORCE,)), ("lugre", numbers))
-
-    def _set(self, actuator: Any) -> None:
-        """Set the numbers of the actuator in an MjSpec."""
-        actuator.actdim = 1
-        bristle = {5: self.value("stiffness"), 6: self.value("damping")}
-        actuator.dynprm = _with(actuator.dynprm, bristle)
-        friction = {
-            3: self.value("coulomb"),
-            4: self.value("coulomb") + self.value("excess"),
-            5: self.value("speed"),
-        }
-        actuator.biasprm = _with(actuator.biasprm, friction)
-        actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
-        actuator.forcerange = np.array([-NO_ELECTRICAL_FORCE, NO_ELECTRICAL_FORCE])
+    @classmethod
+    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
+        """No further numbers."""
+        return ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class AsymmetricFriction(_PassiveDevice):
-    """A constant force beside the joint's dry friction, which then differs by direction.
-
-    Attributes:
-        joint: Name of the joint.
-    """
+    """A constant force beside the joint's dry friction, which then differs by direction."""
 
     kind = "asymmetric_friction"
     description = (
@@ -378,48 +289,29 @@ class AsymmetricFriction(_PassiveDevice):
         ),
     )
     sources = (ARMSTRONG_1994,)
-
-    joint: str
+    places: ClassVar[Places] = {"offset": ("biasprm[0]",)}
 
     @classmethod
-    def of(cls, table: TermTable, model: Any, period: float) -> AsymmetricFriction:
-        """Resolve the term."""
-        at = JointSizes.of(table, model, period, cls.kind)
-        require_free_name(model, "actuator", table.name)
-        values = resolved_values(cls.kind, table, {"offset": 0.0})
-        offset = TermQuantity(
-            value=values["offset"],
-            unit=FORCE_UNITS[at.unit],
-            size=at.force,
-            numbers=((f"actuator/{table.name}:biasprm[0]", 1.0),),
-        )
-        return cls(name=table.name, joint=at.joint, quantities=(("offset", offset),))
+    def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
+        """Fields where the table states nothing."""
+        return {"offset": replace(_friction(at, 0.0), bounds=(-np.inf, np.inf))}
 
-    @property
-    def _attributes(self) -> Attributes:
-        """The constant force."""
-        return (("cogging", (self.value("offset"), 0.0, CONSTANT_PHASE)),)
-
-    def _set(self, actuator: Any) -> None:
-        """Set the numbers of the actuator in an MjSpec."""
-        constant = {0: self.value("offset"), 2: CONSTANT_PHASE}
-        actuator.biasprm = _with(actuator.biasprm, constant)
+    @classmethod
+    def _fixed(cls, at: JointSizes, model: Any) -> tuple[tuple[str, float], ...]:
+        """The phase of the cogging torque."""
+        return (("biasprm[2]", CONSTANT_PHASE),)
 
 
-def _stribeck_speed(value: float, at: JointSizes, path: str) -> TermQuantity:
+def _friction(at: JointSizes, value: float) -> TermQuantity:
+    """A force of dry friction as a field."""
+    return TermQuantity(value=value, unit=FORCE_UNITS[at.unit], size=at.force, bounds=(0.0, np.inf))
+
+
+def _stribeck_speed(at: JointSizes) -> TermQuantity:
     """The Stribeck speed of a joint as a field; it is never zero."""
     return TermQuantity(
-        value=value,
+        value=STRIBECK_SHARE * at.speed,
         unit=per_second(at.unit),
         size=STRIBECK_SHARE * at.speed,
         bounds=(LEAST_STRIBECK_SHARE * at.speed, np.inf),
-        numbers=((path, 1.0),),
     )
-
-
-def _with(numbers: Any, changed: Mapping[int, float]) -> np.ndarray:
-    """A copy of some numbers, of which those at given places are replaced."""
-    copied = np.array(numbers, dtype=np.float64)
-    for place, value in changed.items():
-        copied[place] = value
-    return copied

@@ -2,7 +2,7 @@
 
 The motor acts on a fixed tendon over its joint and over a slide along the axis of the joint. Its
 torque is the torque of the joint, as before, and presses a ball on the slide against one of two
-plates with a force in proportion to it. The ball turns with the link and the plates do not, so that
+buffers with a force in proportion to it. The ball turns with the link and the buffers do not, so
 the torsional friction of the contact is a dry friction of the joint in proportion to the torque.
 
 The slide has an armature and no mass to speak of. Its armature is so small that the slip of the
@@ -22,16 +22,21 @@ import scipy
 from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
 from mjfim.model.sizes import model_length
-from mjfim.model.terms.changes import Attributes, ChangedElement, MjcfChange, NewElement
-from mjfim.model.terms.joint_sizes import rounded
 from mjfim.model.terms.term import (
     FieldDescription,
     Term,
     TermQuantity,
     TermTable,
+    add_body,
+    add_plain_joint,
+    joint_inertia,
+    light_body,
+    motors_at,
+    move_to_tendon,
     named_element,
     require_free_name,
-    resolved_values,
+    rounded,
+    stated_quantities,
 )
 
 # Radius of the ball over the length of the model.
@@ -39,9 +44,6 @@ BALL_SHARE = 0.3
 
 # Armature of the slide, as an inertia on the side of the joint, over the inertia of the joint.
 ARMATURE_SHARE = 1e-3
-
-# Mass and inertia of the ball over those of the link.
-NEGLIGIBLE = 1e-6
 
 # Time constant of the contacts over the timestep, the shortest that MuJoCo follows.
 CONTACT_TIME = 2.0
@@ -62,6 +64,8 @@ SMALL_COEFFICIENT = 1e-3
 LEAST_TORSIONAL = 1.5
 
 WORLD = "world"
+# Names of the two buffers.
+SIDES = ("up", "down")
 
 DUCLAUSAUD_2025 = (
     "M. Duclusaud, G. Passault, V. Padois and O. Ly, Extended friction models for the physics "
@@ -84,8 +88,7 @@ class LoadDependentFriction(Term):
         base: Name of the parent of that body.
         axis: Axis of the joint in the frame of the link.
         place: Anchor of the joint in the frame of the link [m].
-        plates: Places of the two plates in the frame of the base [m].
-        quat: Orientation of the plates in the frame of the base (w, x, y, z).
+        buffers: Places of the two buffers in the frame of the base [m].
         radius: Radius of the ball [m].
         armature: Armature of the slide [kg].
         carrier: Mass [kg] and inertia [kg m²] of the ball.
@@ -101,7 +104,7 @@ class LoadDependentFriction(Term):
     equation = "F = -coefficient · |torque of the motors| · sgn(v)"
     elements = (
         "the motors act on a tendon/fixed over the joint and a slide, which presses a sphere "
-        "against two plates; contact/pair with torsional friction"
+        "against two buffers; contact/pair with torsional friction"
     )
     acts_on = "actuator"
     fields = (
@@ -117,8 +120,7 @@ class LoadDependentFriction(Term):
     base: str
     axis: tuple[float, ...]
     place: tuple[float, ...]
-    plates: tuple[tuple[float, ...], tuple[float, ...]]
-    quat: tuple[float, ...]
+    buffers: tuple[tuple[float, ...], tuple[float, ...]]
     radius: float
     armature: float
     carrier: tuple[float, float]
@@ -142,10 +144,13 @@ class LoadDependentFriction(Term):
                 "body no other joint"
             )
 
-        dof = int(model.jnt_dofadr[joint])
-        weight = float(model.dof_invweight0[dof])
-        inertia = 1.0 / weight if weight > 0.0 else 1.0
-        radius = rounded(BALL_SHARE * model_length(model))
+        motors = motors_at(model, joint)
+        for other, actuator in motors.items():
+            _driven_hinge(model, other, actuator)
+
+        # With a power of two, the ball touches the buffers exactly, and its gear has few digits.
+        radius = 2.0 ** round(np.log2(BALL_SHARE * model_length(model)))
+        inertia = joint_inertia(model, joint)
         axis, place = np.array(model.jnt_axis[joint]), np.array(model.jnt_pos[joint])
         turn = scipy.spatial.transform.Rotation.from_quat(model.body_quat[body], scalar_first=True)
         centre = model.body_pos[body] + turn.apply(place)
@@ -154,59 +159,46 @@ class LoadDependentFriction(Term):
         # MuJoCo replaces coefficients below its minimum, so that no fit could begin there.
         least = LEAST_TORSIONAL * float(mujoco.mjMINMU) / radius
         default = max(SMALL_COEFFICIENT, 2.0 * least)
-        values = resolved_values(cls.kind, table, {"coefficient": default})
-        pairs = [f"pair/{table.name}_{side}:friction[{TORSIONAL}]" for side in ("up", "down")]
+        pairs = [f"pair/{table.name}_{side}:friction[{TORSIONAL}]" for side in SIDES]
         quantity = TermQuantity(
-            value=values["coefficient"],
+            value=default,
             unit="",
             size=1.0,
             bounds=(least, np.inf),
             numbers=tuple((path, radius) for path in pairs),
         )
-        mass = float(model.body_mass[body]) or float(model.body_subtreemass[body])
         return cls(
             name=table.name,
-            motors=_motors(model, joint),
+            motors=tuple(motors),
             joint=element_name(model, "joint", joint),
             link=link,
             base=base,
             axis=tuple(axis.tolist()),
             place=tuple(place.tolist()),
-            plates=(
+            buffers=(
                 tuple((centre + 2.0 * radius * direction).tolist()),
                 tuple((centre - 2.0 * radius * direction).tolist()),
             ),
-            quat=_towards(direction),
             radius=radius,
             armature=rounded(ARMATURE_SHARE * inertia / radius**2),
-            carrier=(rounded(NEGLIGIBLE * mass), rounded(NEGLIGIBLE * inertia)),
+            carrier=light_body(model, body, inertia),
             contact_time=CONTACT_TIME * float(model.opt.timestep),
             enables_contacts=_enables_contacts(model),
-            quantities=(("coefficient", quantity),),
+            quantities=stated_quantities(cls.kind, table, {"coefficient": quantity}),
         )
 
     def edit(self, spec: Any) -> None:
-        """Add the ball, the plates, their contacts and the tendon."""
+        """Add the ball, the buffers, their contacts and the tendon."""
         if self.enables_contacts:
             spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-
-        base = spec.worldbody if self.base == WORLD else spec.body(self.base)
-        for side, place in zip(("up", "down"), self.plates, strict=True):
-            plate = self._add_geom(base, side, mujoco.mjtGeom.mjGEOM_BOX)
-            plate.size = np.full(3, self.radius)
-            plate.pos = place
-            plate.quat = self.quat
-
-        ball = spec.body(self.link).add_body(name=self.name)
+        ball = add_body(spec.body(self.link), self.name, *self.carrier, np.zeros(3))
         ball.pos = self.place
-        ball.mass = self.carrier[0]
-        ball.inertia = np.full(3, self.carrier[1])
-        ball.explicitinertial = True
-        geom = self._add_geom(ball, "ball", mujoco.mjtGeom.mjGEOM_SPHERE)
-        geom.size = [self.radius, 0.0, 0.0]
-        self._add_slide(ball)
-
-        for side in ("up", "down"):
+        slide = add_plain_joint(ball, self.name, self.axis, np.zeros(3), slides=True)
+        slide.armature = self.armature
+        self._add_sphere(ball, "ball")
+        base = spec.worldbody if self.base == WORLD else spec.body(self.base)
+        for side, place in zip(SIDES, self.buffers, strict=True):
+            self._add_sphere(base, side).pos = place
             pair = spec.add_pair(name=f"{self.name}_{side}")
             pair.geomname1, pair.geomname2 = f"{self.name}_ball", f"{self.name}_{side}"
             pair.condim = 4
@@ -217,119 +209,16 @@ class LoadDependentFriction(Term):
         tendon = spec.add_tendon(name=self.name)
         tendon.wrap_joint(self.joint, 1.0)
         tendon.wrap_joint(self.name, 1.0 / self.radius)
-        for name in self.motors:
-            actuator = spec.actuator(name)
-            actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
-            actuator.target = self.name
+        move_to_tendon(spec, self.motors, self.name)
 
-    def _add_geom(self, body: Any, suffix: str, kind: Any) -> Any:
-        """Add a geom without mass that touches nothing but its pair."""
-        geom = body.add_geom(name=f"{self.name}_{suffix}", type=kind)
+    def _add_sphere(self, body: Any, suffix: str) -> Any:
+        """Add a sphere without mass that touches nothing but its pair."""
+        geom = body.add_geom(name=f"{self.name}_{suffix}", type=mujoco.mjtGeom.mjGEOM_SPHERE)
+        geom.size = [self.radius, 0.0, 0.0]
         geom.contype, geom.conaffinity, geom.mass = 0, 0, 0.0
         geom.group = HIDDEN_GROUP
         geom.rgba = np.zeros(4)
         return geom
-
-    def _add_slide(self, ball: Any) -> None:
-        """Add the slide of the ball, on which nothing else acts."""
-        slide = ball.add_joint(
-            name=self.name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=self.axis, armature=self.armature
-        )
-        slide.stiffness, slide.damping = np.zeros(3), np.zeros(3)
-        slide.frictionloss, slide.ref, slide.springref = 0.0, 0.0, 0.0
-        slide.limited = mujoco.mjtLimited.mjLIMITED_FALSE
-        slide.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-
-    def changes(self) -> tuple[MjcfChange, ...]:
-        """The elements in the text."""
-        changes: list[MjcfChange] = [self._plate(side) for side in (0, 1)]
-        if self.enables_contacts:
-            enabled: Attributes = (("contact", "enable"),)
-            changes.append(ChangedElement(kind="flag", name="", attributes=enabled))
-
-        slide: Attributes = (
-            ("name", self.name),
-            ("type", "slide"),
-            ("axis", self.axis),
-            ("armature", (self.armature,)),
-            *((name, "0") for name in ("stiffness", "damping", "frictionloss", "ref")),
-            ("springref", "0"),
-            ("limited", "false"),
-            ("actuatorfrclimited", "false"),
-        )
-        inertial: Attributes = (
-            ("pos", "0 0 0"),
-            ("mass", (self.carrier[0],)),
-            ("diaginertia", 3 * (self.carrier[1],)),
-        )
-        ball = self._geom("ball", (("type", "sphere"), ("size", (self.radius,))))
-        changes.append(
-            NewElement(
-                parent_kind="body",
-                parent=self.link,
-                tag="body",
-                attributes=(("name", self.name), ("pos", self.place)),
-                children=(("inertial", inertial), ("joint", slide), ("geom", ball)),
-            )
-        )
-        changes += [self._pair(side) for side in ("up", "down")]
-
-        over = (
-            ("joint", (("joint", self.joint), ("coef", "1"))),
-            ("joint", (("joint", self.name), ("coef", (1.0 / self.radius,)))),
-        )
-        name: Attributes = (("name", self.name),)
-        changes.append(NewElement(parent="tendon", tag="fixed", attributes=name, children=over))
-        for motor in self.motors:
-            on_tendon: Attributes = (("tendon", self.name),)
-            changes.append(
-                ChangedElement(
-                    kind="actuator", name=motor, attributes=on_tendon, removed=("joint",)
-                )
-            )
-        return tuple(changes)
-
-    def _geom(self, suffix: str, shape: Attributes) -> Attributes:
-        """Attributes of a geom without mass that touches nothing but its pair."""
-        return (
-            ("name", f"{self.name}_{suffix}"),
-            *shape,
-            ("contype", "0"),
-            ("conaffinity", "0"),
-            ("mass", "0"),
-            ("group", str(HIDDEN_GROUP)),
-            ("rgba", "0 0 0 0"),
-        )
-
-    def _plate(self, side: int) -> NewElement:
-        """One of the plates in the text."""
-        shape: Attributes = (
-            ("type", "box"),
-            ("size", 3 * (self.radius,)),
-            ("pos", self.plates[side]),
-            ("quat", self.quat),
-        )
-        in_world = self.base == WORLD
-        return NewElement(
-            parent_kind="" if in_world else "body",
-            parent="worldbody" if in_world else self.base,
-            tag="geom",
-            attributes=self._geom(("up", "down")[side], shape),
-        )
-
-    def _pair(self, side: str) -> NewElement:
-        """One of the contacts in the text."""
-        friction = (0.0, 0.0, self.radius * self.value("coefficient"), 0.0, 0.0)
-        attributes: Attributes = (
-            ("name", f"{self.name}_{side}"),
-            ("geom1", f"{self.name}_ball"),
-            ("geom2", f"{self.name}_{side}"),
-            ("condim", "4"),
-            ("friction", friction),
-            ("solref", (self.contact_time, 1.0)),
-            ("solimp", IMPEDANCE),
-        )
-        return NewElement(parent="contact", tag="pair", attributes=attributes)
 
 
 def _driven_hinge(model: Any, name: str, actuator: int) -> int:
@@ -344,26 +233,6 @@ def _driven_hinge(model: Any, name: str, actuator: int) -> int:
             "servo would contain the position of the contact"
         )
     return joint
-
-
-def _motors(model: Any, joint: int) -> tuple[str, ...]:
-    """Names of the direct drives at a joint; ExperimentError for other actuators there."""
-    found = []
-    for actuator in range(model.nactuator):
-        is_here = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
-        if not is_here or int(model.actuator_trnid[actuator, 0]) != joint:
-            continue
-        name = element_name(model, "actuator", actuator)
-        if model.actuator_ctrlnum[actuator] and name:
-            _driven_hinge(model, name, actuator)
-            found.append(name)
-    return tuple(found)
-
-
-def _towards(direction: Any) -> tuple[float, ...]:
-    """Quaternion that turns the z axis towards a direction: (3,)."""
-    turn, _ = scipy.spatial.transform.Rotation.align_vectors([direction], [[0.0, 0.0, 1.0]])
-    return tuple(turn.as_quat(scalar_first=True).tolist())
 
 
 def _enables_contacts(model: Any) -> bool:

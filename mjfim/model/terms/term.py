@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.model.elements import identifier, names_of
-from mjfim.model.terms.changes import MjcfChange
+from mjfim.model.elements import element_name, identifier, names_of
+from mjfim.model.sizes import LEAST_MOVE_PER_SAMPLE, force_sizes, position_sizes
+from mjfim.model.units import joint_unit
+
+# Significant digits of numbers that the library chooses.
+CHOSEN_DIGITS = 3
+
+# Mass and inertia of a body that a term adds for its geometry alone, over those of the link.
+NEGLIGIBLE = 1e-6
 
 # Keys of a table `[terms.<name>]` that name the element on which the term acts.
 ELEMENT_KEYS = ("joint", "actuator", "body")
@@ -49,7 +57,7 @@ class TermQuantity:
     unit: str
     size: float
     bounds: tuple[float, float] = (-np.inf, np.inf)
-    numbers: tuple[tuple[str, float], ...]
+    numbers: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +89,7 @@ class Term(ABC):
         acts_on: Key of the table that names the element on which it acts; empty for the base.
         fields: Its fields.
         sources: Publications that describe it.
+        is_written_as_a_whole: Whether some number of the model depends on several fields.
         name: Name of the term, and of the elements that it adds.
         quantities: Its fields, resolved against the model, by name.
     """
@@ -92,6 +101,7 @@ class Term(ABC):
     acts_on: ClassVar[str]
     fields: ClassVar[tuple[FieldDescription, ...]]
     sources: ClassVar[tuple[str, ...]]
+    is_written_as_a_whole: ClassVar[bool] = False
 
     name: str
     quantities: tuple[tuple[str, TermQuantity], ...]
@@ -113,10 +123,6 @@ class Term(ABC):
     @abstractmethod
     def edit(self, spec: Any) -> None:
         """Add the elements of the term to an MjSpec, in place."""
-
-    @abstractmethod
-    def changes(self) -> tuple[MjcfChange, ...]:
-        """Changes of the MJCF text that add the term, with the values of the model."""
 
     def quantity(self, field: str) -> TermQuantity:
         """A field of the term.
@@ -149,27 +155,23 @@ class Term(ABC):
         """
         raise NotImplementedError(self.kind)
 
-    @property
-    def is_written_as_a_whole(self) -> bool:
-        """Whether some number of the model depends on several fields."""
-        return False
 
-
-def resolved_values(kind: str, table: TermTable, defaults: Mapping[str, float]) -> dict[str, float]:
-    """Values of all fields of a term: those of the table, and defaults.
-
-    Args:
-        kind: Kind of the term, for messages.
-        table: The table.
-        defaults: Default by field.
+def stated_quantities(
+    kind: str, table: TermTable, defaults: dict[str, TermQuantity]
+) -> tuple[tuple[str, TermQuantity], ...]:
+    """Fields of a term by name, with the values that a table states in place of the defaults.
 
     Raises:
         ExperimentError: The table states a field that the kind does not have.
     """
-    for field, _ in table.values:
+    stated = dict(table.values)
+    for field in stated:
         if field not in defaults:
             raise ExperimentError(f"values: {unknown(f'field of {kind!r}', field, list(defaults))}")
-    return {**defaults, **dict(table.values)}
+    return tuple(
+        (field, replace(quantity, value=stated.get(field, quantity.value)))
+        for field, quantity in defaults.items()
+    )
 
 
 def named_element(table: TermTable, key: str, model: Any, kind: str) -> tuple[str, int]:
@@ -213,3 +215,128 @@ def require_free_name(model: Any, kind: str, name: str) -> None:
             f"the model has {'an' if kind == 'actuator' else 'a'} {kind} {name!r} already; give "
             "the term another name"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSizes:
+    """Natural sizes at a slide or hinge joint.
+
+    Attributes:
+        joint: Name of the joint.
+        number: Number of the joint.
+        dof: Its degree of freedom.
+        unit: Unit of its coordinate, m or rad.
+        inertia: Inertia that its force feels in the reference position [kg or kg m²].
+        force: Force that moves it by its natural size in the natural time [N or N m].
+        speed: Its natural size over the natural time [m/s or rad/s].
+    """
+
+    joint: str
+    number: int
+    dof: int
+    unit: str
+    inertia: float
+    force: float
+    speed: float
+
+    @staticmethod
+    def of(table: TermTable, model: Any, period: float, kind: str) -> JointSizes:
+        """Sizes at the joint that a table names; ExperimentError for ball and free joints."""
+        name, number = named_element(table, "joint", model, kind)
+        scalar = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+        if int(model.jnt_type[number]) not in scalar:
+            raise ExperimentError(
+                f"joint: {name!r} is a ball or free joint; a term of kind {kind!r} acts on slides "
+                "and hinges"
+            )
+
+        time = period / LEAST_MOVE_PER_SAMPLE
+        dof = int(model.jnt_dofadr[number])
+        return JointSizes(
+            joint=name,
+            number=number,
+            dof=dof,
+            unit=joint_unit(model, number),
+            inertia=joint_inertia(model, number),
+            force=float(force_sizes(model, time)[dof]),
+            speed=float(position_sizes(model)[dof]) / time,
+        )
+
+
+def rounded(number: float) -> float:
+    """A number that the library chooses, with as many digits as matter."""
+    return float(f"{number:.{CHOSEN_DIGITS}g}")
+
+
+def joint_inertia(model: Any, joint: int) -> float:
+    """Inertia that the force of a joint feels in the reference position [kg or kg m²]."""
+    weight = float(model.dof_invweight0[int(model.jnt_dofadr[joint])])
+    return 1.0 / weight if weight > 0.0 else 1.0
+
+
+def motors_at(model: Any, joint: int) -> dict[str, int]:
+    """Names and numbers of the actuators with a control at a joint.
+
+    Raises:
+        ExperimentError: One of them has no name; the message is a clause.
+    """
+    at_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    here = at_joint & (model.actuator_trnid[:, 0] == joint) & (model.actuator_ctrlnum > 0)
+    found = {element_name(model, "actuator", i): i for i in np.flatnonzero(here).tolist()}
+    if "" in found:
+        raise ExperimentError("joint: an actuator at the joint has no name; give it one")
+    return found
+
+
+def move_to_tendon(spec: Any, motors: Iterable[str], tendon: str) -> None:
+    """Let actuators of an MjSpec act on a tendon in place of their joint."""
+    for name in motors:
+        actuator = spec.actuator(name)
+        actuator.trntype = mujoco.mjtTrn.mjTRN_TENDON
+        actuator.target = tendon
+
+
+def light_body(model: Any, body: int, inertia: float) -> tuple[float, float]:
+    """Mass and inertia of a body so light that its own motion does not matter.
+
+    Args:
+        model: The stated model.
+        body: The link behind which the body is.
+        inertia: Inertia that the joint of the link feels [kg m²].
+
+    Returns:
+        Mass [kg] and inertia [kg m²].
+    """
+    mass = float(model.body_mass[body]) or float(model.body_subtreemass[body])
+    return rounded(NEGLIGIBLE * mass), rounded(NEGLIGIBLE * inertia)
+
+
+def add_body(parent: Any, name: str, mass: float, inertia: float, com: Any) -> Any:
+    """Add a body to another one of an MjSpec, with an inertia that is equal about all axes."""
+    body = parent.add_body(name=name)
+    body.mass = mass
+    body.ipos = np.array(com)
+    body.inertia = np.full(3, inertia)
+    body.explicitinertial = True
+    return body
+
+
+def add_plain_joint(body: Any, name: str, axis: Any, place: Any, *, slides: bool) -> Any:
+    """Add a slide or hinge to a body of an MjSpec, on which nothing acts whatever its class is."""
+    kind = mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
+    joint = body.add_joint(name=name, type=kind, axis=axis, pos=place)
+    joint.stiffness = np.zeros(np.size(joint.stiffness))
+    joint.damping = np.zeros(np.size(joint.damping))
+    joint.armature, joint.frictionloss = 0.0, 0.0
+    joint.ref, joint.springref = 0.0, 0.0
+    joint.springdamper = np.zeros(2)
+    joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+    joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    return joint
+
+
+def with_first(polynomial: Any, value: float) -> np.ndarray:
+    """Coefficients of a polynomial force of which only the first one is not zero."""
+    numbers = np.zeros(np.size(polynomial))
+    numbers[0] = value
+    return numbers

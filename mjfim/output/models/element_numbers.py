@@ -31,11 +31,11 @@ from mjfim.output.models.model_xml import (
 # By kind of element, the arrays of MjModel whose numbers its attributes state, and those of an
 # <inertial>.
 ARRAYS: dict[str, dict[str, str]] = {
-    "geom": {"pos": "geom_pos", "size": "geom_size", **MODEL_ARRAYS["geom"]},
+    "geom": {"pos": "geom_pos", "quat": "geom_quat", "size": "geom_size", **MODEL_ARRAYS["geom"]},
     "pair": MODEL_ARRAYS["pair"],
     "body": {"pos": "body_pos", "quat": "body_quat", "gravcomp": "body_gravcomp"},
     "site": {"quat": "site_quat", **MODEL_ARRAYS["site"]},
-    "joint": MODEL_ARRAYS["joint"],
+    "joint": {"pos": "jnt_pos", "axis": "jnt_axis", **MODEL_ARRAYS["joint"]},
     "tendon": MODEL_ARRAYS["tendon"],
     "actuator": MODEL_ARRAYS["actuator"],
 }
@@ -47,7 +47,7 @@ INERTIAL = {
 }
 
 # Fewest numbers of the attributes that MuJoCo takes as a whole only.
-LEAST = {"pos": 3, "quat": 4, "diaginertia": 3, "gravity": 3, "wind": 3}
+LEAST = {"pos": 3, "axis": 3, "quat": 4, "diaginertia": 3, "gravity": 3, "wind": 3}
 
 # Numbers that determine the force of an actuator. By element and attribute, where each number of
 # the attribute stands among them: array, column and sign. A <general> states the arrays.
@@ -225,10 +225,25 @@ class _Statement:
         if changed:
             printed = etree.fromstring(self._spec.to_xml().encode())
             (general,) = printed.xpath("//actuator/*[@name=$name]", name=element.get("name"))
-            own = {key: text for key, text in element.attrib.items() if key in general.attrib}
-            element.tag = general.tag
-            element.attrib.clear()
-            element.attrib.update({**general.attrib, **own})
+            state_as_general(element, general, general)
+
+
+def state_as_general(element: Any, printed: Any, before: Any) -> None:
+    """State an actuator as a <general>, as MuJoCo prints it.
+
+    Args:
+        element: The actuator of the user's text.
+        printed: The element that MuJoCo prints for it.
+        before: The same before a change; the user's spelling of what has not changed stays.
+    """
+    own = {
+        key: text
+        for key, text in element.attrib.items()
+        if key in printed.attrib and before.get(key) == printed.get(key)
+    }
+    element.tag = printed.tag
+    element.attrib.clear()
+    element.attrib.update({**printed.attrib, **own})
 
 
 def _numbers(model: Any, kind: str, i: int) -> dict[str, Array]:

@@ -6,11 +6,13 @@ numbers differ states those of the identified one. A file is written only if it 
 
 from __future__ import annotations
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+from lxml import etree
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, first_ones, listed
@@ -20,20 +22,24 @@ from mjfim.model.loading import ModelSource, compile_spec
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS
 from mjfim.model.targets import OutputBiasField, OutputDelayField, OutputScaleField, SpecField
-from mjfim.model.terms.changes import Attributes, ChangedElement, NewElement
-from mjfim.output.models.element_numbers import differ_in_inertia, state_differences
+from mjfim.output.models.element_numbers import (
+    differ_in_inertia,
+    state_as_general,
+    state_differences,
+)
 from mjfim.output.models.model_xml import (
     ModelXml,
     add_comment,
     add_element,
     all_digits,
-    child,
     loading,
 )
 from mjfim.output.models.urdf import urdf_files, write_identified_urdfs
 
-# Attributes of actuators that <general> does not have.
-OF_SHORTHANDS = ("kp", "kv", "dampratio", "timeconst", "inheritrange")
+# Elements with a name that a term may add or change.
+NAMED = (
+    "//worldbody//*[@name] | /mujoco/*[self::actuator or self::tendon or self::contact]/*[@name]"
+)
 
 # Prefixes of the arrays that determine the motion, and of those among them that only speed it up,
 # follow from others, or are compared as matrices.
@@ -125,13 +131,8 @@ def _edited(system: System, theta: Array, wanted: Any, urdfs: dict[Path, Path]) 
     xml = ModelXml(system.model_path)
     if xml.root.tag != "mujoco":
         raise ModelError(f"the model is no MJCF but <{xml.root.tag}>")
-    for term in source.terms.values():
-        for change in term.changes():
-            if isinstance(change, NewElement):
-                _add(xml, change, f"{term.kind} {term.name!r}")
-            else:
-                _change(xml, change)
     if source.terms:
+        _add_terms(xml, source)
         _extend_keyframes(xml, source)
 
     xml.attach(urdfs)
@@ -224,45 +225,45 @@ def _state_others(xml: ModelXml, parameters: ParameterSet, theta: Array) -> bool
 # ---- physical terms
 
 
-def _add(xml: ModelXml, new: NewElement, comment: str) -> None:
-    """Add an element of a term, with a comment that says what it is."""
-    if new.parent_kind:
-        parent = xml.named(new.parent_kind, new.parent)
-    else:
-        # Elements of a section keep their order, so that the new one is in the last section.
-        sections = xml.sections(new.parent)
-        parent = sections[-1] if sections else add_element(xml.root, new.parent)
-    element = add_element(parent, new.tag, _texts(new.attributes), comment=comment)
-    for tag, attributes in new.children:
-        add_element(element, tag, _texts(attributes))
+def _add_terms(xml: ModelXml, source: ModelSource) -> None:
+    """Add what MuJoCo prints for the model with its terms and not for the stated one."""
+    stated, extended = (
+        etree.fromstring(each.spec.to_xml().encode()) for each in (source.stated, source)
+    )
+    known = {_key(element): element for element in stated.xpath(NAMED)}
+    for element in extended.xpath(NAMED):
+        key, parent = _key(element), element.getparent()
+        if key not in known:
+            comment = next(
+                (
+                    f"{t.kind} {t.name!r}"
+                    for t in source.terms.values()
+                    if key[1].startswith(t.name)
+                ),
+                "",
+            )
+            if parent.tag != "body":
+                # Elements of a section keep their order, so that the new one is in the last one.
+                sections = xml.sections(parent.tag)
+                place = sections[-1] if sections else add_element(xml.root, parent.tag)
+            elif _key(parent) in known:
+                place = xml.named("body", parent.get("name"))
+            else:
+                continue
+            added = add_element(place, element.tag, dict(element.attrib), comment=comment)
+            added.extend(deepcopy(list(element)))
+        elif element.tag == "general" and dict(element.attrib) != dict(known[key].attrib):
+            state_as_general(xml.named("actuator", key[1]), element, known[key])
+
+    kept = {name for flag in extended.iter("flag") for name in flag.attrib}
+    for flag in xml.root.iter("flag"):
+        for name in {name for each in stated.iter("flag") for name in each.attrib} - kept:
+            flag.attrib.pop(name, None)
 
 
-def _change(xml: ModelXml, change: ChangedElement) -> None:
-    """Change the attributes of an element for a term."""
-    if change.kind == "option":
-        elements = xml.sections("option")[-1:] or [child(xml.root, "option")]
-    elif change.kind == "flag":
-        elements = list(xml.root.iter("flag"))
-    else:
-        elements = [xml.named(change.kind, change.name)]
-
-    for element in elements:
-        if change.tag and change.tag != element.tag:
-            is_shorthand = element.tag not in ("general", "motor")
-            element.tag = change.tag
-            for attribute in OF_SHORTHANDS if is_shorthand else ():
-                element.attrib.pop(attribute, None)
-            element.attrib.update(_texts(change.of_shorthand) if is_shorthand else {})
-        for attribute in change.removed:
-            element.attrib.pop(attribute, None)
-        element.attrib.update(_texts(change.attributes))
-
-
-def _texts(attributes: Attributes) -> dict[str, str]:
-    """Attributes of a term as the text states them."""
-    return {
-        name: value if isinstance(value, str) else all_digits(*value) for name, value in attributes
-    }
+def _key(element: Any) -> tuple[str, str]:
+    """Kind and name of an element that MuJoCo prints."""
+    return element.tag, element.get("name", "")
 
 
 def _extend_keyframes(xml: ModelXml, source: ModelSource) -> None:
