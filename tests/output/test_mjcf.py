@@ -382,16 +382,16 @@ def stiffen(spec: Any, value: float) -> None:
     spec.joint("j").armature = value
 
 
-def turn(spec: Any, value: float) -> None:
+def soften(spec: Any, value: float) -> None:
     """Another one, which changes what no parameter path names."""
-    spec.joint("j").axis = [0.0, 1.0, value]
+    spec.joint("j").margin = value
 
 
-@pytest.mark.parametrize("function", [stiffen, turn])
+@pytest.mark.parametrize("function", [stiffen, soften])
 def test_functions_of_the_spec(function: Any, tmp_path: Path) -> None:
     """A text states the numbers that a function changes; MuJoCo prints other changes."""
     task = task_of(RICH, tmp_path, {"function": function, "guess": 0.1, "scale": 1.0})
-    said = "jnt_axis" if function is turn else ""
+    said = "jnt_margin" if function is soften else ""
     new = written(task, 0.25, said=said)
     found = mujoco.MjModel.from_xml_path(str(new))
     assert same_dynamics(found, task.system.model_at(np.array([0.25])), 1e-6 if said else 1e-9)
