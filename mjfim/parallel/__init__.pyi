@@ -1,8 +1,14 @@
-from .carry_out import carry_out, results_or_here
-from .dispatch import Dispatch, LostWorkError, NumberedOrder, Outcome
-from .pool import LOST_SENTENCE, Pool
+from .dispatch import (
+    Dispatch,
+    LostWorkError,
+    NumberedOrder,
+    Outcome,
+    carry_out,
+    results,
+    results_or_here,
+)
+from .pool import LOST_SENTENCE, Pool, offer_result, pool_stop_token
 from .threads import cores, one_blas_thread, process_count, require_threads
-from .worker_process import offer_result, pool_stop_token
 from .workers import ExecutorLike, Workers
 
 __all__ = [
@@ -21,5 +27,6 @@ __all__ = [
     "pool_stop_token",
     "process_count",
     "require_threads",
+    "results",
     "results_or_here",
 ]

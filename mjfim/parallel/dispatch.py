@@ -1,22 +1,21 @@
-"""Orders under way on workers: lost ones are done again, and a request to stop takes effect."""
+"""Independent orders on workers or in this process: what is lost is done again."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, wait
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field
 from functools import partial
 from queue import Empty, SimpleQueue
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from mjfim.budget import Budget
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.interruption import hurried
-from mjfim.parallel.losses import is_loss, is_refused_by_pickle, is_shared_loss
 from mjfim.parallel.shared_value import AbsentValue, SentValue, attempt, owned_value
-from mjfim.parallel.workers import Workers
+from mjfim.parallel.workers import ExecutorLike, Workers, is_loss, is_refused_by_pickle
 
 T = TypeVar("T")
 Order = TypeVar("Order")
@@ -49,8 +48,8 @@ class Outcome(Generic[T]):
 
     Attributes:
         index: Number of the order.
-        found: The result; empty where the order is lost.
-        loss: Why there is no result, as a sentence; empty where there is one.
+        found: The result; empty where there is none.
+        loss: Sentence that says why there is no result.
     """
 
     index: int
@@ -64,11 +63,7 @@ class Outcome(Generic[T]):
 
     @property
     def result(self) -> T:
-        """The result.
-
-        Raises:
-            LostWorkError: The order is lost.
-        """
+        """The result; LostWorkError where there is none."""
         if self.is_lost:
             raise LostWorkError(self.loss)
         return self.found[0]
@@ -76,12 +71,7 @@ class Outcome(Generic[T]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NumberedOrder(Generic[Order]):
-    """An order with its number.
-
-    Attributes:
-        index: Number under which its outcome is reported.
-        order: The order.
-    """
+    """An order with its number."""
 
     index: int
     order: Order
@@ -89,35 +79,21 @@ class NumberedOrder(Generic[Order]):
 
 @dataclass(kw_only=True, eq=False)
 class _Work(Generic[Order]):
-    """An order that has no result yet.
-
-    Attributes:
-        index: Number of the order.
-        order: The order.
-        losses: How often its worker was lost.
-        needs_isolation: True where it may be the cause of the losses, and where others are lost
-            together with it.
-        values: Shared values that a worker did not have, by their hash.
-    """
+    """An order that has no result yet, the losses so far, and values that its worker lacked."""
 
     index: int
     order: Order
     losses: int = 0
-    needs_isolation: bool = False
     values: dict[str, SentValue] = field(default_factory=dict)
 
 
 class Dispatch(Generic[Order, T]):
     """Orders under way on workers; an order can be added at any time.
 
-    A task whose worker is killed is submitted again. Where all tasks of an executor are lost
-    together, it is not known which of them was the cause: an order that is lost for the second time
-    is therefore done while nothing else runs.
-
     Args:
         workers: The workers.
         function: Carries out an order; both can be pickled, and the result depends on the order
-            alone.
+            alone. An order whose worker was killed is carried out again.
         budget: Its token ends the work early; see `arrivals` for its time.
         source: Asked for a further order whenever there is a worker for it and none waits. It
             returns None where there is none at present.
@@ -128,56 +104,47 @@ class Dispatch(Generic[Order, T]):
         workers: Workers,
         function: Callable[[Order], T],
         budget: Budget,
-        source: Callable[[], NumberedOrder[Order] | None] | None = None,
+        source: Callable[[], NumberedOrder[Order] | None] = lambda: None,
     ) -> None:
         self._source = source
         self._workers = workers
         self._function = function
         self._budget = budget
         self._waiting: deque[_Work[Order]] = deque()
-        self._running: dict[Future[T | AbsentValue], _Work[Order]] = {}
-        self._ended: SimpleQueue[Future[T | AbsentValue]] = SimpleQueue()
+        self._running: dict[Future[Any], _Work[Order]] = {}
+        self._ended: SimpleQueue[Future[Any]] = SimpleQueue()
 
     def add(self, index: int, order: Order, *, next_one: bool = False) -> None:
-        """Add an order.
-
-        Args:
-            index: Number under which its outcome is reported.
-            order: The order.
-            next_one: Do it before all others that are not begun.
-        """
-        work = _Work(index=index, order=order)
-        if next_one:
-            self._waiting.appendleft(work)
-        else:
-            self._waiting.append(work)
+        """Add an order under a number; `next_one`: before all others that are not begun."""
+        add = self._waiting.appendleft if next_one else self._waiting.append
+        add(_Work(index=index, order=order))
 
     def withdraw(self) -> None:
         """Forget the orders that have not begun."""
         self._waiting.clear()
-        for future in [each for each in self._running if self._may_cancel(each)]:
+
+        # A Dask cluster would cancel tasks that run, too. Those that were submitted first do.
+        kept = self._workers.count if self._workers.is_cluster else 0
+        for future in list(self._running)[kept:]:
             if future.cancel():
                 del self._running[future]
 
     def arrivals(self) -> Iterator[Outcome[T]]:
         """Carry out all orders, also those that are added meanwhile.
 
-        After a request to stop nothing more is begun, and what has ended within `GRACE` seconds is
-        reported. If the caller ends the iteration, what runs is stopped. So is what still runs long
-        after the time of the budget is over, as a task that hangs or a cluster that has gone, if
-        the workers have ended any task before, of this or of earlier work.
+        After a request to stop, what the running tasks have found by then follows. The same holds
+        long after the end of the budget's time, where a task may hang.
 
         Yields:
-            The outcome of every order, in the order of arrival.
+            Outcomes in the order in which they arrive.
 
         Raises:
-            Exception: The error of an order that failed; the others are stopped.
-            ExperimentError: An order or its function cannot be sent to the workers, or a cluster
-                had no workers until its time was over.
+            ExperimentError: An order cannot be sent, or a cluster had no workers at all.
         """
         try:
-            while not self._budget.stop.requested:
-                self._fill()
+            while not self._budget.stop.requested and not self._is_overdue():
+                while len(self._running) < self._workers.window and self._has_waiting():
+                    self._submit(self._waiting.popleft())
                 if not self._running:
                     return
 
@@ -185,58 +152,33 @@ class Dispatch(Generic[Order, T]):
                 if outcome is not None:
                     self._workers.has_answered = True
                     yield outcome
-                elif self._is_overdue():
-                    self._abandon()
-                    return
-
             yield from self._collected()
         finally:
             # If the caller ended the iteration or an order failed, the others are stopped.
             if self._running:
                 self._collected()
 
-    def _fill(self) -> None:
-        """Submit orders while there are workers for them."""
-        while len(self._running) < self._workers.window and self._has_waiting():
-            if self._running and (self._waiting[0].needs_isolation or self._is_isolated):
-                return
-
-            self._submit(self._waiting.popleft())
-
-    @property
-    def _is_isolated(self) -> bool:
-        """True where an order runs that has to run alone."""
-        return len(self._running) == 1 and next(iter(self._running.values())).needs_isolation
-
     def _has_waiting(self) -> bool:
         """Check whether an order waits, and ask the source for one where none does."""
-        if not self._waiting and self._source is not None:
-            further = self._source()
-            if further is not None:
-                self.add(further.index, further.order)
+        further = None if self._waiting else self._source()
+        if further is not None:
+            self.add(further.index, further.order)
         return bool(self._waiting)
 
     def _submit(self, work: _Work[Order]) -> None:
-        """Submit an order; in an executor whose processes have ended, it is lost at once."""
+        """Submit an order with the values that a worker did not have."""
+        future: Future[Any]
         try:
-            future = self._submitted(work)
-        except BrokenExecutor as error:
-            future = Future()
-            future.set_exception(error)
+            future = self._workers.submit(partial(attempt, self._function, work.values), work.order)
         except Exception as error:
-            # Some executors, such as Dask, pickle a task while it is submitted.
-            if not is_refused_by_pickle(error):
+            # Some executors, such as Dask, pickle a task while it is submitted; in one whose
+            # processes have ended, it is lost at once.
+            if not is_loss(error) and not is_refused_by_pickle(error):
                 raise
             future = Future()
             future.set_exception(error)
-
         self._running[future] = work
         future.add_done_callback(self._ended.put)
-
-    def _submitted(self, work: _Work[Order]) -> Future[T | AbsentValue]:
-        """Submit an order, together with the values that a worker did not have."""
-        carry_out = partial(attempt, self._function, work.values)
-        return self._workers.submit(carry_out, work.order)
 
     def _next_outcome(self) -> Outcome[T] | None:
         """Wait for a task for a while; None where none has ended, or where it is done again."""
@@ -249,40 +191,35 @@ class Dispatch(Generic[Order, T]):
         work = self._running.pop(future, None)
         if work is None:
             return None
-        if _is_lost(future):
-            return self._done_again(work, is_shared=_is_shared(future))
 
-        # An order that needs values is submitted again with them.
-        result = _result_of(future)
-        self._workers.has_begun = True
-        if isinstance(result, AbsentValue):
+        error = None if future.cancelled() else future.exception()
+        if future.cancelled() or is_loss(error):
+            work.losses += 1
+            if work.losses == MAX_LOSSES:
+                return Outcome(index=work.index, loss=self._sentence_of_loss())
+        elif is_refused_by_pickle(error):
+            raise ExperimentError(
+                f"executor: the work cannot be sent to other processes ({error}). Functions, such "
+                "as parameters that are Python functions, must be stated at the top of a module "
+                "that the workers can import; lambdas and functions inside functions can be used "
+                "without an executor, or with threads"
+            ) from error
+        elif isinstance(result := future.result(), AbsentValue):
             work.values.update({digest: owned_value(digest) for digest in result.digests})
-            self._waiting.appendleft(work)
-            return None
-        return Outcome(index=work.index, found=(result,))
+        else:
+            return Outcome(index=work.index, found=(result,))
+        self._waiting.appendleft(work)
+        return None
 
-    def _done_again(self, work: _Work[Order], *, is_shared: bool) -> Outcome[T] | None:
-        """Put an order that was lost among the waiting ones, or report it after the last loss."""
-        work.losses += 1
-        work.needs_isolation = is_shared and work.losses == MAX_LOSSES - 1
-        if work.losses < MAX_LOSSES:
-            self._waiting.appendleft(work)
-            return None
-
-        sentence = (
-            f"the worker was lost {work.losses} times while it did this work "
+    def _sentence_of_loss(self) -> str:
+        """Why an order has no result."""
+        return (
+            f"the worker was lost {MAX_LOSSES} times while it did this work "
             f"({self._workers.probable_fault}), so this work is left out"
         )
-        return Outcome(index=work.index, loss=sentence)
-
-    # ---- the end before all orders are carried out
 
     def _is_overdue(self) -> bool:
-        """Check whether the time has been over for so long that nobody waits for what runs.
-
-        Raises:
-            ExperimentError: A cluster had no workers until the time was over.
-        """
+        """Check whether the time has been over for so long that nobody waits for what runs."""
         budget = self._budget
         limit = budget.deadline - budget.begun
         if budget.seconds_used - limit <= max(LONGEST_OVERTIME, OVERTIME_SHARE * limit):
@@ -294,100 +231,120 @@ class Dispatch(Generic[Order, T]):
             )
         return self._workers.has_answered
 
-    def _abandon(self) -> None:
-        """End all tasks at once; what they have found is lost."""
-        self.withdraw()
-        for future in self._running:
-            future.cancel()
-        if self._running and self._workers.pool is not None:
-            self._workers.pool.end_running()
-        self._running.clear()
-
     def _collected(self) -> list[Outcome[T]]:
         """Stop all tasks, and collect what has ended within `GRACE`, or was offered until then."""
         self.withdraw()
         pool = self._workers.pool
         if pool is not None and self._running:
             pool.stop()
-        left = _wait_for_all(list(self._running))
+
+        deadline = time.monotonic() + GRACE
+        _, left = wait(self._running, timeout=0.0)
+        while left and time.monotonic() < deadline and not hurried():
+            _, left = wait(self._running, timeout=min(POLL_INTERVAL, GRACE))
 
         found: list[Outcome[T]] = []
         for future, work in self._running.items():
+            results: list[Any] = []
             if future in left:
-                offered = [] if pool is None else pool.offered(future)
-                found += _outcomes(work.index, offered)
+                # Nobody waits any longer for a task that does not look at the request.
+                future.cancel()
+                results = [] if pool is None else pool.offered(future)
             elif not future.cancelled() and future.exception() is None:
-                found += _outcomes(work.index, [future.result()])
+                results = [future.result()]
+            found += [
+                Outcome(index=work.index, found=(result,))
+                for result in results
+                if not isinstance(result, AbsentValue)
+            ]
 
-        # Nobody waits any longer for a task that does not look at the request.
-        for future in left:
-            future.cancel()
         if pool is not None and left:
             pool.end_running()
         elif pool is not None:
             pool.resume()
-
         self._running.clear()
         return found
 
-    def _may_cancel(self, future: Future[T | AbsentValue]) -> bool:
-        """Check whether a task can be cancelled without the loss of work that is done already.
 
-        Dask does not say which tasks are running: they are those that were submitted first.
-        """
-        if not self._workers.is_cluster:
-            return True
-        first = list(self._running)[: self._workers.count]
-        return future not in first
+def carry_out(
+    executor: ExecutorLike,
+    function: Callable[[Order], T],
+    orders: Sequence[Order],
+    budget: Budget,
+) -> Iterator[Outcome[T]]:
+    """Carry out independent orders on the workers of an executor.
 
+    When the budget is used up, orders that are not begun are left out, except for the first one.
+    After a request to stop, what the running tasks have found until then is yielded last.
 
-def _outcomes(index: int, results: Sequence[T | AbsentValue]) -> list[Outcome[T]]:
-    """Outcome of an order; none where its worker did not have a value that it needs."""
-    return [
-        Outcome(index=index, found=(result,))
-        for result in results
-        if not isinstance(result, AbsentValue)
-    ]
-
-
-def _is_lost(future: Future[T]) -> bool:
-    """Return whether a task that has ended was lost with its worker."""
-    return future.cancelled() or is_loss(future.exception())
-
-
-def _is_shared(future: Future[T]) -> bool:
-    """Return whether a lost task was lost together with all others of its executor."""
-    return not future.cancelled() and is_shared_loss(future.exception())
-
-
-def _result_of(future: Future[T]) -> T:
-    """Result of a task that has ended.
+    Yields:
+        Outcomes in the order of the orders; some after a request to stop may be missing.
 
     Raises:
-        Exception: The error of the task.
-        ExperimentError: The task could not be sent to a worker.
+        ExperimentError: An order cannot be sent, or a cluster had no workers at all.
     """
-    error = future.exception()
-    if is_refused_by_pickle(error):
-        raise ExperimentError(
-            f"executor: the work cannot be sent to other processes ({error}). Functions, such as "
-            "parameters that are Python functions, must be stated at the top of a module that the "
-            "workers can import; lambdas and functions inside functions can be used without an "
-            "executor, or with threads"
-        ) from error
+    dispatch = Dispatch[Order, T](Workers.of(executor), function, budget)
+    for index, order in enumerate(orders):
+        dispatch.add(index, order)
 
-    return future.result()
+    early: dict[int, Outcome[T]] = {}
+    following = 0
+    for outcome in dispatch.arrivals():
+        early[outcome.index] = outcome
+        while following in early:
+            yield early.pop(following)
+            following += 1
+
+        # Without the first order there might be no result at all.
+        if following and budget.exhausted is not None:
+            dispatch.withdraw()
+
+    # What was stopped or left out before them has no outcome.
+    yield from (early[index] for index in sorted(early))
 
 
-def _wait_for_all(futures: list[Future[T]]) -> set[Future[T]]:
-    """Wait for tasks until `GRACE` is over, or until the user presses Ctrl-C a second time.
+def results(
+    function: Callable[[Order], T],
+    orders: Iterable[Order],
+    workers: ExecutorLike | None,
+    budget: Budget,
+    here: Callable[[Order], T] | None = None,
+) -> Iterator[T]:
+    """Carry out independent orders on workers or, where there are none, in this process.
 
-    Returns:
-        The tasks that have not ended.
+    Args:
+        function: Carries out an order on a worker; both can be pickled.
+        orders: The orders. In this process, each is asked for after the one before is done.
+        workers: The workers, or their executor; None: this process.
+        budget: When it is used up, orders that are not begun are left out, except for the first.
+        here: Carries out an order in this process, also one whose worker was lost each time;
+            default: `function`.
+
+    Yields:
+        Results in the order of the orders; after a request to stop, some may be missing.
+
+    Raises:
+        ExperimentError: An order cannot be sent, or a cluster had no workers at all.
     """
-    deadline = time.monotonic() + GRACE
-    _, left = wait(futures, timeout=0.0)
-    while left and time.monotonic() < deadline and not hurried():
-        _, left = wait(futures, timeout=min(POLL_INTERVAL, GRACE))
+    here = here or function
+    if workers is None:
+        for order in orders:
+            yield here(order)
+            if budget.exhausted is not None:
+                return
+        return
 
-    return left
+    orders = list(orders)
+    for outcome in carry_out(workers, function, orders, budget):
+        yield here(orders[outcome.index]) if outcome.is_lost else outcome.result
+
+
+def results_or_here(
+    executor: ExecutorLike,
+    function: Callable[[Order], T],
+    orders: Sequence[Order],
+    budget: Budget,
+    here: Callable[[Order], T],
+) -> Iterator[T]:
+    """Carry out orders on workers, and lost ones in this process; see `results`."""
+    return results(function, orders, executor, budget, here)

@@ -10,22 +10,24 @@ import ctypes
 import itertools
 import multiprocessing
 import os
+import pickle
+import shutil
 import signal
-import sys
 import tempfile
 import threading
-import uuid
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any, TypeVar
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, finalize
 
+from mjfim.budget import StopToken
 from mjfim.interruption import SIGNALS
 from mjfim.parallel.threads import process_count
-from mjfim.parallel.worker_process import initialize_worker, run_in_background, run_task
 
 T = TypeVar("T")
 
@@ -35,56 +37,8 @@ LOST_SENTENCE = (
     "work was done again"
 )
 
-
-class _Processes(ProcessPoolExecutor):
-    """Worker processes that are started together, and end together when one of them is killed.
-
-    Args:
-        count: Number of processes.
-        address: Address to which the processes send their results so far after a request to stop.
-    """
-
-    def __init__(self, count: int, address: str) -> None:
-        context = multiprocessing.get_context("spawn")
-
-        # The request to stop has no lock: a process that is killed while it holds a lock would
-        # block all others.
-        self.stop = context.RawValue(ctypes.c_bool, False)
-
-        # The workers end when nobody holds the writing end of this pipe any more.
-        lifeline, hold = context.Pipe(duplex=False)
-        self._hold: connection.Connection | None = hold
-        self._lock = threading.Lock()
-        with _safe_path():
-            super().__init__(count, context, initialize_worker, (self.stop, lifeline, address))
-
-    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Submit a task; a process that is started for it ignores Ctrl-C from the beginning."""
-        with _interrupts_blocked(), _safe_path():
-            future = super().submit(fn, *args, **kwargs)
-        future.add_done_callback(self._end_if_broken)
-        return future
-
-    def end(self, *, wait: bool = False) -> None:
-        """End the processes at once, whether or not their tasks have ended.
-
-        Args:
-            wait: Return after they have ended.
-        """
-        self._release()
-        self.shutdown(wait=wait, cancel_futures=True)
-
-    def _end_if_broken(self, future: Future[Any]) -> None:
-        """End the other processes at once after one of them was ended from outside."""
-        if not future.cancelled() and isinstance(future.exception(), BrokenExecutor):
-            self._release()
-
-    def _release(self) -> None:
-        """Close the end of the pipe on which the workers wait, once: several threads ask for it."""
-        with self._lock:
-            hold, self._hold = self._hold, None
-        if hold is not None:
-            hold.close()
+# Period at which a worker looks whether its offer is wanted [s].
+OFFER_INTERVAL = 0.2
 
 
 class Pool(Executor):
@@ -109,126 +63,98 @@ class Pool(Executor):
         self.max_workers = process_count(count)
         self.has_lost_worker = False
 
-        # Tasks that cannot end in time send their results so far to this address, at which somebody
-        # listens after a request to stop only.
-        self._address = _private_address()
-        self._listener: connection.Listener | None = None
-        self._offers: dict[int, Any] = {}
+        # Tasks that cannot end in time write their results so far into this folder.
+        self._folder = Path(tempfile.mkdtemp(prefix="mjfim-"))
+        self._remove_folder = finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._next_number = itertools.count()
         self._numbers: WeakKeyDictionary[Future[Any], int] = WeakKeyDictionary()
-
-        self._processes = _Processes(self.max_workers, self._address)
-        self._has_ended = False
+        self._lock = threading.Lock()
+        self._start()
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Submit a task; the arguments are those of `concurrent.futures.Executor.submit`.
 
         Where a worker process was ended from outside, new processes are started for the task.
         """
-        if self._has_ended:
-            self._start_anew()
-
+        if self._hold.closed:
+            self._start()
         number = next(self._next_number)
-        try:
-            future = self._processes.submit(run_task, number, fn, *args, **kwargs)
-        except BrokenExecutor:
-            self.has_lost_worker = True
-            self._processes.end()
-            self._start_anew()
-            future = self._processes.submit(run_task, number, fn, *args, **kwargs)
-
+        words = (number, fn, *args)
+        with _interrupts_blocked():
+            try:
+                future = self._processes.submit(run_task, *words, **kwargs)
+            except BrokenExecutor:
+                self.has_lost_worker = True
+                self.end_running()
+                self._start()
+                future = self._processes.submit(run_task, *words, **kwargs)
         self._numbers[future] = number
+        future.add_done_callback(partial(self._end_if_broken, self._hold))
         return future
 
     def stop(self) -> None:
         """Ask all running and later tasks to return their best result so far."""
-        if self._listener is None:
-            # Only processes that have the key of this process are heard.
-            key = multiprocessing.current_process().authkey
-            with suppress(OSError):
-                self._listener = connection.Listener(self._address, authkey=key)
-                run_in_background(self._listen, self._listener)
-        self._processes.stop.value = True
+        self._stop.value = True
 
     def resume(self) -> None:
         """Withdraw the request to stop. No task may be running."""
-        self._processes.stop.value = False
-        self._close_listener()
+        self._stop.value = False
 
     def end_running(self, *, wait: bool = False) -> None:
         """End the processes at once with their tasks; the next task starts new processes.
 
         Args:
-            wait: Return after they have ended. A program that ends at once has to wait: Python's
-                own end of a program may otherwise print an error (a write to a closed pipe).
+            wait: Return after they have ended.
         """
-        self._processes.end(wait=wait)
-        self._has_ended = True
-        self._close_listener()
+        self._release(self._hold)
+        self._processes.shutdown(wait=wait, cancel_futures=True)
 
     def offered(self, future: Future[T]) -> list[T]:
         """Read what a running task has offered as its best result so far after `stop`.
 
-        Args:
-            future: The task.
-
         Returns:
-            The result; empty where the task has none yet.
+            The result, or nothing where the task has offered none.
         """
-        number = self._numbers.get(future)
-        return [] if number not in self._offers else [self._offers[number]]
+        path = self._folder / str(self._numbers[future])
+        return [pickle.loads(path.read_bytes())] if path.exists() else []
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the workers; the arguments are those of `concurrent.futures.Executor.shutdown`."""
         self._processes.shutdown(wait, cancel_futures=cancel_futures)
-        self._close_listener()
+        self._remove_folder()
 
-    def _start_anew(self) -> None:
-        """Start new processes in place of those that have ended."""
-        self._processes = _Processes(self.max_workers, self._address)
-        self._has_ended = False
+    def _start(self) -> None:
+        """Prepare new processes, which are started by their first tasks."""
+        context = multiprocessing.get_context("spawn")
 
-    def _listen(self, listener: connection.Listener) -> None:
-        """Collect what workers offer, until the listener is closed."""
-        while self._listener is listener:
-            # A worker that is killed while it connects ends its own connection only.
-            with suppress(OSError, EOFError, multiprocessing.AuthenticationError):
-                run_in_background(_receive, listener.accept(), self._offers)
+        # The request to stop has no lock: a process that is killed while it holds a lock would
+        # block all others.
+        self._stop = context.RawValue(ctypes.c_bool, False)
 
-    def _close_listener(self) -> None:
-        """Hear no more offers."""
-        listener, self._listener = self._listener, None
-        if listener is not None:
-            listener.close()
+        # The workers end when nobody holds the writing end of this pipe any more.
+        lifeline, self._hold = context.Pipe(duplex=False)
+        self._processes = ProcessPoolExecutor(
+            self.max_workers, context, initialize_worker, (self._stop, lifeline, self._folder)
+        )
 
+    def _end_if_broken(self, hold: connection.Connection, future: Future[Any]) -> None:
+        """End the other processes at once after one of them was ended from outside."""
+        if not future.cancelled() and isinstance(future.exception(), BrokenExecutor):
+            self.has_lost_worker |= not hold.closed
+            self._release(hold)
 
-@contextmanager
-def _safe_path() -> Iterator[None]:
-    """Let Python processes that are started here import nothing from the current folder.
-
-    Otherwise they would take a file `signal.py` or `socket.py` there for the module of this name.
-    """
-    before = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            os.environ.pop("PYTHONSAFEPATH", None)
-        else:
-            os.environ["PYTHONSAFEPATH"] = before
+    def _release(self, hold: connection.Connection) -> None:
+        """Close the end of the pipe on which the workers wait; several threads ask for it."""
+        with self._lock:
+            hold.close()
 
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C and SIGTERM in this thread, and thereby in processes that it starts.
-
-    Without signal masks, as on Windows, this has no effect.
-    """
+    """Block Ctrl-C and SIGTERM in this thread, and thereby in processes that it starts."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         yield
@@ -236,16 +162,80 @@ def _interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _private_address() -> str:
-    """Return an unused address for processes of this computer."""
-    name = f"mjfim-{uuid.uuid4().hex}"
-    return (
-        rf"\\.\pipe\{name}" if sys.platform == "win32" else str(Path(tempfile.gettempdir()) / name)
-    )
+# ---- in a worker process
+
+# Stop token of the pool to which this process belongs. In a worker process, `initialize_worker`
+# replaces it.
+_pool_token = StopToken()
+
+# Number of the task that this worker process runs, None between tasks and in other processes; and
+# the last offer of a result, with the number of its task.
+_task: int | None = None
+_offer: tuple[int, object] | None = None
 
 
-def _receive(heard: connection.Connection, offers: dict[int, Any]) -> None:
-    """Receive one offer; a worker that is killed meanwhile offers nothing."""
-    with suppress(OSError, EOFError), heard:
-        number, result = heard.recv()
-        offers[number] = result
+def pool_stop_token() -> StopToken:
+    """Return the stop token of the pool to which this process belongs; never set in others."""
+    return _pool_token
+
+
+def offer_result(result: object) -> None:
+    """Offer the best result so far of the running task.
+
+    It is the result if the task does not end in time after a request to stop. Outside of a worker
+    process of a pool, this does nothing.
+    """
+    global _offer
+    if _task is not None:
+        _offer = (_task, result)
+
+
+def run_task(number: int, function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
+    """Run a task in a worker process."""
+    global _task, _offer
+    _task = number
+    try:
+        return function(*args, **kwargs)
+    finally:
+        _task = _offer = None
+
+
+def initialize_worker(stop: ctypes.c_bool, lifeline: connection.Connection, folder: Path) -> None:
+    """Prepare a new worker process: it stops and ends with its pool alone."""
+    global _pool_token
+    _pool_token = StopToken(also=lambda: stop.value)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    # `timeout` and cluster managers send it to all processes; a running task hands over its result.
+    signal.signal(signal.SIGTERM, lambda number, frame: None if _task is not None else os._exit(1))
+    for function, arguments in ((_end_with_parent, (lifeline,)), (_hand_over, (folder,))):
+        threading.Thread(target=function, args=arguments, daemon=True).start()
+
+    # The parent process blocked the signals while it started this process.
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+
+
+def _hand_over(folder: Path) -> None:
+    """Write what the running task has offered, whenever a stop is requested."""
+    sent: tuple[int, object] | None = None
+    while True:
+        time.sleep(OFFER_INTERVAL)
+        offer = _offer
+        if not _pool_token.requested or offer is None or offer is sent:
+            continue
+        number, result = offer
+        part = folder / f"{number}.part"
+        # The folder is gone where the parent process has what it needs.
+        with suppress(OSError):
+            part.write_bytes(pickle.dumps(result))
+            part.replace(folder / str(number))
+        sent = offer
+
+
+def _end_with_parent(lifeline: connection.Connection) -> None:
+    """Wait until the parent process or its pool is gone, then end this process at once."""
+    parent = multiprocessing.parent_process()
+    sentinels = [] if parent is None else [parent.sentinel]
+    connection.wait([lifeline, *sentinels])
+    os._exit(1)

@@ -1,16 +1,14 @@
 """Large values that tasks hold by their hash, so that a worker process need not get them each time.
 
-A task is sent without the value. A process that does not have it yet says so in place of a result;
-the task is then sent again together with the value, which the process keeps. This needs nothing of
-an executor but `submit`.
+A task that needs a value which its process does not have fails with AbsentValueError; `attempt`
+turns that into an answer, and `dispatch` sends the task again, together with the value.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
@@ -20,15 +18,11 @@ Order = TypeVar("Order")
 
 # Size of the values that a process keeps [bytes]. Those that were not used for the longest time are
 # sent again when a task needs them.
-KEPT_BYTES = 256 * 2**20
+KEPT_BYTES = 2**30
 
 
 class AbsentValueError(Exception):
-    """A task needs shared values that its process has not received.
-
-    Attributes:
-        digests: Hashes of the values.
-    """
+    """A task needs shared values that its process has not received: the hashes."""
 
     def __init__(self, *digests: str) -> None:
         super().__init__(*digests)
@@ -41,10 +35,6 @@ class SharedValue(Generic[T]):
     Args:
         digest: Hash of the value; equal for equal values only.
         value: The value, which can be pickled and is never changed.
-        size: About the memory that the value takes [bytes].
-
-    Attributes:
-        digest: The hash.
         size: About the memory that the value takes [bytes].
     """
 
@@ -59,25 +49,15 @@ class SharedValue(Generic[T]):
         """Return the value of a hash that this process has made already, or else make it.
 
         Two of them would not be found by the same hash any more after one of them is deleted.
-
-        Args:
-            digest: Hash of the value; equal for equal values only.
-            value: The value, which can be pickled and is never changed.
-            size: About the memory that the value takes [bytes].
         """
         own: SharedValue[T] | None = _owned.get(digest)
         return cls(digest, value, size) if own is None else own
 
     @property
     def value(self) -> T:
-        """The value.
-
-        Raises:
-            AbsentValueError: This process has not received it.
-        """
+        """The value; AbsentValueError in a process that has received the hash only."""
         if self._value:
             return self._value[0]
-
         found: T = _received.get(self.digest)
         return found
 
@@ -87,8 +67,12 @@ class SharedValue(Generic[T]):
 
     @property
     def is_here(self) -> bool:
-        """True where this process has the value."""
-        return bool(self._value) or _received.has(self.digest)
+        """True where this process has the value; it counts as a use of it."""
+        try:
+            self.value  # noqa: B018
+        except AbsentValueError:
+            return False
+        return True
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[str, int]]:
         """Pickle the hash alone, with the size."""
@@ -97,12 +81,7 @@ class SharedValue(Generic[T]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SentValue:
-    """A value on its way to a worker, and in its memory.
-
-    Attributes:
-        value: The value.
-        size: About the memory that it takes [bytes].
-    """
+    """A value on its way to a worker and in its memory, and about its size [bytes]."""
 
     value: Any
     size: int
@@ -112,7 +91,6 @@ class _ReceivedValues:
     """The latest values that this process has received. Its threads share them."""
 
     def __init__(self) -> None:
-        """Start without any value."""
         self._lock = threading.Lock()
         self._values: OrderedDict[str, SentValue] = OrderedDict()
 
@@ -124,52 +102,18 @@ class _ReceivedValues:
                 self._values.move_to_end(digest)
 
             # The values of one task are kept together, however large they are.
-            while len(self._values) > len(values) and self._size > KEPT_BYTES:
-                self._values.popitem(last=False)
-
-    def has(self, digest: str) -> bool:
-        """Check whether a value is here, and count that as a use of it."""
-        if digest in _of_task.values:
-            return True
-        with self._lock:
-            if digest in self._values:
-                self._values.move_to_end(digest)
-            return digest in self._values
+            size = sum(sent.size for sent in self._values.values())
+            while len(self._values) > len(values) and size > KEPT_BYTES:
+                size -= self._values.popitem(last=False)[1].size
 
     def get(self, digest: str) -> Any:
         """Return a value; AbsentValueError where it was not received, or forgotten since."""
-        if digest in _of_task.values:
-            return _of_task.values[digest].value
         with self._lock:
             if digest not in self._values:
                 raise AbsentValueError(digest)
             self._values.move_to_end(digest)
             return self._values[digest].value
 
-    @property
-    def _size(self) -> int:
-        """Size of all values [bytes]."""
-        return sum(sent.size for sent in self._values.values())
-
-
-class _TaskValues(threading.local):
-    """Values that came with the task of this thread; tasks of other threads cannot replace them."""
-
-    def __init__(self) -> None:
-        """Start without any value."""
-        self.values: Mapping[str, SentValue] = {}
-
-    @contextmanager
-    def held(self, values: Mapping[str, SentValue]) -> Iterator[None]:
-        """Hold values while a task of this thread runs."""
-        before, self.values = self.values, values
-        try:
-            yield
-        finally:
-            self.values = before
-
-
-_of_task = _TaskValues()
 
 # Values that this process has made and still uses, and values that it has received.
 _owned: WeakValueDictionary[str, SharedValue[Any]] = WeakValueDictionary()
@@ -177,38 +121,19 @@ _received = _ReceivedValues()
 
 
 def require_values(values: Iterable[SharedValue[Any]]) -> None:
-    """Check that values are here, so that all absent ones are sent together.
-
-    Args:
-        values: The values.
-
-    Raises:
-        AbsentValueError: This process has not received all of them.
-    """
+    """Check that values are here, so that all absent ones are sent together."""
     absent = [shared.digest for shared in values if not shared.is_here]
     if absent:
         raise AbsentValueError(*absent)
 
 
 def keep_value(shared: SharedValue[T], value: T) -> None:
-    """Keep a value in a worker that has made it itself instead of receiving it.
-
-    Args:
-        shared: The reference to the value.
-        value: The value.
-    """
+    """Keep a value in a worker that has made it itself instead of receiving it."""
     _received.put({shared.digest: SentValue(value=value, size=shared.size)})
 
 
 def owned_value(digest: str) -> SentValue:
-    """Return a value that this process has made, to send it to a worker.
-
-    Args:
-        digest: Its hash.
-
-    Raises:
-        AbsentValueError: This process did not make it, or does not have it any more.
-    """
+    """Return a value that this process has made, to send it to a worker."""
     shared = _owned.get(digest)
     if shared is None:
         raise AbsentValueError(digest)
@@ -217,11 +142,7 @@ def owned_value(digest: str) -> SentValue:
 
 @dataclass(frozen=True, kw_only=True)
 class AbsentValue:
-    """Answer of a worker that lacks shared values, in place of a result.
-
-    Attributes:
-        digests: Hashes of the values.
-    """
+    """Answer of a worker that lacks shared values, in place of a result: their hashes."""
 
     digests: tuple[str, ...]
 
@@ -232,19 +153,10 @@ def attempt(
     """Carry out an order in a worker, if the values are there that it needs.
 
     An error would be the other way to say that one is absent, but Dask prints the errors of tasks.
-
-    Args:
-        function: Carries out the order.
-        values: Values by their hash, which this process keeps from now on.
-        order: The order.
-
-    Returns:
-        The result of the order, or which values it needs.
     """
     _received.put(values)
     try:
-        with _of_task.held(values):
-            return function(order)
+        return function(order)
     except AbsentValueError as error:
         return AbsentValue(digests=error.digests)
 
@@ -254,7 +166,6 @@ def _referenced(digest: str, size: int) -> SharedValue[Any]:
     own = _owned.get(digest)
     if own is not None:
         return own
-
     reference: SharedValue[Any] = SharedValue.__new__(SharedValue)
     reference.digest = digest
     reference.size = size

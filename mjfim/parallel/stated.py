@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import sys
+import runpy
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from mjfim.errors import ExperimentError
@@ -86,23 +83,15 @@ class StatedExecutor:
             ExperimentError: A package or a function is missing, nobody answers at the address, or
                 the workers have other versions.
         """
-        executor = self._cluster() if self.kind is ExecutorKind.DASK else self._made()
-        if not hasattr(executor, "__enter__"):
-            yield Workers.of(executor)
-            return
-
-        # Those of this computer would wait for tasks that nobody needs any more, before a result is
-        # written.
-        workers = Workers.of(executor)
-        if workers.is_loky or isinstance(executor, ThreadPoolExecutor | ProcessPoolExecutor):
-            try:
-                yield workers
-            finally:
-                workers.shutdown(wait=False, cancel_futures=True)
-            return
-
-        with executor as entered:
-            yield Workers.of(entered)
+        made = self._cluster() if self.kind is ExecutorKind.DASK else self._made()
+        workers = Workers.of(made)
+        try:
+            yield workers
+        finally:
+            # Nobody waits for tasks that are not needed any more.
+            workers.shutdown(wait=False, cancel_futures=True)
+            if hasattr(made, "close"):
+                made.close()
 
     def _require_place(self) -> None:
         """Raise ExperimentError where the place does not fit the kind."""
@@ -180,52 +169,21 @@ class StatedExecutor:
     def _made(self) -> Any:
         """The executor that the stated function returns."""
         place, _, name = self.place.rpartition(":")
-        module = self._module(place)
-        factory = getattr(module, name, None)
+        try:
+            is_file = place.endswith(".py")
+            known = runpy.run_path(place) if is_file else vars(importlib.import_module(place))
+        except (ImportError, OSError) as error:
+            raise ExperimentError(
+                f"executor: {self.text!r}: {place} cannot be imported: {error}; state the name of "
+                "an installed module, or the path of a file that ends with .py"
+            ) from error
+        factory = known.get(name)
         if not callable(factory):
             raise ExperimentError(
                 f"executor: {self.text!r}: {place} has no function {name}; it must return an "
                 "executor of the kind of concurrent.futures"
             )
         return factory()
-
-    def _module(self, place: str) -> ModuleType:
-        """Import a module by its name, or from a file."""
-        try:
-            if not place.endswith(".py"):
-                return importlib.import_module(place)
-
-            spec = importlib.util.spec_from_file_location(Path(place).stem, place)
-            if spec is None or spec.loader is None:
-                raise ImportError(f"{place} is no Python file")
-            module = importlib.util.module_from_spec(spec)
-            with _known_module(module):
-                spec.loader.exec_module(module)
-        except (ImportError, OSError) as error:
-            raise ExperimentError(
-                f"executor: {self.text!r}: {place} cannot be imported: {error}; state the name of "
-                "an installed module, or the path of a file that ends with .py"
-            ) from error
-        return module
-
-
-@contextmanager
-def _known_module(module: ModuleType) -> Iterator[None]:
-    """Let a module be found by its name while it is executed, as dataclasses in it need.
-
-    Later it is not found, so that cloudpickle sends its functions by their contents: the workers
-    cannot import them.
-    """
-    name = module.__name__
-    before = sys.modules.get(name)
-    sys.modules[name] = module
-    try:
-        yield
-    finally:
-        if before is None:
-            sys.modules.pop(name, None)
-        else:
-            sys.modules[name] = before
 
 
 def own_versions() -> tuple[str, str]:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Callable
 from concurrent.futures import (
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import suppress
 from typing import Any, Protocol, TypeVar
 
 from mjfim.errors import ExperimentError
-from mjfim.parallel.losses import renewed
 from mjfim.parallel.pool import Pool
 
 T = TypeVar("T")
@@ -24,9 +22,6 @@ T = TypeVar("T")
 # Attributes with the number of workers: of mjfim and executorlib, of mpi4py, and of
 # `concurrent.futures` and loky, which have no public name for it.
 COUNT_NAMES = ("max_workers", "num_workers", "_max_workers")
-
-# Period after which a Dask cluster, which may grow, is asked again how large it is [s].
-COUNT_PERIOD = 2.0
 
 # Tasks that are submitted at once for each worker, so that it need not wait for the next one.
 TASKS_PER_WORKER = 2
@@ -63,7 +58,6 @@ class Workers(Executor):
 
     Attributes:
         has_answered: Whether any task has ended so far.
-        has_begun: Whether any worker has sent an answer of its own so far.
     """
 
     def __init__(
@@ -94,9 +88,7 @@ class Workers(Executor):
         self._stated_count = count
         self._stated_threads = threads
         self._known_count = 0
-        self._count_until = 0.0
         self.has_answered = False
-        self.has_begun = False
 
     @classmethod
     def of(cls, executor: ExecutorLike) -> Workers:
@@ -123,11 +115,6 @@ class Workers(Executor):
         return self._client is not None
 
     @property
-    def is_loky(self) -> bool:
-        """True for an executor of loky, also for the copy of loky in joblib."""
-        return "loky" in type(self._executor).__module__.split(".")
-
-    @property
     def is_empty(self) -> bool:
         """True for a Dask cluster without any worker."""
         return self.is_cluster and not self._found_count()
@@ -136,11 +123,6 @@ class Workers(Executor):
     def count(self) -> int:
         """Number of tasks that run at once, at least 1."""
         return max(self._stated_count or self._found_count(), 1)
-
-    @property
-    def local_count(self) -> int:
-        """Number of tasks that run at once and are known to be on this computer, at least 1."""
-        return self.count if self.is_local else 1
 
     @property
     def window(self) -> float:
@@ -166,31 +148,19 @@ class Workers(Executor):
         # Dask would take the result of an equal task, even of one that failed.
         if self.is_cluster:
             kwargs = {**kwargs, "pure": False}
-
-        try:
-            with _large_tasks() if self.is_cluster else nullcontext():
-                return self._executor.submit(fn, *args, **kwargs)
-        except BrokenExecutor:
-            executor = renewed(self._executor)
-            if executor is None:
-                raise
-            self._executor = executor
-            return executor.submit(fn, *args, **kwargs)
+        return self._executor.submit(fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the executor; the arguments are those of `concurrent.futures.Executor.shutdown`."""
-        # The executor of Dask has no such option: without waiting, it cancels everything. That of
-        # loky ends its processes instead.
-        name = "kill_workers" if self.is_loky else "cancel_futures"
-        is_known = cancel_futures and not self.is_cluster
-        options = {name: True} if is_known else {}
+        # The executor of Dask has no such option: without waiting, it cancels everything.
+        options = {"cancel_futures": True} if cancel_futures and not self.is_cluster else {}
         self._executor.shutdown(wait, **options)
 
     @property
     def probable_fault(self) -> str:
         """Why processes of the workers have ended, in words: what is probable."""
         words = "its process was ended from outside, perhaps because the memory was full"
-        if self.pool is None or self.has_begun:
+        if self.pool is None or self.has_answered:
             return words
         return f'{words}, or because a script calls mjfim outside `if __name__ == "__main__":`'
 
@@ -202,38 +172,40 @@ class Workers(Executor):
     @property
     def is_local(self) -> bool:
         """True where all workers are known to be on this computer, so that they share its cores."""
-        return self.is_loky or isinstance(
-            self._executor, Pool | ProcessPoolExecutor | ThreadPoolExecutor
-        )
+        return isinstance(self._executor, Pool | ProcessPoolExecutor | ThreadPoolExecutor)
 
     def _found_count(self) -> int:
         """Number of workers that the executor states; 0 where it is not known."""
         if self._client is not None:
-            return self._cluster_size()
-
+            # A cluster may grow. Where its scheduler does not answer, it is as large as before.
+            with suppress(OSError):
+                self._known_count = sum(self._client.nthreads().values())
+            return self._known_count
         for name in COUNT_NAMES:
             number = getattr(self._executor, name, None)
             if isinstance(number, int):
                 return number
         return 0
 
-    def _cluster_size(self) -> int:
-        """Number of threads of all workers of a Dask cluster; each of them does one task."""
-        if time.monotonic() >= self._count_until:
-            # Where the scheduler does not answer, the results so far must not be lost here.
-            with suppress(OSError):
-                self._known_count = sum(self._client.nthreads().values())
-            self._count_until = time.monotonic() + COUNT_PERIOD
-        return self._known_count
+
+# Errors of other packages with which a task fails whose worker has gone. Only the names are needed,
+# so that these packages need not be installed.
+LOSSES_BY_NAME = ("KilledWorker", "CommClosedError", "WorkerCrashedError", "NodeDiedError")
 
 
-def _large_tasks() -> AbstractContextManager[object]:
-    """Let Dask take large tasks without a warning: what they share is sent once per worker."""
-    dask = sys.modules.get("dask")
-    if dask is None:
-        return nullcontext()
+def is_loss(error: BaseException | None) -> bool:
+    """Check whether a task failed because its worker has gone, so that it can be done again.
 
-    settings: AbstractContextManager[object] = dask.config.set(
-        {"distributed.admin.large-graph-warning-threshold": "1TB"}
-    )
-    return settings
+    A worker that the user interrupts in the terminal fails with KeyboardInterrupt.
+    """
+    if isinstance(error, BrokenExecutor | CancelledError | KeyboardInterrupt):
+        return True
+    return any(kind.__name__ in LOSSES_BY_NAME for kind in type(error).__mro__)
+
+
+def is_refused_by_pickle(error: BaseException | None) -> bool:
+    """Check whether a task could not be sent to a worker; the words are those of pickle."""
+    if type(error).__name__ == "PicklingError":
+        return True
+    text = str(error).lower() if isinstance(error, AttributeError | TypeError) else ""
+    return "pickle" in text or "local object" in text

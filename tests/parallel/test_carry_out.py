@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import (
@@ -12,12 +11,8 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
-    ProcessPoolExecutor,
     ThreadPoolExecutor,
 )
-from contextlib import AbstractContextManager, nullcontext
-from multiprocessing import get_context
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -32,8 +27,7 @@ from mjfim.parallel import (
     Workers,
     carry_out,
     dispatch,
-    losses,
-    results_or_here,
+    results,
 )
 
 
@@ -95,44 +89,8 @@ def test_an_order_that_is_lost_three_times_is_reported_and_the_others_go_on() ->
     with pytest.raises(LostWorkError, match="lost 3 times"):
         _ = found[1].result
 
-    here = list(results_or_here(executor, square, range(3), Budget(), lambda order: -order))
-    assert here == [0, -1, 4]
-
-
-def test_where_all_are_lost_together_the_suspect_runs_alone_in_the_end() -> None:
-    """Order 1 kills the pool; without isolation, its neighbours would be given up with it."""
-    running: list[int] = []
-    alone: list[int] = []
-
-    class Together(Executor):
-        """Loses all running tasks when order 1 runs."""
-
-        _max_workers = 2
-
-        def __init__(self) -> None:
-            self.futures: list[tuple[int, Future[int]]] = []
-
-        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-            future: Future[int] = Future()
-            self.futures.append((args[0], future))
-            threading.Timer(0.01, self.end).start()
-            return future
-
-        def end(self) -> None:
-            """End what runs: with losses if order 1 is among it."""
-            ended, self.futures = self.futures, []
-            running[:] = [order for order, _ in ended]
-            if len(ended) == 1:
-                alone.append(running[0])
-            for order, future in ended:
-                if 1 in running:
-                    future.set_exception(BrokenExecutor())
-                else:
-                    future.set_result(square(order))
-
-    found = squares(Together(), 6)
-    assert [each.index for each in found if each.is_lost] == [1]
-    assert 1 in alone
+    here = results(square, range(3), executor, Budget(), lambda order: -order)
+    assert list(here) == [0, -1, 4]
 
 
 def test_a_program_whose_processes_cannot_begin_reads_how_to_call_them() -> None:
@@ -148,7 +106,7 @@ def test_a_program_whose_processes_cannot_begin_reads_how_to_call_them() -> None
     assert "the memory was full" in other.probable_fault
 
 
-def test_outcomes_come_in_the_order_of_the_orders_and_the_callback_has_them_at_once() -> None:
+def test_results_come_in_the_order_of_the_orders() -> None:
     is_last = threading.Event()
 
     def slow_first(order: int) -> int:
@@ -159,13 +117,16 @@ def test_outcomes_come_in_the_order_of_the_orders_and_the_callback_has_them_at_o
             is_last.set()
         return order
 
-    early: list[int] = []
     with ThreadPoolExecutor(2) as executor:
-        found = carry_out(
-            executor, slow_first, range(4), Budget(), lambda each: early.append(each.index)
-        )
-        assert [each.index for each in found] == [0, 1, 2, 3]
-    assert early == [1, 2, 3, 0]
+        assert list(results(slow_first, range(4), executor, Budget())) == [0, 1, 2, 3]
+
+
+def test_without_workers_each_order_is_asked_for_after_the_one_before_is_done() -> None:
+    done: list[int] = []
+    orders = (len(done) for _ in range(3))
+    assert list(results(lambda order: done.append(order), orders, None, Budget())) == [None] * 3
+    assert done == [0, 1, 2]
+    assert list(results(square, range(9), None, Budget(seconds=0.0))) == [0]
 
 
 def test_orders_may_be_added_while_others_are_carried_out() -> None:
@@ -251,26 +212,6 @@ def test_a_cluster_without_workers_is_an_error_when_the_time_is_over(
         list(carry_out(Idle(FakeClient()), square, range(2), Budget(seconds=0.0)))
 
 
-def test_a_cluster_that_vanishes_after_a_result_ends_the_waiting(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A verb uses several dispatches; what the earlier ones have found must not be lost."""
-    monkeypatch.setattr(dispatch, "GRACE", 0.05)
-    monkeypatch.setattr(dispatch, "LONGEST_OVERTIME", 0.05)
-    monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.02)
-
-    class Vanishing(FakeDaskExecutor):
-        """A cluster whose workers end after the first task."""
-
-        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-            return Future() if self.submitted else super().submit(fn, *args)
-
-    monkeypatch.setattr(FakeClient, "nthreads", lambda self: {})
-    workers = Workers(Vanishing(FakeClient()))
-    assert [each.result for each in carry_out(workers, square, [3], Budget(seconds=0.0))] == [9]
-    assert list(carry_out(workers, square, range(2), Budget(seconds=0.0))) == []
-
-
 def test_without_time_the_first_order_is_carried_out_and_the_rest_is_left_out() -> None:
     executor = FakeExecutor(lambda order, times: None)
     found = list(carry_out(executor, square, range(9), Budget(seconds=0.0)))
@@ -324,13 +265,6 @@ def test_the_number_of_workers_is_stated_or_found() -> None:
         Workers(workers, threads=2)
 
 
-def test_a_process_pool_that_is_made_anew_has_the_same_settings() -> None:
-    pool = ProcessPoolExecutor(3, mp_context=get_context("spawn"), max_tasks_per_child=5)
-    other = losses.renewed(pool)
-    assert isinstance(other, ProcessPoolExecutor)
-    assert (other._max_workers, other._max_tasks_per_child) == (3, 5)  # type: ignore[attr-defined]
-
-
 class FakeClient:
     """As a Dask client: it has an executor, and a number of threads per worker that changes."""
 
@@ -362,37 +296,12 @@ class FakeDaskExecutor(FakeExecutor):
         self.waited.append(wait)
 
 
-def test_a_cluster_has_as_many_workers_as_threads_and_may_grow(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("mjfim.parallel.workers.COUNT_PERIOD", -1.0)
-    cluster = Workers(FakeClient())
-    assert [cluster.count, cluster.count] == [1, 5]
-    assert cluster.is_cluster
-    assert cluster.threads_for(1) == 1
-
-
-def test_a_scheduler_that_does_not_answer_leaves_the_number_as_it_was(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("mjfim.parallel.workers.COUNT_PERIOD", -1.0)
+def test_a_cluster_has_as_many_workers_as_threads_and_may_grow() -> None:
+    """A scheduler that does not answer leaves the number as it was."""
     cluster = Workers(FakeClient(OSError("the scheduler is gone")))
     assert [cluster.count for _ in range(3)] == [1, 1, 5]
-
-
-def test_large_tasks_are_submitted_to_dask_without_a_warning(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    settings = []
-
-    def noted(values: dict[str, str]) -> AbstractContextManager[None]:
-        settings.append(values)
-        return nullcontext()
-
-    monkeypatch.setitem(sys.modules, "dask", SimpleNamespace(config=SimpleNamespace(set=noted)))
-    workers = Workers(FakeClient())
-    workers.submit(lambda order, pure: order, 1)
-    assert settings == [{"distributed.admin.large-graph-warning-threshold": "1TB"}]
+    assert cluster.is_cluster
+    assert cluster.threads_for(1) == 1
 
 
 def test_a_cluster_is_ended_without_an_option_that_dask_does_not_have() -> None:

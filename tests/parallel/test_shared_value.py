@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import pickle
-import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from typing import Any
@@ -14,7 +13,7 @@ import pytest
 
 from mjfim.budget import Budget
 from mjfim.parallel import carry_out, shared_value
-from mjfim.parallel.shared_value import AbsentValueError, SentValue, SharedValue, attempt
+from mjfim.parallel.shared_value import AbsentValueError, SharedValue
 from mjfim.parallel.workers import TASKS_PER_WORKER
 
 # A value that would be expensive to send with every task.
@@ -85,26 +84,6 @@ def test_a_forgotten_value_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> Non
         processes.sizes.clear()
         assert results(processes, value, 2) == [len(LARGE), len(LARGE) + 1]
         assert max(processes.sizes) > len(LARGE)
-
-
-def test_tasks_of_other_threads_cannot_take_away_the_value_of_a_task(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(shared_value, "KEPT_BYTES", 1)
-    monkeypatch.setattr(shared_value, "_owned", WeakValueDictionary())
-    first, second = (SentValue(value=name, size=1) for name in ("first", "second"))
-
-    def task(order: str) -> str:
-        """Meanwhile, another thread receives a value that takes the place of this one."""
-        other = threading.Thread(target=attempt, args=(str, {"second": second}, "other"))
-        other.start()
-        other.join()
-        return shared_value._referenced(order, 1).value
-
-    assert attempt(task, {"first": first}, "first") == "first"
-    assert attempt(lambda order: shared_value._referenced(order, 1).value, {}, "first").digests == (
-        "first",
-    )
 
 
 def test_an_equal_value_that_is_deleted_does_not_take_the_first_one_with_it() -> None:
