@@ -14,7 +14,6 @@ TYPE_CHECKING = False
 # Programs import each name when they use it first, see `__getattr__`: importing all of them takes
 # seconds, in which the command line must be able to react to Ctrl-C.
 if TYPE_CHECKING:
-    from mjfim.budget import Budget, StopToken
     from mjfim.errors import MjfimError
     from mjfim.excitation.design import design
     from mjfim.excitation.evaluation import evaluate
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from mjfim.output.robots.export import export_design
     from mjfim.output.video.video import save_video
     from mjfim.parallel import ExecutorLike, Pool, Workers
+    from mjfim.parallel.budget import Budget, StopToken
     from mjfim.records.campaign import Campaign
     from mjfim.records.check import Check
     from mjfim.records.comparison import Comparison
@@ -96,8 +96,8 @@ __version__ = "0.1.0"
 
 # Module of each name.
 MODULES = {
-    "Budget": "mjfim.budget",
-    "StopToken": "mjfim.budget",
+    "Budget": "mjfim.parallel.budget",
+    "StopToken": "mjfim.parallel.budget",
     "MjfimError": "mjfim.errors",
     "design": "mjfim.excitation.design",
     "evaluate": "mjfim.excitation.evaluation",

@@ -22,7 +22,7 @@ from contextlib import suppress  # noqa: E402
 from types import FrameType  # noqa: E402
 from typing import NoReturn  # noqa: E402
 
-from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS  # noqa: E402
+from mjfim.parallel.budget import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS  # noqa: E402
 
 
 def main() -> NoReturn:

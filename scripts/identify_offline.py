@@ -20,7 +20,7 @@ from pathlib import Path
 
 import mjfim
 from mjfim.errors import InterruptedByUserError, MjfimError, NoResultError
-from mjfim.interruption import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS, Interruption
+from mjfim.parallel.budget import INTERRUPTED_CODE, NOTHING_SENTENCE, SIGNALS, Interruption
 
 
 def main() -> int:

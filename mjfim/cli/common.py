@@ -39,12 +39,6 @@ from mjfim.errors import (
     UnfinishedError,
 )
 from mjfim.files import observed_by, remove_temporary_files
-from mjfim.interruption import (
-    INTERRUPTED_CODE,
-    NOTHING_SENTENCE,
-    Interruption,
-    current_interruption,
-)
 from mjfim.output.live import ADDRESS, HERE, live_system
 from mjfim.output.optional_files import write_optional
 from mjfim.output.picture_format import PictureFormat
@@ -53,6 +47,12 @@ from mjfim.output.report import OWN_REPORTS, REPORT, is_report
 from mjfim.output.summary_parts import Summary
 from mjfim.output.text import render
 from mjfim.output.video.video import NoVideoError, require_format, write_video
+from mjfim.parallel.budget import (
+    INTERRUPTED_CODE,
+    NOTHING_SENTENCE,
+    Interruption,
+    current_interruption,
+)
 from mjfim.records.events import (
     Callback,
     DesignEvent,

@@ -11,7 +11,6 @@ import typer
 
 import mjfim
 from mjfim.amounts import MAX_STARTS
-from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -38,6 +37,7 @@ from mjfim.cli.common import (
 from mjfim.cli.executors import LOCAL, ExecutorPlace, started_executor, stated_executor
 from mjfim.errors import first_ones
 from mjfim.output.picture_format import PictureFormat
+from mjfim.parallel.budget import StopToken, stop_on_interrupt
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -188,7 +188,7 @@ def _with_draws(
     import numpy as np
 
     from mjfim.identification.parameter_draws import draw_parameters_system
-    from mjfim.interruption import run_optional
+    from mjfim.parallel.budget import run_optional
 
     if not count:
         return result, ()

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mjfim
-from mjfim.budget import stop_on_interrupt
 from mjfim.cli.common import (
     errors,
     keep_result,
@@ -18,6 +17,7 @@ from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.model.limited_elements import KINDS as LIMIT_KINDS
 from mjfim.output.archive import write_design
+from mjfim.parallel.budget import stop_on_interrupt
 from mjfim.parallel.stated import StatedExecutor
 
 # Kinds of limits from which a design can keep a reserve.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mjfim.budget import Budget
+from mjfim.parallel.budget import Budget
 
 # Factor between two successive numbers of samples where the ratio is infinite, so that it does not
 # show the distance to feasibility.

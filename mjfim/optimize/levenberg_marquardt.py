@@ -16,9 +16,9 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopReason
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.curved_rows import step_over_curved_rows
+from mjfim.parallel.budget import Budget, StopReason
 
 T = TypeVar("T")
 

@@ -15,7 +15,6 @@ from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.system import System
 from mjfim.files import read_json, remove_earlier_result, replacing, write_json
 from mjfim.identification.aligned_recording import measured_trajectory
-from mjfim.interruption import current_interruption
 from mjfim.output import archive, plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.drawing import begin_pictures, picture_contents
@@ -27,6 +26,7 @@ from mjfim.output.report import REPORT
 from mjfim.output.report.build import records_in, write_report
 from mjfim.output.robot_samples import clear_samples, write_samples
 from mjfim.output.video.video import report_video
+from mjfim.parallel.budget import current_interruption
 from mjfim.records.base import ShownRecord
 from mjfim.records.comparison import DESIGN, Comparison
 from mjfim.records.design import Design

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable
 
 from mjfim.errors import MjfimError, UndrawnWarning
-from mjfim.interruption import run_optional
+from mjfim.parallel.budget import run_optional
 
 
 def write_guarded(name: str, write: Callable[[], object]) -> None:

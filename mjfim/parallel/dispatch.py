@@ -11,9 +11,8 @@ from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
-from mjfim.budget import Budget
 from mjfim.errors import ExperimentError, MjfimError
-from mjfim.interruption import hurried
+from mjfim.parallel.budget import Budget, hurried
 from mjfim.parallel.shared_value import AbsentValue, SentValue, attempt, owned_value
 from mjfim.parallel.workers import ExecutorLike, Workers, is_loss, is_refused_by_pickle
 

@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary, finalize
 
-from mjfim.budget import StopToken
-from mjfim.interruption import SIGNALS
+from mjfim.parallel.budget import SIGNALS, StopToken
 from mjfim.parallel.threads import process_count
 
 T = TypeVar("T")

@@ -27,11 +27,11 @@ from matplotlib.ticker import StrMethodFormatter
 from rich.console import Console
 from rich.table import Table
 
-from mjfim.budget import measured_by, stop_on_interrupt
 from mjfim.errors import MjfimError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.output.vocabulary import DESIGNED, OTHER
+from mjfim.parallel.budget import measured_by, stop_on_interrupt
 from mjfim.records.comparison import DESIGN
 from mjfim.studies.baselines.titles import TITLES
 from mjfim.studies.compare import compare_task

@@ -51,7 +51,6 @@ from rich.progress import track
 
 import mjfim
 from mjfim.arrays import NORMAL_95, Array
-from mjfim.budget import Budget
 from mjfim.experiment.system import System
 from mjfim.files import replacing
 from mjfim.identification.fit_problem import FitProblem
@@ -63,6 +62,7 @@ from mjfim.identification.task import FitTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.inertia_distance import barycentric_of, logcholesky_factor
 from mjfim.parallel import cores, one_blas_thread
+from mjfim.parallel.budget import Budget
 from mjfim.records.estimate import Estimate, Whiteness
 from mjfim.records.trajectory import Recording
 from mjfim.studies.selection import select_terms_system

@@ -23,8 +23,8 @@ from pathlib import Path
 from rich.console import Console
 
 import mjfim
-from mjfim.budget import stop_on_interrupt
 from mjfim.parallel import cores
+from mjfim.parallel.budget import stop_on_interrupt
 from mjfim.records.comparison import Comparison, MethodResult
 from scripts.benchmarks import arms
 

@@ -17,10 +17,10 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.system import System
 from mjfim.identification import parameter_draws
-from mjfim.interruption import NOTHING_SENTENCE
 from mjfim.output import archive, plots
 from mjfim.output.folders import DESIGN_ARCHIVE
 from mjfim.output.manifest import MANIFEST
+from mjfim.parallel.budget import NOTHING_SENTENCE
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent, FitEvent, StudyEvent
 from mjfim.studies import derivative_test

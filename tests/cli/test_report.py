@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from mjfim.interruption import NOTHING_SENTENCE
 from mjfim.output import plots
 from mjfim.output.plots.pictures import picture_names
 from mjfim.output.report import REPORT
+from mjfim.parallel.budget import NOTHING_SENTENCE
 from tests.support import results
 from tests.support.cli import misused, run
 

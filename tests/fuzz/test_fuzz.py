@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.budget import measured_by
+from mjfim.parallel.budget import measured_by
 from tests.fuzz import bad_inputs, inputs, problems
 from tests.fuzz.faults import FAULTS, packed_bomb
 from tests.fuzz.inputs import Ending

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mjfim.budget import Budget, StopToken
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
+from mjfim.parallel.budget import Budget, StopToken
 
 LAWS: dict[str, Callable[[int], float]] = {
     "square root": lambda n: (173 / n) ** 0.5,

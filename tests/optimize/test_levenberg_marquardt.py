@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mjfim.budget import Budget, StopToken
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (
     ABSOLUTE_STAGNATION,
@@ -29,6 +28,7 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from mjfim.optimize.robust_losses import RobustLoss
+from mjfim.parallel.budget import Budget, StopToken
 from tests.support.numerics import Array
 
 Rows = Callable[[Array, Array], Array]

@@ -11,8 +11,8 @@ from weakref import WeakValueDictionary
 
 import pytest
 
-from mjfim.budget import Budget
 from mjfim.parallel import carry_out, shared_value
+from mjfim.parallel.budget import Budget
 from mjfim.parallel.shared_value import AbsentValueError, SharedValue
 from mjfim.parallel.workers import TASKS_PER_WORKER
 

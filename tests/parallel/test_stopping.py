@@ -18,12 +18,12 @@ import pytest
 
 import mjfim
 from mjfim import parallel as workers
-from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError
 from mjfim.excitation import constrained
 from mjfim.excitation.design import design_task
 from mjfim.excitation.interior_point import BarrierIterate, InteriorPointMethod
 from mjfim.parallel import dispatch
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 from tests.support.cli import names, read, write_experiment

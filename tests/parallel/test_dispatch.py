@@ -17,7 +17,6 @@ from typing import Any
 
 import pytest
 
-from mjfim.budget import Budget, StopToken
 from mjfim.errors import ExperimentError
 from mjfim.parallel import (
     Dispatch,
@@ -29,6 +28,7 @@ from mjfim.parallel import (
     dispatch,
     results,
 )
+from mjfim.parallel.budget import Budget, StopToken
 
 
 class FakeExecutor(Executor):

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mjfim.budget import LONGEST_WAY, Budget, StopReason, StopToken, measured_by
+from mjfim.parallel.budget import LONGEST_WAY, Budget, StopReason, StopToken, measured_by
 
 
 def test_a_budget_keeps_the_clock_with_which_it_was_made() -> None:
@@ -41,7 +41,7 @@ def test_the_time_left_is_kept_on_a_computer_whose_clock_differs(
 ) -> None:
     sent = pickle.dumps(Budget(seconds=1000.0))
     there = time.time() + ahead
-    monkeypatch.setattr("mjfim.budget.time.time", lambda: there)
+    monkeypatch.setattr("mjfim.parallel.budget.time.time", lambda: there)
 
     restored = pickle.loads(sent)
     assert 1000.0 - LONGEST_WAY - 10.0 <= restored.seconds_left <= 1000.0

@@ -1,0 +1,538 @@
+"""Budget of a computation, the token that asks it to stop, and what Ctrl-C and SIGTERM do.
+
+Long computations check `budget.exhausted` in their loops and return their best result so far; no
+exception is raised to stop them. `stop_on_interrupt`, which the verbs use, turns Ctrl-C into a
+request of a token.
+
+On the command line, an `Interruption` is in force. The first press asks the computation to return
+its best result so far, which is then written. A second press leaves out what is not necessary, such
+as figures; so are those that are not begun `FINISH_SECONDS` after the first press. Before there is
+anything to keep, the first press ends the program.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from types import FrameType
+from typing import Any
+
+from mjfim.errors import InterruptedByUserError, UnfinishedError
+from mjfim.files import remove_temporary_files
+
+# Longest time that a budget may take to another process [s]. More is a difference of the clocks.
+LONGEST_WAY = 60.0
+
+# Time after the first press at which no file is begun that is not necessary [s]. Computations
+# usually end within about 5 s. What is drawn then may take much longer on a busy computer, and can
+# be drawn later.
+FINISH_SECONDS = 6.0
+
+# Time after the second press of the user at which the process ends in any case [s].
+LAST_SECONDS = 5.0
+
+# Exit code of an interrupted program.
+INTERRUPTED_CODE = 1
+
+# Begin of the file names of the code by which Python imports modules.
+IMPORT_MACHINERY = "<frozen importlib._bootstrap"
+
+# Signals that interrupt a program.
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+# What the user reads where there is nothing to keep, after the first press, and before a process is
+# ended from outside its loops.
+NOTHING_SENTENCE = "interrupted before there was a result; nothing was written"
+FIRST_SENTENCE = "interrupted; finishing with the best so far; press again to stop at once"
+LAST_SENTENCE = "interrupted; stopped at once; each file that was written is complete"
+
+
+class StopReason(Enum):
+    """Reason why a computation ended early; the value is a sentence for the user."""
+
+    REQUESTED = "interrupted by the user"
+    SECONDS = "the time is used up"
+    STEPS = "the engine steps are used up"
+    ITERATIONS = "the iterations are used up"
+
+
+class StopToken:
+    """A request to stop, which all computations that share the token check.
+
+    The request may come from another thread, from a signal handler or from a callback.
+
+    Args:
+        also: Function that returns True if there is a request from elsewhere, such as from a
+            parent process.
+    """
+
+    def __init__(self, also: Callable[[], bool] | None = None) -> None:
+        self._is_requested = False
+        self._also = also
+
+    def request(self) -> None:
+        """Ask all computations that share this token to return their best result so far."""
+        self._is_requested = True
+
+    @property
+    def requested(self) -> bool:
+        """True after a request to stop."""
+        return self._is_requested or (self._also is not None and self._also())
+
+
+_clock: ContextVar[Callable[[], float]] = ContextVar("mjfim_clock", default=time.monotonic)
+
+
+@contextmanager
+def measured_by(clock: Callable[[], float]) -> Iterator[None]:
+    """Let budgets that are made inside the context measure time by another clock.
+
+    With `time.process_time`, work gets the same number of processor seconds on a busy machine as on
+    an idle one. This is meant for benchmarks in one process.
+
+    Args:
+        clock: Returns the time from any fixed moment [s].
+    """
+    restore = _clock.set(clock)
+    try:
+        yield
+    finally:
+        _clock.reset(restore)
+
+
+class Budget:
+    """Time, engine steps and iterations that a computation may use; it checks them in its loops.
+
+    Args:
+        seconds: Time from the creation of the budget [s]; infinite without a limit.
+        steps: Engine steps; None without a limit.
+        iterations: Iterations; None without a limit.
+        stop: Token that ends the computation early.
+    """
+
+    def __init__(
+        self,
+        *,
+        seconds: float = math.inf,
+        steps: float | None = None,
+        iterations: int | None = None,
+        stop: StopToken | None = None,
+    ) -> None:
+        self.stop = StopToken() if stop is None else stop
+        self._now = _clock.get()
+        self.begun = self._now()
+        self.deadline = self.begun + seconds
+        self.max_steps = math.inf if steps is None else float(steps)
+        self.max_iterations = math.inf if iterations is None else float(iterations)
+        self.steps = 0.0
+        self.iterations = 0
+
+    def spend(self, *, steps: float = 0.0, iterations: int = 0) -> None:
+        """Count the engine steps and iterations since the last call."""
+        self.steps += steps
+        self.iterations += iterations
+
+    @property
+    def seconds_left(self) -> float:
+        """Remaining time [s], never negative; infinite without a limit."""
+        return max(self.deadline - self._now(), 0.0)
+
+    @property
+    def iterations_left(self) -> float:
+        """Remaining iterations, never negative; infinite without a limit."""
+        return max(self.max_iterations - self.iterations, 0)
+
+    @property
+    def seconds_used(self) -> float:
+        """Time since the budget was made [s]."""
+        return self._now() - self.begun
+
+    @property
+    def used(self) -> float:
+        """Used fraction of the limit that is closest to its end; 1 or more if it is exhausted."""
+        shares = [self.steps / self.max_steps, self.iterations / self.max_iterations]
+        total = self.deadline - self.begun
+        if math.isfinite(total):
+            shares.append(self.seconds_used / total if total > 0.0 else 1.0)
+
+        return max(shares)
+
+    @property
+    def exhausted(self) -> StopReason | None:
+        """Reason to stop the computation; None while it may continue."""
+        if self.stop.requested:
+            return StopReason.REQUESTED
+        if self._now() >= self.deadline:
+            return StopReason.SECONDS
+        if self.steps >= self.max_steps:
+            return StopReason.STEPS
+        if self.iterations >= self.max_iterations:
+            return StopReason.ITERATIONS
+
+        return None
+
+    def share(self, fraction: float = 1.0, *, iterations: int | None = None) -> Budget:
+        """Make a budget for a part of the computation; both budgets share one token.
+
+        Args:
+            fraction: Fraction of the remaining time and of the remaining engine steps.
+            iterations: Iterations of the part; None without a limit.
+
+        Returns:
+            A budget that begins to count now.
+        """
+        steps_left = max(self.max_steps - self.steps, 0.0)
+        return Budget(
+            seconds=fraction * self.seconds_left,
+            steps=fraction * steps_left if math.isfinite(steps_left) else None,
+            iterations=iterations,
+            stop=self.stop,
+        )
+
+    def with_stop(self, stop: StopToken) -> Budget:
+        """Make a copy with another token.
+
+        Args:
+            stop: The other token.
+
+        Returns:
+            A budget with equal limits and equal use so far.
+        """
+        # `copy.copy` would restore the clock of another process.
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other.stop = stop
+        return other
+
+    def paused(self) -> PausedBudget:
+        """Freeze what is used and left now, for a computation that goes on later or elsewhere."""
+        return PausedBudget(
+            seconds_used=self.seconds_used,
+            seconds_left=self.seconds_left,
+            max_steps=self.max_steps,
+            max_iterations=self.max_iterations,
+            steps=self.steps,
+            iterations=self.iterations,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for another process, in which the stop token and the clock differ."""
+        state = dict(self.__dict__)
+        state["stop"] = None
+        state["moment"] = time.time(), state.pop("_now")()
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore in another process; `stop` is a new token, which the worker replaces."""
+        wall, then = state.pop("moment")
+        self.__dict__.update(state)
+        self._now = time.monotonic
+
+        # The clocks of two computers may differ, but the way between them takes a moment only.
+        on_the_way = min(max(time.time() - wall, 0.0), LONGEST_WAY)
+        shift = (self._now() - then) - on_the_way
+        self.begun += shift
+        self.deadline += shift
+        self.stop = StopToken()
+
+
+@dataclass(frozen=True, kw_only=True)
+class PausedBudget:
+    """A budget whose time does not pass, because its computation is interrupted.
+
+    Attributes:
+        seconds_used: Time that was used before [s].
+        seconds_left: Time that is left [s]; infinite without a limit.
+        max_steps: Limit of the engine steps; infinite without one.
+        max_iterations: Limit of the iterations; infinite without one.
+        steps: Engine steps that were used.
+        iterations: Iterations that were used.
+    """
+
+    seconds_used: float
+    seconds_left: float
+    max_steps: float
+    max_iterations: float
+    steps: float
+    iterations: int
+
+    def resumed(self, stop: StopToken) -> Budget:
+        """Let the time pass again.
+
+        Args:
+            stop: Token that ends the computation early.
+        """
+        budget = Budget(seconds=self.seconds_left, stop=stop)
+        budget.begun -= self.seconds_used
+        budget.max_steps, budget.steps = self.max_steps, self.steps
+        budget.max_iterations, budget.iterations = self.max_iterations, self.iterations
+        return budget
+
+
+class Interruption:
+    """Handler of Ctrl-C and SIGTERM while a program runs; a context manager.
+
+    Python delivers signals to the main thread only; in another thread the context has no effect. A
+    process that ignores Ctrl-C, such as a worker, continues to ignore it.
+
+    Args:
+        announce: Shows a sentence to the user; called from another thread.
+
+    Attributes:
+        presses: Number of presses of the user so far.
+        folder: Folder that holds results already, or None.
+        incomplete: True after results were left out.
+    """
+
+    def __init__(self, announce: Callable[[str], None]) -> None:
+        self.presses = 0
+        self.folder: Path | None = None
+        self.incomplete = False
+        self._announce = announce
+        self._requests: list[StopToken] = []
+        self._has_result = False
+        self._has_work_to_finish = False
+        self._is_optional = False
+        self._is_postponed = False
+        self._first_press = math.inf
+        self._before: dict[int, Any] = {}
+
+        # A queue of this kind may be used in a signal handler; None ends the thread that watches.
+        self._pressed: SimpleQueue[int | None] = SimpleQueue()
+        self._watcher = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> Interruption:
+        """Handle the signals from here on."""
+        global _current
+        is_main_thread = threading.current_thread() is threading.main_thread()
+        if is_main_thread and callable(signal.getsignal(signal.SIGINT)):
+            _current = self
+            self._watcher.start()
+            self._before = {number: signal.signal(number, self) for number in SIGNALS}
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Restore the handlers of before; InterruptedByUserError after a press in an import."""
+        global _current
+        if not self._before:
+            return
+        _current = None
+        for number, handler in self._before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+        # What the other thread still says belongs to this context, and not to what follows.
+        self._pressed.put(None)
+        self._watcher.join(timeout=1.0)
+        if kind is None:
+            self._end_if_postponed()
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """React to a press: ask computations to stop, or raise where none runs.
+
+        Raises:
+            InterruptedByUserError: There is nothing to keep.
+            UnfinishedError: What is being written may be left out, and the user presses again.
+        """
+        self.presses += 1
+
+        # The thread that announces the first press must not see what this function changes later.
+        if self.presses == 1:
+            self._first_press = time.monotonic()
+            self._has_work_to_finish = bool(self._requests) or self._has_result
+        self._pressed.put(self.presses)
+        for request in self._requests:
+            request.request()
+
+        # An import that ends halfway would leave modules behind that cannot be imported again.
+        if self._requests or self._has_result:
+            if self._is_optional and self.hurried and not _is_importing(frame):
+                raise UnfinishedError
+        elif _is_importing(frame):
+            self._is_postponed = True
+        else:
+            # The error ends the program; a further press must not disturb that.
+            self._has_result = True
+            raise InterruptedByUserError
+
+    @property
+    def hurried(self) -> bool:
+        """True after the second press of the user."""
+        return self.presses > 1
+
+    def keep(self, folder: Path | None = None) -> None:
+        """Say that there is a result, so that no press ends the program before it is written.
+
+        Args:
+            folder: Folder that receives it, or None.
+
+        Raises:
+            InterruptedByUserError: A press came during an import, and the program goes on.
+        """
+        self._end_if_postponed()
+        self._has_result = True
+        self.folder = folder or self.folder
+
+    @contextmanager
+    def computing(self, request: StopToken) -> Iterator[None]:
+        """Pass presses on to a computation; afterwards, there is a result to keep.
+
+        Args:
+            request: Asks the computation to stop; after an earlier press, it is asked at once.
+
+        Raises:
+            InterruptedByUserError: A press came during an import, and the program goes on.
+        """
+        self._end_if_postponed()
+        self._requests.append(request)
+        if self.presses:
+            request.request()
+        try:
+            yield
+            self._has_result = True
+        finally:
+            self._requests.remove(request)
+
+    def run_optional(self, write: Callable[[], object]) -> None:
+        """Call a function, but not some time after a press, and leave it at the second press.
+
+        Args:
+            write: Writes something that may be left out.
+        """
+        self._is_optional = True
+        try:
+            if self.hurried or time.monotonic() - self._first_press > FINISH_SECONDS:
+                raise UnfinishedError
+            write()
+        except UnfinishedError:
+            self.incomplete = True
+        finally:
+            self._is_optional = False
+
+    def _end_if_postponed(self) -> None:
+        """End a program that goes on after an import in which the press came."""
+        if self._is_postponed:
+            self._is_postponed = False
+            raise InterruptedByUserError
+
+    def _watch(self) -> None:
+        """Announce the first press, and end the process some time after the second one."""
+        if self._pressed.get() is None:
+            return
+        if self._has_work_to_finish:
+            self._announce(FIRST_SENTENCE)
+        if self._pressed.get() is None:
+            return
+
+        # The user wants an end; work that does not return in time is given up.
+        try:
+            while self._pressed.get(timeout=LAST_SECONDS) is not None:
+                continue
+        except Empty:
+            self._announce(LAST_SENTENCE)
+            remove_temporary_files()
+            os._exit(INTERRUPTED_CODE)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Whether a module is being imported."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith(IMPORT_MACHINERY):
+            return True
+        frame = frame.f_back
+    return False
+
+
+# The handler in force. Signals concern the whole process, and so does the handler.
+_current: Interruption | None = None
+
+
+def current_interruption() -> Interruption | None:
+    """Return the handler in force; None where the program has none, or in another thread."""
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    return _current if is_main_thread else None
+
+
+def hurried() -> bool:
+    """Return whether the user has pressed Ctrl-C twice."""
+    return _current is not None and _current.hurried
+
+
+def run_optional(write: Callable[[], object]) -> None:
+    """Call a function, and leave it when the user presses twice, or some time after one press.
+
+    Args:
+        write: Writes something that may be left out, such as figures.
+    """
+    interruption = current_interruption()
+    if interruption is None:
+        write()
+    else:
+        interruption.run_optional(write)
+
+
+_active: ContextVar[StopToken | None] = ContextVar("mjfim_stop_token", default=None)
+
+
+@contextmanager
+def stop_on_interrupt(stop: StopToken | None = None) -> Iterator[StopToken]:
+    """Turn the first Ctrl-C inside the context into a request to stop.
+
+    A second Ctrl-C raises KeyboardInterrupt as usual, except on the command line, which has a
+    handler of its own (`Interruption`). Nested contexts share the token of the outermost one.
+    Outside the main thread, to which Python delivers no signals, the token is only yielded.
+
+    Args:
+        stop: Token to set; default: that of the surrounding context, or a new one.
+
+    Yields:
+        The token that the computation has to check.
+    """
+    outer = _active.get()
+    token = stop or outer or StopToken()
+    restore = _active.set(token)
+    try:
+        with nullcontext() if token is outer else _requested_by_interrupt(token, outer):
+            yield token
+    finally:
+        _active.reset(restore)
+
+
+@contextmanager
+def _requested_by_interrupt(token: StopToken, outer: StopToken | None) -> Iterator[None]:
+    """Request a token, and that of the surrounding context, at Ctrl-C."""
+    interruption = current_interruption()
+    if interruption is not None:
+        with interruption.computing(token):
+            yield
+        return
+
+    # A process that ignores Ctrl-C, such as a worker, continues to ignore it.
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    previous = signal.getsignal(signal.SIGINT)
+    if not in_main_thread or not callable(previous):
+        yield
+        return
+
+    def request(number: int, frame: FrameType | None) -> None:
+        """Set this token and the one of the surrounding context; a second call interrupts."""
+        if token.requested:
+            signal.default_int_handler(number, frame)
+        token.request()
+        if outer is not None:
+            outer.request()
+
+    signal.signal(signal.SIGINT, request)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)

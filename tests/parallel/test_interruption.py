@@ -1,0 +1,193 @@
+"""Ctrl-C and SIGTERM on the command line: what one press and two presses do at each moment."""
+
+from __future__ import annotations
+
+import importlib
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mjfim.errors import InterruptedByUserError
+from mjfim.parallel import budget as module
+from mjfim.parallel.budget import Interruption, StopToken, hurried, run_optional, stop_on_interrupt
+from tests.support.paths import ROOT
+
+
+@pytest.fixture
+def sentences() -> list[str]:
+    """What the user was told."""
+    return []
+
+
+@pytest.fixture
+def interruption(sentences: list[str]) -> Iterator[Interruption]:
+    """A handler in force."""
+    before = [signal.getsignal(number) for number in module.SIGNALS]
+    with Interruption(sentences.append) as handler:
+        yield handler
+    assert [signal.getsignal(number) for number in module.SIGNALS] == before
+
+
+@pytest.mark.parametrize("number", module.SIGNALS)
+def test_nothing_is_kept_before_there_is_a_result(
+    interruption: Interruption, number: signal.Signals
+) -> None:
+    with pytest.raises(InterruptedByUserError):
+        signal.raise_signal(number)
+
+
+@pytest.mark.parametrize("number", module.SIGNALS)
+def test_no_number_of_presses_ends_a_computation_from_outside(
+    interruption: Interruption, number: signal.Signals
+) -> None:
+    inner = StopToken()
+    with stop_on_interrupt() as outer, stop_on_interrupt(inner):
+        signal.raise_signal(number)
+        assert outer.requested
+        assert inner.requested
+        assert not hurried()
+
+        signal.raise_signal(number)
+        assert hurried()
+
+    # The result is written however often the user presses.
+    signal.raise_signal(number)
+    assert interruption.presses == 3
+
+
+def test_a_computation_that_begins_after_a_press_is_stopped_at_once(
+    interruption: Interruption,
+) -> None:
+    interruption.keep()
+    signal.raise_signal(signal.SIGINT)
+    with stop_on_interrupt() as token:
+        assert token.requested
+
+
+def test_the_second_press_leaves_out_figures_and_the_program_goes_on(
+    interruption: Interruption,
+) -> None:
+    drawn = []
+
+    def draw() -> None:
+        drawn.append("begun")
+        signal.raise_signal(signal.SIGINT)
+        drawn.append("after one press")
+        signal.raise_signal(signal.SIGINT)
+        drawn.append("after two presses")
+
+    interruption.keep()
+    run_optional(draw)
+    run_optional(draw)
+    assert drawn == ["begun", "after one press"]
+    assert interruption.incomplete
+
+
+def test_what_a_press_says_is_said_before_the_end_of_the_context() -> None:
+    """The thread that says it may be late; the sentence would stand among later ones."""
+    said: list[str] = []
+
+    def say_late(sentence: str) -> None:
+        time.sleep(0.1)
+        said.append(sentence)
+
+    with Interruption(say_late) as handler:
+        handler.keep()
+        signal.raise_signal(signal.SIGINT)
+    assert said == [module.FIRST_SENTENCE]
+
+
+# A module that is imported while the user presses.
+PRESSED = """
+import signal
+
+signal.raise_signal(signal.SIGINT)
+IS_COMPLETE = True
+"""
+
+
+@pytest.fixture
+def pressed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Name of a module whose import sends a signal to this process."""
+    name = "module_that_is_pressed"
+    (tmp_path / f"{name}.py").write_text(PRESSED)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield name
+    sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize("begin", ["computing", "keep"])
+def test_no_work_begins_after_a_press_during_an_import(
+    interruption: Interruption, pressed: str, begin: str
+) -> None:
+    """Short work would end before the error comes, with a result that was asked to stop."""
+    importlib.import_module(pressed)
+    with pytest.raises(InterruptedByUserError):
+        interruption.keep() if begin == "keep" else _compute(interruption)
+
+    assert sys.modules[pressed].IS_COMPLETE
+    assert interruption.presses == 1
+
+
+def _compute(interruption: Interruption) -> None:
+    with interruption.computing(StopToken()):
+        pytest.fail("the computation has begun")
+
+
+def test_no_figure_begins_some_seconds_after_a_press(
+    interruption: Interruption, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "FINISH_SECONDS", 0.0)
+    drawn = []
+    interruption.keep()
+    signal.raise_signal(signal.SIGINT)
+    run_optional(lambda: drawn.append("a figure"))
+    assert interruption.incomplete
+    assert not drawn
+
+
+def test_the_end_of_the_work_does_not_hide_a_press_during_an_import(pressed: str) -> None:
+    with pytest.raises(InterruptedByUserError), Interruption(lambda _: None):
+        importlib.import_module(pressed)
+
+
+# A computation that does not look at the request to stop, and is pressed twice.
+DEAF = """
+import signal
+import time
+
+from mjfim.parallel import budget as interruption
+
+interruption.LAST_SECONDS = 0.05
+
+
+class Ignored:
+    def request(self):
+        pass
+
+
+with interruption.Interruption(lambda text: print(text, flush=True)) as handler:
+    with handler.computing(Ignored()):
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+        time.sleep(60.0)
+"""
+
+
+def test_two_presses_end_work_that_does_not_return() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", DEAF],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+        timeout=30.0,
+    )
+    assert ended.returncode == module.INTERRUPTED_CODE, ended.stderr
+    assert ended.stdout.splitlines() == [module.FIRST_SENTENCE, module.LAST_SENTENCE]
+    assert not ended.stderr
