@@ -182,16 +182,16 @@ def _segment_bounds(recording: AlignedRecording, length: float | None) -> np.nda
 def _on_ticks(bounds: np.ndarray, ticks: int) -> np.ndarray:
     """Samples at which segments begin, moved to evaluations of all control laws.
 
-    A segment that begins there needs no guess of the control that was held before, and segments
-    with common evaluations are simulated together. Segments that are too short stay as they are.
+    Segments that are shorter than the time between two evaluations go into their neighbours.
 
     Args:
         bounds: Samples at which segments begin, and the last sample.
         ticks: Samples after which the evaluations repeat; 1 without laws.
     """
-    if np.diff(bounds).min() < MIN_SAMPLES + ticks:
+    if ticks == 1:
         return bounds
-    return np.append(np.rint(bounds[:-1] / ticks).astype(int) * ticks, bounds[-1])
+    begins = np.unique(np.rint(bounds[:-1] / ticks).astype(int) * ticks)
+    return np.append(begins[(begins == 0) | (begins <= bounds[-1] - MIN_SAMPLES)], bounds[-1])
 
 
 def measured_initial_states(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import mujoco
@@ -20,7 +21,7 @@ from mjfim.parallel import cores
 from mjfim.plant.state_space import StateSpace
 
 if TYPE_CHECKING:
-    from mjfim.plant.input_context import InputContext, LoopTrace
+    from mjfim.plant.running_law import InputContext, LoopTrace
 
 # Components of MuJoCo's state that a rollout records after every engine step: the time, then qpos,
 # qvel and act.
@@ -259,17 +260,6 @@ class SampleSteps:
     observed: Array | None
 
 
-class StepCount:
-    """Number of engine steps, shared by simulators of one model.
-
-    Attributes:
-        steps: `mj_step` calls so far.
-    """
-
-    def __init__(self) -> None:
-        self.steps = 0
-
-
 class BatchSimulator:
     """Steps many simulations of models that share one memory layout.
 
@@ -305,7 +295,8 @@ class BatchSimulator:
         self.substeps = substeps
         self.sensors = sensors
         self.threads = threads or cores()
-        self._count = StepCount()
+        # Shared by simulators with samples of other lengths.
+        self._count = SimpleNamespace(steps=0)
         self._batches: dict[str, Batch] = {}
         self._data = mujoco.MjData(model)
         self._clocks = model.sensor_adr[model.sensor_type == CLOCK_SENSOR]
@@ -316,7 +307,7 @@ class BatchSimulator:
     @property
     def steps(self) -> int:
         """`mj_step` calls so far, those of `with_substeps` and of workers included."""
-        return self._count.steps
+        return int(self._count.steps)
 
     def add_steps(self, steps: int) -> None:
         """Count `mj_step` calls that a worker has made for this simulator.
@@ -358,18 +349,15 @@ class BatchSimulator:
             The sample of every simulation.
         """
         share = len(states) // len(models)
-        parts = []
-        for i, model in enumerate(models):
-            rows = slice(i * share, (i + 1) * share)
-            parts.append(self._step_model(model, states[rows], ctrl[rows], observations))
-
-        sensors = [part.sensors for part in parts if part.sensors is not None]
-        observed = [part.observed for part in parts if part.observed is not None]
-        return SampleSteps(
-            states=np.concatenate([part.states for part in parts]),
-            sensors=np.concatenate(sensors) if sensors else None,
-            observed=np.concatenate(observed) if observed else None,
-        )
+        each = models if len(models) == 1 else [model for model in models for _ in range(share)]
+        found = self._open_loop(each, states, ctrl[:, None], observations, at_end=False)
+        after = found.states[:, 1]
+        after[~found.finite] = np.nan
+        observed = None
+        if observations is not None and found.observed is not None:
+            observed = found.observed[:, 0, list(observations.derivative_rows)]
+        sensors = None if found.sensors is None else found.sensors[:, 0]
+        return SampleSteps(states=after, sensors=sensors, observed=observed)
 
     def rollout(
         self,
@@ -391,36 +379,7 @@ class BatchSimulator:
         Returns:
             The simulated curves.
         """
-        count = len(ctrl)
-        batch = self._batch("small rollout" if count <= SMALL_BATCH else "large rollout", count)
-        padding = [models[-1]] * (batch.nsim - count)
-        batch.set_models(models[0] if len(models) == 1 else [*models, *padding])
-        ids = self._load(batch, start, models)
-
-        held = self._held(ctrl)
-        record = self._recorded_fields(observations)
-        with silence_mujoco_log():
-            out = batch.rollout(held.shape[1], held, record=record, ids=ids)
-        self._count.steps += count * held.shape[1]
-
-        # Engine step i is recorded after the step: sample k ends with step k * substeps.
-        engine_steps = ctrl.shape[1] * self.substeps
-        rows = out[RECORDED_STATE][:, self.substeps - 1 : engine_steps : self.substeps]
-        states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
-
-        finite = self._on_time(rows[:, -1, 0], engine_steps)
-        finite &= np.isfinite(states).all(axis=(1, 2))
-        finite &= is_accepted(ctrl).all(axis=(1, 2))
-
-        sensors = observed = None
-        if self.sensors:
-            sensors = self._sensor_data(out["sensordata"][:, :: self.substeps])
-        if observations is not None:
-            observed = self._observed(observations, start, out, engine_steps)
-            if observations.force_rows:
-                forces = self._forces_between_steps(observations, models, start, out, ctrl)
-                observed = _with_force_rows(observations, observed, forces)
-        return Rollouts(states=states, sensors=sensors, finite=finite, observed=observed)
+        return self._open_loop(models, start, ctrl, observations, at_end=True)
 
     def engine_steps(
         self, model: Any, states: Array, ctrl: Array, fields: Sequence[str]
@@ -436,40 +395,63 @@ class BatchSimulator:
         Returns:
             The engine steps; without a meaning where a simulation diverges.
         """
-        count = len(states)
-        batch = self._batch("engine steps", count)
-        batch.set_models(model)
-        ids = self._load(batch, states, [model])
-
         held = np.repeat(ctrl[:, None], self.substeps, axis=1)
-        with silence_mujoco_log():
-            out = batch.rollout(self.substeps, held, record=(RECORDED_STATE, *fields), ids=ids)
-        self._count.steps += count * self.substeps
-
+        out = self._recorded([model], states, held, (RECORDED_STATE, *fields))
         after = out[RECORDED_STATE][:, :, 1:]
         return EngineSteps(
             states=np.concatenate([states[:, None], after], axis=1),
             fields={name: out[name] for name in fields},
         )
 
-    def _held(self, ctrl: Array) -> Array:
-        """(m, engine steps, nu) control of every engine step of rollouts under ctrl: (m, N, nu)."""
+    def _open_loop(
+        self,
+        models: Sequence[Any],
+        start: Array,
+        ctrl: Array,
+        observations: SubstepObservations | None,
+        *,
+        at_end: bool,
+    ) -> Rollouts:
+        """Simulate curves, see `rollout`. at_end: whether sensors of the last state are needed."""
         held = np.repeat(ctrl, self.substeps, axis=1)
-
-        # Sensor data belong to the state before a step. One more step gives those of the last
-        # state.
-        if self.sensors:
-            held = np.concatenate([held, held[:, -1:]], axis=1)
-        return np.ascontiguousarray(held)
-
-    def _recorded_fields(self, observations: SubstepObservations | None) -> tuple[Any, ...]:
-        """MuJoCo's fields that a rollout records after every engine step."""
         record: tuple[Any, ...] = (RECORDED_STATE,)
         if self.sensors:
             record = (*record, "sensordata")
+            # Sensor data belong to the state before a step. One more step gives those of the last
+            # state.
+            if at_end:
+                held = np.concatenate([held, held[:, -1:]], axis=1)
         if observations is not None:
             record = (*record, *observations.fields)
-        return record
+        out = self._recorded(models, start, held, record)
+
+        # Engine step i is recorded after the step: sample k ends with step k * substeps.
+        engine_steps = ctrl.shape[1] * self.substeps
+        rows = out[RECORDED_STATE][:, self.substeps - 1 : engine_steps : self.substeps]
+        states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
+        finite = self._on_time(rows[:, -1, 0], engine_steps)
+        finite &= np.isfinite(states).all(axis=(1, 2))
+        finite &= is_accepted(ctrl).all(axis=(1, 2))
+
+        sensors = observed = None
+        if self.sensors:
+            sensors = self._sensor_data(out["sensordata"][:, :: self.substeps])
+        if observations is not None:
+            observed = self._observed(observations, models, start, out, ctrl)
+        return Rollouts(states=states, sensors=sensors, finite=finite, observed=observed)
+
+    def _recorded(
+        self, models: Sequence[Any], start: Array, held: Array, record: Sequence[Any]
+    ) -> dict[Any, Array]:
+        """Records after each engine step of simulations under held: (m, engine steps, nu)."""
+        count, steps = held.shape[:2]
+        batch, ids = self._loaded(
+            "small" if count <= SMALL_BATCH else "large", models, start, count
+        )
+        with silence_mujoco_log():
+            out = batch.rollout(steps, np.ascontiguousarray(held), record=record, ids=ids)
+        self._count.steps += count * steps
+        return dict(out)
 
     def closed_loop(
         self, model: Any, reference: Array, mu: Array, K: Array
@@ -517,24 +499,31 @@ class BatchSimulator:
         )
         return states, used, bool(finite)
 
-    def _batch(self, kind: str, count: int) -> Batch:
-        """A batch of at least `count` simulations.
+    def _loaded(
+        self, kind: str, models: Sequence[Any], states: Array, count: int
+    ) -> tuple[Batch, np.ndarray | None]:
+        """A batch of at least `count` simulations, of which the first ones begin at given states.
 
-        It is kept for later calls, because making one takes milliseconds, and replaced where a
-        larger one is needed.
+        Args:
+            kind: Use of the batch; batches are kept, and grow.
+            models: One model for all simulations, or one for each.
+            states: (count, ns) states.
+            count: Number of simulations.
+
+        Returns:
+            The batch and the simulations that are to be stepped; None for all.
         """
         batch = self._batches.get(kind)
         if batch is None or batch.nsim < count:
             batch = Batch(self.model, count, min(self.threads, count))
             self._batches[kind] = batch
-        return batch
+        padding = [models[-1]] * (batch.nsim - count)
+        batch.set_models(models[0] if len(models) == 1 else [*models, *padding])
+        self._load(batch, states, models)
+        return batch, None if count == batch.nsim else np.arange(count)
 
-    def _load(self, batch: Batch, states: Array, models: Sequence[Any]) -> np.ndarray | None:
-        """Write states: (n, ns) into the first n simulations of a batch.
-
-        Returns:
-            (n,) ids of these simulations, or None if they are all simulations of the batch.
-        """
+    def _load(self, batch: Batch, states: Array, models: Sequence[Any]) -> None:
+        """Write states: (n, ns) into the first n simulations of a batch."""
         n = len(states)
         qpos, qvel, act = self.space.split(states)
         batch.bind("qpos")[:n] = qpos
@@ -545,139 +534,14 @@ class BatchSimulator:
         batch.bind("time")[:n] = START_TIME
 
         # A batch keeps the mocap poses of the model that it was made with.
-        if len(self._mocap_bodies):
-            self._load_mocap(batch, models, n)
-        return None if n == batch.nsim else np.arange(n)
-
-    def _load_mocap(self, batch: Batch, models: Sequence[Any], count: int) -> None:
-        """Write the poses of the mocap bodies of each model into its simulations."""
-        mocap_pos = batch.bind("mocap_pos")
-        mocap_quat = batch.bind("mocap_quat")
         bodies = self._mocap_bodies
-
-        for i, model in enumerate(models):
+        for i, model in enumerate(models if len(bodies) else ()):
             # A single model belongs to all simulations.
-            simulations = slice(None, count) if len(models) == 1 else i
-            mocap_pos[simulations] = model.body_pos[bodies]
-            mocap_quat[simulations] = model.body_quat[bodies]
-
-    def _step_model(
-        self, model: Any, states: Array, ctrl: Array, observations: SubstepObservations | None
-    ) -> SampleSteps:
-        """Advance all simulations of one model by one sample, see `step`."""
-        count = len(states)
-        batch = self._batch("step", count)
-        batch.set_models(model)
-        ids = self._load(batch, states, [model])
-        batch.bind("ctrl")[:count] = ctrl
-
-        # Fields have to be bound before the step that fills them.
-        if self.sensors:
-            batch.bind("sensordata")
-        if observations is not None:
-            for name in observations.fields:
-                batch.bind(name)
-
-        with silence_mujoco_log():
-            sensors, observed = self._advance(batch, ids, count, observations)
-        self._count.steps += self.substeps * count
-
-        names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
-        after = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)
-        on_time = self._on_time(batch.bind("time").reshape(-1)[:count], self.substeps)
-        after[~on_time | ~is_accepted(ctrl).all(axis=1)] = np.nan
-        return SampleSteps(
-            states=after, sensors=sensors, observed=np.stack(observed, axis=1) if observed else None
-        )
-
-    def _advance(
-        self,
-        batch: Batch,
-        ids: np.ndarray | None,
-        count: int,
-        observations: SubstepObservations | None,
-    ) -> tuple[Array | None, list[Array]]:
-        """Step a batch over one sample, and read sensors and observations in between.
-
-        Returns:
-            (count, nsensordata) sensor data or None, and a list of (count, w) observations, one
-            for each derivative row.
-        """
-        substeps = () if observations is None else observations.derivative_substeps
-        accelerations = observations is not None and len(observations.accelerations) > 0
-        sensors = None
-        observed = []
-
-        # Sensor data are those of the state before the sample: the first step computes them.
-        stops = {*substeps, self.substeps}
-        if self.sensors:
-            stops.add(1)
-
-        begun = None
-        if observations is not None and observations.has_stages:
-            begun = self._current_forces(batch, ids, count, observations)
-
-        done = 0
-        for stop in sorted(stops):
-            # An acceleration is the change of velocity over one engine step.
-            if stop - done > 1 and stop in substeps:
-                batch.step(ids, nstep=stop - done - 1)
-                done = stop - 1
-            qvel_before = np.array(batch.bind("qvel")[:count]) if accelerations else None
-
-            batch.step(ids, nstep=stop - done)
-            done = stop
-            if self.sensors and stop == 1:
-                sensors = self._sensor_data(batch.bind("sensordata")[:count])
-            if observations is not None and stop in substeps:
-                qpos = batch.bind("qpos")[:count]
-                qvel = batch.bind("qvel")[:count]
-                before = qvel if qvel_before is None else qvel_before
-                observed.append(
-                    observations.values(qpos, qvel, before, lambda name: batch.bind(name)[:count])
-                )
-
-        # The further row belongs to the first engine step with RK4, and otherwise to the last one.
-        if observations is not None and observations.force_rows:
-            further = observed[0 if observations.has_stages else -1].copy()
-            if begun is None:
-                begun = self._current_forces(batch, ids, count, observations)
-            further[:, -begun.shape[1] :] = begun
-            observed.append(further)
-        return sensors, observed
-
-    def _current_forces(
-        self,
-        batch: Batch,
-        ids: np.ndarray | None,
-        count: int,
-        observations: SubstepObservations,
-    ) -> Array:
-        """(count, f) observed forces by `mj_forward` at the states of a batch, which it keeps."""
-        with silence_mujoco_log():
-            batch.forward(ids)
-
-        # mj_forward leaves its accelerations for the solver of the next step.
-        batch.bind("qacc_warmstart")[:count] = 0.0
-        return observations.forces(lambda name: batch.bind(name)[:count])
+            simulations = slice(None, n) if len(models) == 1 else i
+            batch.bind("mocap_pos")[simulations] = model.body_pos[bodies]
+            batch.bind("mocap_quat")[simulations] = model.body_quat[bodies]
 
     def _observed(
-        self,
-        observations: SubstepObservations,
-        start: Array,
-        out: dict[Any, Array],
-        engine_steps: int,
-    ) -> Array:
-        """(m, N, substeps, w) observations from the records of a rollout from start: (m, ns)."""
-        _, first_qvel, _ = self.space.split(start)
-        qpos, qvel, _ = self.space.split(out[RECORDED_STATE][:, :engine_steps, 1:])
-        before = np.concatenate([first_qvel[:, None], qvel[:, :-1]], axis=1)
-        rows = observations.values(qpos, qvel, before, lambda name: out[name][:, :engine_steps])
-
-        samples = engine_steps // self.substeps
-        return np.asarray(rows.reshape(len(start), samples, self.substeps, rows.shape[-1]))
-
-    def _forces_between_steps(
         self,
         observations: SubstepObservations,
         models: Sequence[Any],
@@ -685,53 +549,40 @@ class BatchSimulator:
         out: dict[Any, Array],
         ctrl: Array,
     ) -> Array:
-        """Forces by `mj_forward` for the further rows of a rollout.
-
-        Args:
-            observations: The observed quantities, with further rows.
-            models: One model for all simulations, or one for each.
-            start: (m, ns) initial states.
-            out: Records of the rollout.
-            ctrl: (m, N, nu) controls, each held over its sample.
-
-        Returns:
-            (m, N, further rows, f) forces of the f last observations.
-        """
+        """(m, N, rows, w) observations from the records of a rollout under ctrl: (m, N, nu)."""
         m, N, nu = ctrl.shape
-        after = out[RECORDED_STATE][:, : N * self.substeps, 1:]
+        end = N * self.substeps
+        after = out[RECORDED_STATE][:, :end, 1:]
         before = np.concatenate([start[:, None], after[:, :-1]], axis=1)
+        qpos, qvel, _ = self.space.split(after)
+        qvel_before = self.space.split(before)[1]
+        found = observations.values(qpos, qvel, qvel_before, lambda name: out[name][:, :end])
+        observed = found.reshape(m, N, self.substeps, found.shape[-1])
+        if not observations.force_rows:
+            return np.asarray(observed)
+
+        # Further rows have the forces at the beginning of the engine steps, and at the end of the
+        # samples.
         shape = (m, N, self.substeps, start.shape[1])
-
-        # The states at the beginning of the engine steps, and those at the end of the samples.
-        ends = after.reshape(shape)[:, :, -1:]
         begun = before.reshape(shape)[:, :, : len(observations.force_rows) - 1]
-        states = np.concatenate([begun, ends], axis=2)
+        states = np.concatenate([begun, after.reshape(shape)[:, :, -1:]], axis=2)
         rows = states.shape[2]
-
-        # Values that are not finite belong to simulations that diverged.
-        flat = np.nan_to_num(states.reshape(-1, start.shape[1]), posinf=0.0, neginf=0.0)
-        held = np.broadcast_to(ctrl[:, :, None], (m, N, rows, nu)).reshape(m * N * rows, nu)
-        forces = self._forces_at(observations, models, flat, held)
-        return np.asarray(forces.reshape(m, N, rows, -1))
-
-    def _forces_at(
-        self, observations: SubstepObservations, models: Sequence[Any], states: Array, ctrl: Array
-    ) -> Array:
-        """(n, f) observed forces at n states, (n, ns), under controls, (n, nu)."""
-        count = len(states)
-        batch = self._batch("forces", count)
         each = models
         if len(models) > 1:
-            each = [model for model in models for _ in range(count // len(models))]
-        padding = [models[-1]] * (batch.nsim - count)
-        batch.set_models(each[0] if len(each) == 1 else [*each, *padding])
-
-        ids = self._load(batch, states, each)
-        batch.bind("ctrl")[:count] = ctrl
+            each = [model for model in models for _ in range(N * rows)]
+        # Values that are not finite belong to simulations that diverged.
+        flat = np.nan_to_num(states.reshape(-1, start.shape[1]), posinf=0.0, neginf=0.0)
+        batch, ids = self._loaded("forces", each, flat, len(flat))
+        held = np.broadcast_to(ctrl[:, :, None], (m, N, rows, nu))
+        batch.bind("ctrl")[: len(flat)] = held.reshape(-1, nu)
         for name in observations.fields:
             batch.bind(name)
-
-        return self._current_forces(batch, ids, count, observations)
+        with silence_mujoco_log():
+            batch.forward(ids)
+        forces = observations.forces(lambda name: batch.bind(name)[: len(flat)])
+        further = observed[:, :, list(observations.force_rows)]
+        further[..., -forces.shape[-1] :] = forces.reshape(m, N, rows, -1)
+        return np.concatenate([observed, further], axis=2)
 
     def _sensor_data(self, data: Array) -> Array:
         """A copy of sensor data: (..., nsensordata) whose clocks count from zero."""
@@ -750,22 +601,6 @@ class BatchSimulator:
         duration = engine_steps * timestep
         error = np.abs(time - START_TIME - duration)
         return np.asarray(error < 0.5 * timestep)
-
-
-def _with_force_rows(observations: SubstepObservations, observed: Array, forces: Array) -> Array:
-    """Append the further rows of a rollout.
-
-    Args:
-        observations: The observed quantities, with r further rows.
-        observed: (m, N, substeps, w) observations at the engine steps.
-        forces: (m, N, r, f) forces of the further rows.
-
-    Returns:
-        (m, N, substeps + r, w) observations.
-    """
-    further = observed[:, :, list(observations.force_rows)]
-    further[..., -forces.shape[-1] :] = forces
-    return np.concatenate([observed, further], axis=2)
 
 
 def is_accepted(ctrl: Array) -> np.ndarray:

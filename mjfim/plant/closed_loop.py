@@ -6,7 +6,8 @@ MuJoCo steps them up to the next tick.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -17,21 +18,170 @@ from mjfim.model.control_laws import MEASURED_SUMS, ControlLaw, ControlLaws
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.plant.batch import (
     BatchSimulator,
-    EngineSteps,
     Rollouts,
-    SampleSteps,
     SubstepObservations,
     is_accepted,
 )
-from mjfim.plant.input_context import InputContext, LoopTrace
-from mjfim.plant.law_commands import LawCommands, Ticks, lead_time
-from mjfim.plant.law_loop import LawGroup, LawLoop
-from mjfim.plant.law_numbers import LawNumbers
-from mjfim.plant.running_law import RunningLaws, memory_at_begin
+from mjfim.plant.law_commands import LawCommands, LawNumbers, Ticks, lead_time
+from mjfim.plant.running_law import (
+    InputContext,
+    LawMemory,
+    LoopTrace,
+    RunningLaws,
+    memory_at_begin,
+)
 from mjfim.plant.state_sizes import StateSizes
 
 # Number of batches that are kept, one for each of the latest numbers of simulations.
 KEPT_BATCHES = 6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LawGroup:
+    """C laws with one period in the loop.
+
+    Attributes:
+        running: The laws in the loop.
+        ticks: Engine steps at which they are evaluated.
+        controls: (c,) addresses of their controls in ctrl.
+        positions: (c,) addresses of the positions that they read in qpos.
+        velocities: (c,) addresses of the velocities that they read in qvel.
+        places: (c,) places of the laws among all laws.
+    """
+
+    running: RunningLaws
+    ticks: Ticks
+    controls: np.ndarray
+    positions: np.ndarray
+    velocities: np.ndarray
+    places: np.ndarray
+
+
+class LawLoop:
+    """Simulation of m curves from one tick to the next.
+
+    Args:
+        laws: All laws, and the inputs.
+        batch: The m simulations, with the initial states.
+        ctrl: (m, N, w) inputs.
+        groups: The laws, grouped by their periods.
+        substeps: Engine steps of a sample.
+        sensors: True if sensor data are wanted. A step after the last sample gives its data.
+
+    Attributes:
+        end: Engine steps of all samples.
+        total: Engine steps that are taken.
+        states: (m, N+1, ns) states.
+        sensor_data: (m, N+1, nsensordata) sensor data that belong to the states, or None.
+        time: (m,) time of each simulation at the end of the samples [s].
+        largest: (m,) largest magnitudes of the controls so far [u-unit].
+    """
+
+    def __init__(
+        self,
+        *,
+        laws: ControlLaws,
+        batch: Batch,
+        ctrl: Array,
+        groups: Sequence[LawGroup],
+        substeps: int,
+        sensors: bool,
+    ) -> None:
+        self._laws = laws
+        self._batch = batch
+        self._ctrl = ctrl
+        self._groups = groups
+        self._substeps = substeps
+
+        count, samples = ctrl.shape[:2]
+        self.end = samples * substeps
+        self.total = self.end + int(sensors)
+
+        # Time, qpos, qvel and act are the first numbers of MuJoCo's state.
+        model = batch.model
+        self._recorded = batch.state[:, 1 : 1 + model.nq + model.nv + model.na]
+        self._applied = batch.bind("ctrl")
+        self._sensed = batch.bind("sensordata") if sensors else None
+
+        self.states = np.zeros((count, samples + 1, self._recorded.shape[1]))
+        self.sensor_data = None
+        if self._sensed is not None:
+            self.sensor_data = np.zeros((count, samples + 1, self._sensed.shape[1]))
+        self.time = np.zeros(count)
+        self.largest = np.zeros(count)
+
+        self._controls = np.zeros((count, samples, model.nu))
+        self._is_clipped = np.zeros((count, samples, len(laws.laws)), dtype=bool)
+        self._memory: tuple[LawMemory, ...] = ()
+
+    def run(self) -> LoopTrace:
+        """Simulate the curves, and return what the laws have done."""
+        qpos, qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        for group in self._groups:
+            self._applied[:, group.controls] = group.running.held
+
+        for length, sample, due in self._plan():
+            if sample is not None:
+                self._begin(sample)
+            for group in due:
+                self._evaluate(group, qpos, qvel)
+            if sample is not None:
+                self._note(sample)
+            if length:
+                self._batch.step(None, nstep=length)
+            if sample is not None and self.sensor_data is not None:
+                self.sensor_data[:, sample] = self._sensed
+
+        return LoopTrace(controls=self._controls, is_clipped=self._is_clipped, memory=self._memory)
+
+    def _plan(self) -> Iterator[tuple[int, int | None, list[LawGroup]]]:
+        """Everything that happens between engine steps.
+
+        Yields:
+            Number of steps up to the next event, the sample that begins now or None, and the laws
+            that are evaluated now.
+        """
+        begins = np.arange(0, self.end + 1, self._substeps)
+        stops = [begins, np.array([self.total])]
+        stops += [np.arange(0, self.total, g.ticks.period) for g in self._groups]
+
+        # The first step of a sample computes the sensor data that belong to its begin.
+        if self._sensed is not None:
+            stops.append(begins + 1)
+        steps = np.unique(np.concatenate(stops))
+        for step, length in zip(steps.tolist(), [*np.diff(steps).tolist(), 0], strict=True):
+            sample, inside = divmod(step, self._substeps)
+            due = [g for g in self._groups if step % g.ticks.period == 0]
+            is_over = step >= self.total
+            is_begin = inside == 0 and step <= self.end
+            yield length, sample if is_begin else None, [] if is_over else due
+
+    def _begin(self, sample: int) -> None:
+        """Record the states at the begin of a sample, and set the controls without a law."""
+        self.states[:, sample] = self._recorded
+        last = self._ctrl.shape[1] - 1
+        if sample > last:
+            self.time[:] = self._batch.bind("time")
+            self._memory = tuple(group.running.memory for group in self._groups)
+
+        inputs, direct = self._laws.direct
+        if len(direct):
+            self._applied[:, direct] = self._ctrl[:, min(sample, last), inputs]
+
+    def _evaluate(self, group: LawGroup, qpos: Array, qvel: Array) -> None:
+        """Evaluate laws at the current states and apply their controls."""
+        control = group.running.evaluate(qpos[:, group.positions], qvel[:, group.velocities])
+        self.largest = np.maximum(self.largest, np.abs(control).max(axis=1))
+        self._applied[:, group.controls] = control
+
+    def _note(self, sample: int) -> None:
+        """Note the controls of a sample, once they are known."""
+        if sample == self._ctrl.shape[1]:
+            return
+        self._controls[:, sample] = self._applied
+        for group in self._groups:
+            if group.running.has_limits:
+                self._is_clipped[:, sample, group.places] = group.running.is_clipped
 
 
 class ClosedLoopSimulator(BatchSimulator):
@@ -104,37 +254,31 @@ class ClosedLoopSimulator(BatchSimulator):
         if context is None:
             context = InputContext.none(ctrl)
 
-        # Curves that begin at different times between two ticks take their ticks separately.
-        phases = (context.samples * self.substeps) % self.laws.period
-        if (phases == phases[0]).all():
-            return self._in_phase(models, start, ctrl, context, int(phases[0]))
+        batch = self._batch_of(len(ctrl))
+        batch.set_models(models[0] if len(models) == 1 else list(models))
+        self._load(batch, start, models)
+        loop = LawLoop(
+            laws=self.laws,
+            batch=batch,
+            ctrl=ctrl,
+            groups=[
+                self._group(i, models, start, ctrl, context) for i in range(len(self.laws.by_tick))
+            ],
+            substeps=self.substeps,
+            sensors=self.sensors,
+        )
+        with silence_mujoco_log(), np.errstate(over="ignore", invalid="ignore"):
+            trace = loop.run()
+        self._count.steps += len(ctrl) * loop.total
 
-        groups = [np.flatnonzero(phases == phase) for phase in np.unique(phases)]
-        parts = [
-            self._in_phase(
-                models if len(models) == 1 else [models[i] for i in chosen.tolist()],
-                start[chosen],
-                ctrl[chosen],
-                context.of_curves(chosen),
-                int(phases[chosen[0]]),
-            )
-            for chosen in groups
-        ]
-        return _joined(parts, np.argsort(np.concatenate(groups)))
+        finite = self._on_time(loop.time, loop.end)
+        finite &= np.isfinite(loop.states).all(axis=(1, 2)) & is_accepted(loop.largest)
+        sensors = None if loop.sensor_data is None else self._sensor_data(loop.sensor_data)
+        return Rollouts(states=loop.states, sensors=sensors, finite=finite, loop=trace)
 
-    def step(
-        self,
-        models: Sequence[Any],
-        states: Array,
-        ctrl: Array,
-        observations: SubstepObservations | None = None,
-    ) -> SampleSteps:
-        """Refuse to step single samples."""
-        self._refuse()
-
-    def engine_steps(
-        self, model: Any, states: Array, ctrl: Array, fields: Sequence[str]
-    ) -> EngineSteps:
+    def _recorded(
+        self, models: Sequence[Any], start: Array, held: Array, record: Sequence[Any]
+    ) -> dict[Any, Array]:
         """Refuse to step single samples."""
         self._refuse()
 
@@ -147,34 +291,6 @@ class ClosedLoopSimulator(BatchSimulator):
     def _refuse(self) -> NoReturn:
         """Raise NotImplementedError: control laws remember what happened before a sample."""
         raise NotImplementedError("control laws have a memory, which single samples do not show")
-
-    def _in_phase(
-        self, models: Sequence[Any], start: Array, ctrl: Array, context: InputContext, phase: int
-    ) -> Rollouts:
-        """Simulate curves that begin `phase` engine steps after a common tick of all laws."""
-        batch = self._batch_of(len(ctrl))
-        batch.set_models(models[0] if len(models) == 1 else list(models))
-        self._load(batch, start, models)
-        groups = [
-            self._group(i, models, start, ctrl, context, phase)
-            for i in range(len(self.laws.by_tick))
-        ]
-        loop = LawLoop(
-            laws=self.laws,
-            batch=batch,
-            ctrl=ctrl,
-            groups=groups,
-            substeps=self.substeps,
-            sensors=self.sensors,
-        )
-        with silence_mujoco_log(), np.errstate(over="ignore", invalid="ignore"):
-            trace = loop.run()
-        self._count.steps += len(ctrl) * loop.total
-
-        finite = self._on_time(loop.time, loop.end)
-        finite &= np.isfinite(loop.states).all(axis=(1, 2)) & is_accepted(loop.largest)
-        sensors = None if loop.sensor_data is None else self._sensor_data(loop.sensor_data)
-        return Rollouts(states=loop.states, sensors=sensors, finite=finite, loop=trace)
 
     def _batch_of(self, count: int) -> Batch:
         """A batch of exactly `count` simulations, which steps faster than a part of a larger one.
@@ -196,9 +312,8 @@ class ClosedLoopSimulator(BatchSimulator):
         start: Array,
         ctrl: Array,
         context: InputContext,
-        phase: int,
     ) -> LawGroup:
-        """Laws with one period, ready for curves that begin `phase` engine steps after a tick.
+        """Laws with one period, ready for curves that begin at a tick.
 
         Args:
             index: Place of the laws among the groups of laws.
@@ -206,18 +321,15 @@ class ClosedLoopSimulator(BatchSimulator):
             start: (m, ns) initial states.
             ctrl: (m, N, w) inputs.
             context: Inputs before and after the curves.
-            phase: Engine steps from a common tick of all laws to the begin of the curves.
         """
         laws = self.laws.by_tick[index]
         count, N = ctrl.shape[:2]
         period, lead = laws[0].tick, context.before.shape[1]
-        first = -phase % period
         total = N * self.substeps + int(self.sensors)
         ticks = Ticks(
-            first=first,
             period=period,
-            before=(lead * self.substeps + first) // period,
-            count=max(-(-(total - first) // period), 0),
+            before=lead * self.substeps // period,
+            count=-(-total // period),
             substeps=self.substeps,
             timestep=float(self.model.opt.timestep),
         )
@@ -231,12 +343,10 @@ class ClosedLoopSimulator(BatchSimulator):
         if known is None:
             sums = self._measured_sums(laws, ctrl, context)
             state = (start[:, q], start[:, v])
-            known = memory_at_begin(laws, numbers, commands, ticks, state, sums)
+            known = memory_at_begin(numbers, commands, ticks, state, sums)
 
-        begins = context.memory is None and first == 0
-        running = RunningLaws(
-            laws, numbers, commands, ticks, known, begins=begins, first=commands.before
-        )
+        begins = context.memory is None
+        running = RunningLaws(laws, numbers, commands, ticks, known, begins=begins)
         return LawGroup(
             running=running,
             ticks=ticks,
@@ -264,23 +374,6 @@ class ClosedLoopSimulator(BatchSimulator):
         sums = np.stack(columns, axis=1)
         sums[context.samples == 0] = np.nan
         return sums
-
-
-def _joined(parts: Sequence[Rollouts], places: np.ndarray) -> Rollouts:
-    """Put curves together.
-
-    Args:
-        parts: Rollouts of some curves each.
-        places: (m,) place of each curve among those of all parts.
-    """
-    loops = [part.loop for part in parts if part.loop is not None]
-    sensors = [part.sensors for part in parts if part.sensors is not None]
-    return Rollouts(
-        states=np.concatenate([part.states for part in parts])[places],
-        sensors=np.concatenate(sensors)[places] if sensors else None,
-        finite=np.concatenate([part.finite for part in parts])[places],
-        loop=LoopTrace.joined(loops, places),
-    )
 
 
 def input_sizes(laws: ControlLaws, sizes: StateSizes) -> Array:

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.model.control_laws import ControlLaw, Quantity
-from mjfim.plant.law_numbers import LawNumbers, filter_shares
+from mjfim.model.control_laws import NUMBERS, ControlLaw, Quantity
 
 # Number of time constants after which a filter has forgotten its beginning to the last digit.
 FORGOTTEN_AFTER = 37.0
@@ -31,19 +31,86 @@ ON = 0.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class LawNumbers:
+    """Numbers of c laws in m simulations, each (m, c), with the unit u of the control.
+
+    Attributes:
+        kp: Gain of the position [u/rad or u/m].
+        kd: Gain of the velocity [u s/rad or u s/m].
+        ki: Gain of the integral of the error of the position [u/(rad s) or u/(m s)].
+        integral: Integral at the begin of a recording [u].
+        integral_limit: Largest magnitude of the integral [u].
+        saturation_low: Smallest control [u].
+        saturation_high: Largest control [u].
+        slew: Largest change of the control per second [u/s].
+        latency: Time from a command in the log to its effect [s].
+        time_constant: Time constant of the filter of the reference [s].
+        feedback_latency: Time from a measurement to the effect of the control [s].
+        velocity_time_constant: Time constant of the filter of the velocity [s].
+    """
+
+    kp: Array
+    kd: Array
+    ki: Array
+    integral: Array
+    integral_limit: Array
+    saturation_low: Array
+    saturation_high: Array
+    slew: Array
+    latency: Array
+    time_constant: Array
+    feedback_latency: Array
+    velocity_time_constant: Array
+
+    @classmethod
+    def of(cls, models: Sequence[Any], laws: Sequence[ControlLaw], count: int) -> LawNumbers:
+        """Read the numbers.
+
+        Args:
+            models: One model for all simulations, or one for each; successive simulations often
+                share one.
+            laws: The c laws.
+            count: Number m of simulations.
+        """
+        places = np.array([[law.first + i for law in laws] for i in range(len(NUMBERS))])
+        rows: list[Array] = []
+        for i, model in enumerate(models):
+            known = i > 0 and model is models[i - 1]
+            rows.append(rows[-1] if known else np.array(model.numeric_data[places]))
+
+        stacked = np.stack(rows, axis=1)
+        if len(models) == 1:
+            stacked = np.repeat(stacked, count, axis=1)
+        return cls(**dict(zip(NUMBERS, stacked, strict=True)))
+
+
+def filter_shares(time_constant: Array, period: float) -> Array:
+    """Share of a new value that a filter of first order takes over in one period.
+
+    Args:
+        time_constant: Time constants [s]; 0 for no filter.
+        period: The period [s].
+
+    Returns:
+        Shares of the same shape, 1 without a filter.
+    """
+    filtered = time_constant > 0.0
+    ratio = period / np.where(filtered, time_constant, 1.0)
+    return np.asarray(np.where(filtered, -np.expm1(-ratio), 1.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Ticks:
     """Times at which laws with one period are evaluated, in engine steps.
 
     Attributes:
-        first: Engine step after the begin of a curve at which the laws are evaluated first.
         period: Engine steps from one evaluation to the next.
-        before: Number of evaluations before the first one whose commands are needed.
-        count: Number of evaluations from the first one on.
+        before: Number of evaluations before the curve whose commands are needed.
+        count: Number of evaluations from the begin of the curve on, the first one at it.
         substeps: Engine steps of a sample.
         timestep: Engine timestep [s].
     """
 
-    first: int
     period: int
     before: int
     count: int
@@ -58,7 +125,7 @@ class Ticks:
     @property
     def samples(self) -> Array:
         """(before + count,) times of all evaluations, in samples after the begin of a curve."""
-        steps = self.first + self.period * np.arange(-self.before, self.count)
+        steps = self.period * np.arange(-self.before, self.count)
         return np.asarray(steps / self.substeps)
 
 
@@ -119,7 +186,7 @@ class LawCommands:
 
         # Sums over ticks hold back what the reference was, on average, half a latency before the
         # middle of the latest tick.
-        begin = (ticks.first - 0.5 * ticks.period) / ticks.substeps
+        begin = -0.5 * ticks.period / ticks.substeps
         middle = columns.at("reference", lead + begin - 0.5 * latency[None])
         kept_back = ticks.seconds * (1.0 - shares) / shares
         latest = reference[max(ticks.before - 1, 0)]

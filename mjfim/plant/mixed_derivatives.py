@@ -6,15 +6,19 @@ derivatives by state and control.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.batch import SampleSteps, SubstepObservations
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.step_derivatives import MovedSamples, StepDerivatives, all_samples, tiled
 from mjfim.records.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from mjfim.plant.plant import Plant
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,26 +86,6 @@ class Bilinear:
     observation_jacobian: Array | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _PairDerivatives:
-    """Differences by the c coordinates of (x, u) of two steps at +-epsilon along (psi w, w).
-
-    Attributes:
-        first: (c, n, nx) first differences of F.
-        mixed: (c, n, nx) mixed differences of F.
-        sensor_first: (c, n, nsensordata) first differences of the sensors, or None without sensors.
-        sensor_mixed: (c, n, nsensordata) mixed differences of the sensors, or None without sensors.
-        observation_jacobian: (N, S, w, c) first differences of the observations,
-            or None.
-    """
-
-    first: Array
-    mixed: Array
-    sensor_first: Array | None
-    sensor_mixed: Array | None
-    observation_jacobian: Array | None
-
-
 class MixedDerivatives(StepDerivatives):
     """First and mixed second derivatives of F and h."""
 
@@ -147,18 +131,68 @@ class MixedDerivatives(StepDerivatives):
             if closed is not None:
                 return closed
 
-        given = (theta, trajectory, psi, directions, accuracy)
-
+        plant, smooth, space = self.plant, self.plant.smooth, self.plant.space
         # Derivatives of sensors need the mean of both sides, so one-sided differences are used only
         # without sensors.
-        if accuracy.shared_origin and not self.plant.simulator.sensors:
-            return self._shared_origin(*given, observations)
+        has_origin = accuracy.shared_origin and not plant.simulator.sensors
+        sizes = self.difference_sizes(trajectory)
+        steps = accuracy.coordinate_step * sizes
+        moved = self._move_samples(*all_samples(trajectory), steps, accuracy.central)
 
-        found = self._symmetric_pairs(*given, observations)
-        if self.plant.smooth is self.plant:
-            return found
-        smooth = self.plant.smooth.derivatives._symmetric_pairs(*given, None)
-        return replace(found, F_mixed=smooth.F_mixed, h_mixed=smooth.h_mixed)
+        # Steps from which first derivatives follow: those at theta, or those on both sides of it.
+        # One-sided mixed differences are relative to the steps of the smooth plant at theta.
+        near: list[SampleSteps] = []
+        origin = None
+        if has_origin:
+            near.append(
+                plant.simulator.step([plant.model(theta)], moved.states, moved.ctrl, observations)
+            )
+            origin = near[0]
+            if smooth is not plant:
+                origin = smooth.simulator.step([smooth.model(theta)], moved.states, moved.ctrl)
+
+        F_mixed, of_sensors = [], []
+        for number, w in enumerate(directions):
+            along = psi @ w
+            epsilon = self.direction_step(accuracy.direction_step, along / sizes[: space.nx], w)
+            distances = np.array([epsilon] if has_origin else [epsilon, -epsilon])
+            at = theta + distances[:, None] * w
+            shifts = distances[:, None, None] * along
+            if origin is None:
+                # First derivatives of the observations do not depend on w.
+                near.append(_stepped(plant, moved, at, shifts, None if number else observations))
+            on_smooth = (
+                near[-1]
+                if smooth is plant and origin is None
+                else _stepped(smooth, moved, at, shifts)
+            )
+            reached = moved.unflatten(on_smooth.states)
+            other = reached[1] if origin is None else moved.unflatten(origin.states)[0]
+            width = 2.0 * epsilon if origin is None else epsilon
+            F_mixed.append(moved.quotient(space.minus(reached[0], other) / width))
+            if on_smooth.sensors is not None:
+                pair = moved.unflatten(on_smooth.sensors)
+                of_sensors.append(moved.quotient((pair[0] - pair[1]) / width))
+
+        # The state after the last sample is no state of the trajectory.
+        jacobian = None
+        if near[0].observed is not None:
+            jacobian = moved.observation_jacobian(_mean_change(moved, near[0].observed))[:-1]
+        count = len(moved.widths)
+        states = [moved.unflatten(each.states) for each in near]
+        by_z = [np.mean(space.minus(x[:, :count], x[:, count:]), axis=0) for x in states]
+        sensors = [_mean_change(moved, each.sensors) for each in near if each.sensors is not None]
+        return self._bilinear_from(
+            theta,
+            moved.trajectory_states,
+            psi,
+            directions,
+            first=np.mean([each / moved.widths for each in by_z], axis=0),
+            mixed=F_mixed,
+            sensor_first=np.mean([x / moved.widths for x in sensors], axis=0) if sensors else None,
+            sensor_mixed=of_sensors,
+            observation_jacobian=jacobian,
+        )
 
     def _in_closed_form(
         self,
@@ -192,178 +226,6 @@ class MixedDerivatives(StepDerivatives):
             sensor_mixed=[],
             observation_jacobian=jacobian,
         )
-
-    def _symmetric_pairs(
-        self,
-        theta: Array,
-        trajectory: Trajectory,
-        psi: Array,
-        directions: Array,
-        accuracy: DifferenceAccuracy,
-        observations: SubstepObservations | None,
-    ) -> Bilinear:
-        """`bilinear` by pairs of steps at +-epsilon along (psi w, w), at every moved (x, u).
-
-        Means over the pairs give A and B.
-        """
-        sizes = self.difference_sizes(trajectory)
-        steps, nx = accuracy.coordinate_step * sizes, self.plant.space.nx
-        moved = self._move_samples(*all_samples(trajectory), steps, accuracy.central)
-        pairs = []
-        for number, w in enumerate(directions):
-            # First derivatives of the observations do not depend on w, so the first pair gives
-            # them.
-            wanted = observations if number == 0 else None
-            state_direction = psi @ w
-            epsilon = self.direction_step(accuracy.direction_step, state_direction / sizes[:nx], w)
-            pairs.append(self._pair(theta, moved, state_direction, w, epsilon, wanted))
-
-        sensor_firsts = [pair.sensor_first for pair in pairs if pair.sensor_first is not None]
-        return self._bilinear_from(
-            theta,
-            moved.trajectory_states,
-            psi,
-            directions,
-            first=np.mean([pair.first for pair in pairs], axis=0),
-            mixed=[pair.mixed for pair in pairs],
-            sensor_first=np.mean(sensor_firsts, axis=0) if sensor_firsts else None,
-            sensor_mixed=[pair.sensor_mixed for pair in pairs if pair.sensor_mixed is not None],
-            observation_jacobian=pairs[0].observation_jacobian,
-        )
-
-    def _pair(
-        self,
-        theta: Array,
-        moved: MovedSamples,
-        state_direction: Array,
-        w: Array,
-        epsilon: float,
-        observations: SubstepObservations | None,
-    ) -> _PairDerivatives:
-        """Differences by (x, u) of two steps at +-epsilon along (psi w, w).
-
-        The mean of the two steps gives first differences, their quotient gives mixed ones.
-
-        Args:
-            theta: (p,) parameters of the trajectory [theta-unit].
-            moved: The n moved samples.
-            state_direction: (n, nx) direction psi w of the states.
-            w: (p,) direction of the parameters [theta-unit].
-            epsilon: Step along (psi w, w).
-            observations: Quantities observed within the samples, or None.
-        """
-        plant, count = self.plant, len(moved.widths)
-        shift = tiled(epsilon * state_direction, moved.batch_shape[0])
-        forward = plant.space.plus(moved.states, shift)
-        backward = plant.space.plus(moved.states, -shift)
-        stepped = plant.simulator.step(
-            plant.models(np.stack([theta + epsilon * w, theta - epsilon * w])),
-            np.concatenate([forward, backward]),
-            np.concatenate([moved.ctrl, moved.ctrl]),
-            observations,
-        )
-
-        states = moved.unflatten(stepped.states)
-        by_z = np.mean(plant.space.minus(states[:, :count], states[:, count:]), axis=0)
-        by_direction = plant.space.minus(states[0], states[1]) / (2.0 * epsilon)
-
-        sensor_first = sensor_mixed = None
-        if stepped.sensors is not None:
-            sensor_first, sensor_mixed = _sensor_differences(moved, stepped.sensors, epsilon)
-
-        # The state after the last sample is no state of the trajectory.
-        jacobian = None
-        if stepped.observed is not None:
-            observed = moved.unflatten(stepped.observed)
-            change = np.mean(observed[:, :count] - observed[:, count:], axis=0)
-            jacobian = moved.observation_jacobian(change)[:-1]
-        return _PairDerivatives(
-            first=by_z / moved.widths,
-            mixed=moved.quotient(by_direction),
-            sensor_first=sensor_first,
-            sensor_mixed=sensor_mixed,
-            observation_jacobian=jacobian,
-        )
-
-    def _shared_origin(
-        self,
-        theta: Array,
-        trajectory: Trajectory,
-        psi: Array,
-        directions: Array,
-        accuracy: DifferenceAccuracy,
-        observations: SubstepObservations | None,
-    ) -> Bilinear:
-        """`bilinear` by one-sided differences, for outputs without sensors.
-
-        The steps at the origin, from the moved samples at theta, serve all directions.
-        """
-        plant, smooth = self.plant, self.plant.smooth
-        sizes = self.difference_sizes(trajectory)
-        steps, nx = accuracy.coordinate_step * sizes, self.plant.space.nx
-        moved = self._move_samples(*all_samples(trajectory), steps, False)
-        count = len(moved.widths)
-
-        stepped = plant.simulator.step([plant.model(theta)], moved.states, moved.ctrl, observations)
-        origin = moved.unflatten(stepped.states)[0]
-        first = plant.space.minus(origin[:count], origin[count:]) / moved.widths
-
-        # The state after the last sample is no state of the trajectory.
-        jacobian = None
-        if stepped.observed is not None:
-            observed = moved.unflatten(stepped.observed)[0]
-            jacobian = moved.observation_jacobian(observed[:count, :-1] - observed[count:, :-1])
-
-        # Mixed differences are taken on the smooth plant, relative to its steps at the origin.
-        if smooth is not plant:
-            smooth_step = smooth.simulator.step([smooth.model(theta)], moved.states, moved.ctrl)
-            origin = moved.unflatten(smooth_step.states)[0]
-        mixed = []
-        for w in directions:
-            state_direction = psi @ w
-            epsilon = self.direction_step(accuracy.direction_step, state_direction / sizes[:nx], w)
-            mixed.append(
-                self._one_sided_difference(theta, moved, origin, state_direction, w, epsilon)
-            )
-
-        return self._bilinear_from(
-            theta,
-            moved.trajectory_states,
-            psi,
-            directions,
-            first=first,
-            mixed=mixed,
-            sensor_first=None,
-            sensor_mixed=[],
-            observation_jacobian=jacobian,
-        )
-
-    def _one_sided_difference(
-        self,
-        theta: Array,
-        moved: MovedSamples,
-        origin: Array,
-        state_direction: Array,
-        w: Array,
-        epsilon: float,
-    ) -> Array:
-        """(c, n, nx) mixed differences of F on the smooth plant, by (x, u) and along (psi w, w).
-
-        Args:
-            theta: (p,) parameters of the trajectory [theta-unit].
-            moved: The n moved samples.
-            origin: (m, n, ns) states of the smooth plant after the moved samples, at theta.
-            state_direction: (n, nx) direction psi w of the states.
-            w: (p,) direction of the parameters [theta-unit].
-            epsilon: Step along (psi w, w).
-        """
-        space, smooth = self.plant.space, self.plant.smooth
-        shift = tiled(epsilon * state_direction, moved.batch_shape[0])
-        models = smooth.models((theta + epsilon * w)[None])
-        stepped = smooth.simulator.step(models, space.plus(moved.states, shift), moved.ctrl)
-
-        states = moved.unflatten(stepped.states)[0]
-        return moved.quotient(space.minus(states, origin) / epsilon)
 
     def _bilinear_from(
         self,
@@ -431,19 +293,33 @@ class MixedDerivatives(StepDerivatives):
         )
 
 
-def _sensor_differences(moved: MovedSamples, sensors: Array, epsilon: float) -> tuple[Array, Array]:
-    """First and mixed differences of sensors by (x, u).
+def _mean_change(moved: MovedSamples, values: Array) -> Array:
+    """(c, n, ...) changes of values by the moves, averaged over the sides of the direction."""
+    count = len(moved.widths)
+    sides = moved.unflatten(values)
+    return np.asarray(np.mean(sides[:, :count] - sides[:, count:], axis=0))
+
+
+def _stepped(
+    plant: Plant,
+    moved: MovedSamples,
+    theta: Array,
+    shifts: Array,
+    observations: SubstepObservations | None = None,
+) -> SampleSteps:
+    """Steps of moved samples at several parameter values, one after the other.
 
     Args:
-        moved: The n moved samples.
-        sensors: (2*m*n, nsensordata) sensor data of steps at +epsilon, then at -epsilon.
-        epsilon: Step along (psi w, w).
-
-    Returns:
-        (c, n, nsensordata) first differences and (c, n, nsensordata) mixed differences.
+        plant: The plant.
+        moved: The samples, moved along each coordinate of (x, u).
+        theta: (b, p) parameters.
+        shifts: (b, n, nx) further moves of the samples, which belong to the parameters.
+        observations: Quantities to observe, or None.
     """
-    count = len(moved.widths)
-    pair = moved.unflatten(sensors)
-    first = np.mean(pair[:, :count] - pair[:, count:], axis=0) / moved.widths
-    mixed = moved.quotient((pair[0] - pair[1]) / (2.0 * epsilon))
-    return first, mixed
+    moves = [tiled(shift, moved.batch_shape[0]) for shift in shifts]
+    return plant.simulator.step(
+        plant.models(theta),
+        np.concatenate([plant.space.plus(moved.states, move) for move in moves]),
+        np.concatenate([moved.ctrl] * len(moves)),
+        observations,
+    )

@@ -12,8 +12,8 @@ from mjfim.plant.batch import Rollouts
 from mjfim.plant.closed_form_derivatives import ClosedFormDerivatives
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.difference_steps import TINY
-from mjfim.plant.input_context import InputContext
 from mjfim.plant.lumped_parameters import LumpedParameters
+from mjfim.plant.running_law import InputContext
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 # Relative step of the differences between whole rollouts.
@@ -449,7 +449,9 @@ class RolloutDerivatives(ClosedFormDerivatives):
             models = [model for model in models for _ in range(S)]
 
         numbers_per_sample = J * S * plant.simulator.substeps * (1 + state_size)
-        interval = int(np.clip(max_numbers / numbers_per_sample, 1, ctrl.shape[1] - lead))
+        # Control laws are evaluated where an interval begins.
+        ticks = plant.tick_samples
+        interval = max(int(max_numbers / (ticks * numbers_per_sample)), 1) * ticks
         begun = np.zeros(S, dtype=np.intp) if samples is None else samples
         memory = None
         for first in range(lead, ctrl.shape[1], interval):

@@ -20,8 +20,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.model.control_laws import ControlLaw
-from mjfim.plant.law_commands import LawCommands, Ticks
-from mjfim.plant.law_numbers import LawNumbers, filter_shares
+from mjfim.plant.law_commands import LawCommands, LawNumbers, Ticks, filter_shares
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,37 +43,90 @@ class LawMemory:
     positions: Array
     velocities: Array
 
-    def of_curves(self, chosen: np.ndarray) -> LawMemory:
-        """The memory of some of the curves.
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InputContext:
+    """Inputs that a rollout with control laws needs beside those of its samples.
+
+    Attributes:
+        before: (m, L, w) inputs of the samples before the curves; none at the begin of recordings.
+        after: (m, A, w) inputs of samples after the curves, of which the first one counts; without
+            one, the last input of the curves is held.
+        samples: (m,) samples from the begin of the recordings to the begin of the curves, which
+            show when the laws are evaluated.
+        memory: Memory of the laws, grouped by their periods, at the end of rollouts that the curves
+            continue; None where they begin.
+    """
+
+    before: Array
+    after: Array
+    samples: np.ndarray
+    memory: tuple[LawMemory, ...] | None = None
+
+    @classmethod
+    def none(cls, inputs: Array) -> InputContext:
+        """The context of curves at the begin of recordings.
 
         Args:
-            chosen: Indices of the curves.
+            inputs: (m, N, w) inputs of the curves.
         """
-        return LawMemory(
-            held=self.held[chosen],
-            integral=self.integral[chosen],
-            velocity=self.velocity[chosen],
-            measured=self.measured[chosen],
-            positions=self.positions[:, chosen],
-            velocities=self.velocities[:, chosen],
-        )
+        nothing = inputs[:, :0]
+        begin = np.zeros(len(inputs), dtype=np.intp)
+        return cls(before=nothing, after=nothing, samples=begin)
 
-    @staticmethod
-    def joined(parts: Sequence[LawMemory], places: np.ndarray) -> LawMemory:
-        """Put the memories of all curves together.
+    @classmethod
+    def of_interval(
+        cls,
+        inputs: Array,
+        samples: np.ndarray,
+        interval: slice,
+        lead: int,
+        memory: tuple[LawMemory, ...] | None,
+    ) -> InputContext:
+        """The context of an interval of curves.
 
         Args:
-            parts: Memories of some curves each.
-            places: (m,) place of each curve among those of all parts.
+            inputs: (m, W, w) inputs of the curves, and of samples before them.
+            samples: (m,) samples from the begin of the recordings to the first of these inputs.
+            interval: Samples of the interval among these inputs.
+            lead: Number of samples before the interval that matter.
+            memory: Memory at the end of the interval before it; None for the first interval.
         """
-        return LawMemory(
-            held=np.concatenate([part.held for part in parts])[places],
-            integral=np.concatenate([part.integral for part in parts])[places],
-            velocity=np.concatenate([part.velocity for part in parts])[places],
-            measured=np.concatenate([part.measured for part in parts])[places],
-            positions=np.concatenate([part.positions for part in parts], axis=1)[:, places],
-            velocities=np.concatenate([part.velocities for part in parts], axis=1)[:, places],
+        return cls(
+            before=inputs[:, interval.start - lead : interval.start],
+            after=inputs[:, interval.stop : interval.stop + 1],
+            samples=samples + interval.start,
+            memory=memory,
         )
+
+    def repeated(self, count: int) -> InputContext:
+        """This context of m curves for `count * m` curves, of which the memory is that already.
+
+        Args:
+            count: How often all curves are repeated, one repetition after the other.
+        """
+        return replace(
+            self,
+            before=np.tile(self.before, (count, 1, 1)),
+            after=np.tile(self.after, (count, 1, 1)),
+            samples=np.tile(self.samples, count),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoopTrace:
+    """Record of control laws along m curves of N samples.
+
+    Attributes:
+        controls: (m, N, nu) controls at the begin of every sample [u-unit].
+        is_clipped: (m, N, laws) True where the range or the largest change of a control has clipped
+            it.
+        memory: Memory at the end of the curves, grouped by the periods of the laws.
+    """
+
+    controls: Array
+    is_clipped: np.ndarray
+    memory: tuple[LawMemory, ...]
 
 
 class RunningLaws:
@@ -95,7 +147,6 @@ class RunningLaws:
         memory: LawMemory,
         *,
         begins: bool,
-        first: int,
     ) -> None:
         """Prepare the laws.
 
@@ -107,12 +158,11 @@ class RunningLaws:
             memory: What the laws remember at the begin.
             begins: True where no control was held before the first tick, so that its change is not
                 limited.
-            first: Index of the first tick among the commands.
         """
         self._numbers = numbers
         self._commands = commands
         self._drive = commands.drive(numbers)
-        self._next = first
+        self._next = ticks.before
 
         seconds = ticks.seconds
         self._seconds = seconds
@@ -268,7 +318,6 @@ class _PastInterpolation:
 
 
 def memory_at_begin(
-    laws: Sequence[ControlLaw],
     numbers: LawNumbers,
     commands: LawCommands,
     ticks: Ticks,
@@ -277,11 +326,9 @@ def memory_at_begin(
 ) -> LawMemory:
     """Memory of laws where a curve begins.
 
-    Before it, the joints count as moving with their velocity at the begin. The control that is held
-    up to the first tick is that of the law at the tick before, without a limit of its change.
+    Before it, the joints count as moving with their velocity at the begin.
 
     Args:
-        laws: The c laws.
         numbers: Their numbers.
         commands: Commands of the log at the ticks.
         ticks: The ticks.
@@ -291,28 +338,17 @@ def memory_at_begin(
     """
     q, v = state
     latency, period = numbers.feedback_latency, ticks.seconds
-    latest = ticks.first * ticks.timestep - period
     size = int(np.floor(latency.max(initial=0.0) / period)) + 2
-    times = latest - period * np.arange(size)
+    times = -period * np.arange(1, size + 1)
 
-    memory = LawMemory(
+    return LawMemory(
         held=np.zeros_like(q),
         integral=_integral_at_begin(numbers, commands, state, sums, period),
         velocity=v,
-        measured=q + v * (latest - latency),
+        measured=q - v * (period + latency),
         positions=q + v * times[:, None, None],
         velocities=np.repeat(v[None], size, axis=0),
     )
-    if ticks.first == 0:
-        return memory
-
-    # The law at the tick before the begin, whose error the integral contains already.
-    step = v * period
-    earlier = replace(memory, measured=memory.measured - step, positions=memory.positions - step)
-    frozen = replace(numbers, ki=np.zeros_like(numbers.ki))
-    first = commands.before - 1
-    before = RunningLaws(laws, frozen, commands, ticks, earlier, begins=True, first=first)
-    return replace(memory, held=before.evaluate(q + v * latest, v))
 
 
 def _integral_at_begin(
