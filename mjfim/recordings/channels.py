@@ -2,13 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
+
+import mujoco
 
 from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, RecordingError, unknown
 from mjfim.model.control_laws import ControlLaws
-from mjfim.model.coordinates import measurable_columns
-from mjfim.recordings.spec import RecordingSpec
+from mjfim.model.coordinates import (
+    measurable_columns,
+    sensor_columns,
+    state_components,
+    unknown_coordinate,
+)
+from mjfim.model.elements import identifier, names_of
+from mjfim.model.units import sensor_unit
+from mjfim.quantities import Unit, units_like
+from mjfim.recordings.spec import LAW_PREFIXES, LogUnit, RecordingSpec
+
+# Factor that converts each unit of a log to the model's unit.
+UNIT_FACTORS = {unit: Unit.parse(unit).factor for unit in get_args(LogUnit)}
+
+# Units of a log that fit to each unit of the model.
+VALID_UNITS = {
+    unit: [name for name in UNIT_FACTORS if name in units_like(unit)]
+    for unit in ("rad", "rad/s", "m", "m/s")
+}
+
+# Unit of what measures an angle or a length, depending on the model; every unit is accepted.
+ANY = "any"
+SENSORS_OF_ANY_UNIT = (
+    mujoco.mjtSensor.mjSENS_ACTUATORPOS,
+    mujoco.mjtSensor.mjSENS_ACTUATORVEL,
+    mujoco.mjtSensor.mjSENS_USER,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,3 +77,113 @@ class Channels:
     def measurable(self) -> tuple[str, ...]:
         """Column names of everything that can be measured: components of the state, and sensors."""
         return measurable_columns(self.model)
+
+
+# ---- checks of the table `[recording]` against the model
+
+
+def check_spec(channels: Channels) -> None:
+    """Check the table `[recording]` against the model.
+
+    Raises:
+        ExperimentError: A column does not exist in the model, or has a unit that does not fit.
+    """
+    where = f"{channels.source}: recording.columns"
+    units = _units_of(channels)
+    for name in channels.spec.columns:
+        if name not in units:
+            require_law(where, name, channels)
+            raise ExperimentError(f"{where}: {unknown_coordinate('column', name, list(units))}")
+
+    for name, source in channels.spec.sources.items():
+        unit = units[name]
+        valid = list(UNIT_FACTORS) if unit == ANY else VALID_UNITS.get(unit, [])
+        if source.unit is not None and source.unit not in valid:
+            raise ExperimentError(
+                f"{where}.{name}.unit: {unknown('unit', source.unit, valid)}; use scale for any "
+                "other unit"
+            )
+        if source.unwrap and unit not in ("rad", ANY):
+            raise ExperimentError(
+                f"{where}.{name}.unwrap: only an angle jumps by whole turns; use period for a "
+                "counter"
+            )
+    for name in channels.spec.constants:
+        if name not in channels.control_columns:
+            raise ExperimentError(
+                f"{where}.{name}: a number is the value of a constant control, and this is a "
+                "measured column; state the name of the column in the log"
+            )
+
+
+def _units_of(channels: Channels) -> dict[str, str]:
+    """Unit in the model of every column that a recording may hold; `ANY` where it is not known."""
+    model = channels.model
+    units = {component.name: component.unit for component in state_components(model)}
+    for name in names_of(model, "sensor"):
+        number = identifier(model, "sensor", name)
+        of_any_unit = mujoco.mjtSensor(int(model.sensor_type[number])) in SENSORS_OF_ANY_UNIT
+        unit = ANY if of_any_unit else sensor_unit(model, number)
+        units.update(dict.fromkeys(sensor_columns(model, name), unit))
+
+    units.update(dict.fromkeys(channels.control_columns, ANY))
+    inputs = () if channels.laws is None else channels.laws.inputs
+    return units | {c.name: c.unit for c in inputs if c.unit in VALID_UNITS}
+
+
+# ---- columns that control laws read in place of controls
+
+
+def require_law(where: str | Path, name: str, channels: Channels) -> None:
+    """Explain the column of a control law that the experiment does not have as it is named.
+
+    Args:
+        where: Place of the name, for messages.
+        name: Name of a column, which no signal of the experiment has.
+        channels: The signals of the experiment.
+
+    Raises:
+        ExperimentError: The name is that of a control or of an input of a law.
+    """
+    quantity, _, actuator = name.partition(":")
+    laws = () if channels.laws is None else tuple(law.actuator for law in channels.laws.laws)
+    if quantity == "ctrl" and actuator in laws:
+        raise ExperimentError(
+            f"{where}: {name!r}: [controllers.{actuator}] computes this control; remove the column "
+            "or the table. A torque or current that was measured is an output: measure a sensor, "
+            "such as <actuatorfrc>, and state its name"
+        )
+    if f"{quantity}:" not in LAW_PREFIXES or actuator not in channels.controls:
+        return
+    if actuator not in laws:
+        raise ExperimentError(
+            f"{where}: {name!r}: the experiment file states no law for this actuator, so that its "
+            f"control is read from 'ctrl:{actuator}'; state the law in [controllers.{actuator}]"
+        )
+    value = '"column"' if quantity == "reference_velocity" else "true"
+    raise ExperimentError(
+        f"{where}: {name!r}: the law of this actuator does not read it; state {quantity} = {value} "
+        f"in [controllers.{actuator}]"
+    )
+
+
+def require_one_source(where: str | Path, names: Sequence[str], channels: Channels) -> None:
+    """Refuse a log that holds the control of an actuator and the reference of its law.
+
+    Raises:
+        RecordingError: It holds both, and the experiment file does not name the control as the
+            source of an output.
+    """
+    named = {
+        source.column
+        for name, source in channels.spec.sources.items()
+        if name not in channels.control_columns
+    }
+    for law in () if channels.laws is None else channels.laws.laws:
+        control, reference = f"ctrl:{law.actuator}", f"reference:{law.actuator}"
+        if control in names and reference in names and control not in named:
+            raise RecordingError(
+                f"{where}: it holds {control!r} and {reference!r}, and "
+                f"[controllers.{law.actuator}] computes the control from the reference; remove one "
+                "of the columns, or give the measured control the name of a sensor"
+            )

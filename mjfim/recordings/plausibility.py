@@ -78,18 +78,23 @@ def plausibility_remarks(
 def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
     """Remarks about controls ctrl: (M-1, nu) that are outside their range or look like noise."""
     model = channels.model
-
     for column, u in zip(channels.control_columns, ctrl.T, strict=True):
         # References of control laws jump where the user commands it, and have no range.
         if not column.startswith("ctrl:") or not _moves(u):
             continue
-
         name = column.removeprefix("ctrl:")
         i = channels.controls.index(name)
-        if model.actuator_ctrllimited[i]:
-            yield from _range_remarks(name, u, model.actuator_ctrlrange[i])
+        low, high = model.actuator_ctrlrange[i]
+        tolerance = RANGE_TOLERANCE * (high - low)
+        share = float(np.mean((u < low - tolerance) | (u > high + tolerance)))
+        if model.actuator_ctrllimited[i] and share > MAX_SHARE_OUTSIDE_RANGE:
+            yield (
+                f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in "
+                f"{100 * share:.2g} % of the rows (it ranges from {u.min():.3g} to {u.max():.3g}); "
+                "the simulation clamps it to the range"
+            )
 
-        rough, correlation = _rough_share(u), _lag_one_correlation(u)
+        rough, correlation = _rough_share(u), float(np.corrcoef(u[1:], u[:-1])[0, 1])
         if rough > MAX_ROUGH_CONTROL_SHARE and correlation < MIN_CONTROL_CORRELATION:
             yield (
                 f"control {name!r} jumps from row to row ({100 * rough:.0f} % of its variance lies "
@@ -99,27 +104,11 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
             )
 
 
-def _range_remarks(name: str, u: Array, limits: Array) -> Iterator[str]:
-    """Remark about a control u: (M-1,) that leaves its range, limits: (2,)."""
-    low, high = limits
-    tolerance = RANGE_TOLERANCE * (high - low)
-    outside = (u < low - tolerance) | (u > high + tolerance)
-
-    share = float(np.mean(outside))
-    if share > MAX_SHARE_OUTSIDE_RANGE:
-        yield (
-            f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in {100 * share:.2g} % "
-            f"of the rows (it ranges from {u.min():.3g} to {u.max():.3g}); the simulation clamps "
-            "it to the range"
-        )
-
-
 def _roughness_remarks(
     channels: Channels, recording: Recording, predicted: Array | None
 ) -> Iterator[str]:
     """Remarks about outputs whose jumps are large compared with both their noise and motion."""
     sigma = _sigma_by_name(channels)
-
     for i, name in enumerate(recording.outputs):
         y = recording.y[:MAX_ROWS, i]
         present = np.isfinite(y)
@@ -130,9 +119,9 @@ def _roughness_remarks(
         share, explanation = _rough_share(y), "is too quick for a smooth motion"
         if predicted is not None and name in channels.outputs:
             motion = predicted[:MAX_ROWS, channels.outputs.index(name)][present]
-            share = min(share, _unexplained_share(y, motion))
+            unexplained = np.var(_rough_part(y) - _rough_part(motion)) / np.var(y)
+            share = min(share, float(unexplained))
             explanation = "is not explained by the identified motion"
-
         rough_std = np.sqrt(share * np.var(y))
         if share > MAX_ROUGH_SHARE and rough_std > SIGNIFICANT_SIGMAS * sigma.get(name, 0.0):
             yield (
@@ -146,51 +135,28 @@ def _contradiction_remarks(channels: Channels, recording: Recording) -> Iterator
     t = recording.t[:MAX_ROWS]
     columns = {name: recording.y[:MAX_ROWS, i] for i, name in enumerate(recording.outputs)}
     sigma = _sigma_by_name(channels)
-
     for joint in scalar_joints(channels.model):
         position, velocity = joint.position_column, joint.velocity_column
         if position not in columns or velocity not in columns:
             continue
-
-        q, v = columns[position], columns[velocity]
-        both = np.isfinite(q) & np.isfinite(v)
+        both = np.isfinite(columns[position]) & np.isfinite(columns[velocity])
         if both.sum() < MIN_ROWS:
             continue
 
-        disagreement, expected = _disagreement(
-            t[both], q[both], v[both], sigma.get(position, 0.0), sigma.get(velocity, 0.0)
+        q, v = columns[position][both], columns[velocity][both]
+        dq, dv, lag = displacements(t[both], q, v, COMPARISON_TIME, len(q) // 4)
+        size = float(np.std(dq))
+        # Noise of a difference of positions, and of an integral of velocities.
+        integral = np.sqrt(lag) * float(np.median(np.diff(t[both])))
+        expected = np.hypot(
+            np.sqrt(2.0) * sigma.get(position, 0.0), integral * sigma.get(velocity, 0.0)
         )
-        if disagreement > max(MAX_DISAGREEMENT, SIGNIFICANT_SIGMAS * expected):
+        difference = float(np.std(dq - dv))
+        if size > 0.0 and difference > max(MAX_DISAGREEMENT * size, SIGNIFICANT_SIGMAS * expected):
             yield (
-                f"{position} and the integral of {velocity} differ by {100 * disagreement:.0f} % "
-                "of the motion; one of them is wrong or delayed"
+                f"{position} and the integral of {velocity} differ by "
+                f"{100 * difference / size:.0f} % of the motion; one of them is wrong or delayed"
             )
-
-
-def _disagreement(
-    t: Array, q: Array, v: Array, sigma_q: float, sigma_v: float
-) -> tuple[float, float]:
-    """Difference between the displacements of a position and of its integrated velocity.
-
-    Args:
-        t: (M,) times [s].
-        q: (M,) positions.
-        v: (M,) velocities.
-        sigma_q: Standard deviation of the positions' noise.
-        sigma_v: Standard deviation of the velocities' noise.
-
-    Returns:
-        Standard deviation of the difference, and its value that the noise explains, both divided
-        by the standard deviation of the displacement; 0 and 0 if the joint does not move.
-    """
-    dq, dv, lag = displacements(t, q, v, COMPARISON_TIME, len(t) // 4)
-    size = float(np.std(dq))
-    if size == 0.0:
-        return 0.0, 0.0
-
-    difference_noise = np.sqrt(2.0) * sigma_q
-    integral_noise = sigma_v * np.sqrt(lag) * float(np.median(np.diff(t)))
-    return float(np.std(dq - dv)) / size, float(np.hypot(difference_noise, integral_noise)) / size
 
 
 def displacements(
@@ -232,18 +198,7 @@ def _rough_share(x: Array) -> float:
     return float(np.var(_rough_part(x)) / np.var(x))
 
 
-def _unexplained_share(y: Array, motion: Array) -> float:
-    """Fraction of the variance of y: (M,) that is rough and not part of a motion: (M,)."""
-    return float(np.var(_rough_part(y) - _rough_part(motion)) / np.var(y))
-
-
 def _rough_part(x: Array) -> Array:
     """(M,) what a running median removes from x: (M,); beyond its ends, x keeps its last values."""
     smooth: Array = scipy.ndimage.median_filter(x, size=MEDIAN_ROWS, mode="nearest")
     return x - smooth
-
-
-def _lag_one_correlation(x: Array) -> float:
-    """Correlation of successive rows of x: (M,)."""
-    d = x - x.mean()
-    return float(d[1:] @ d[:-1] / (d @ d))

@@ -1,11 +1,17 @@
 """Reader of recordings: it applies the experiment's `[recording]` table to the columns of a log.
 
 The times are those of the log, and nothing is interpolated. Only a control is held over rows in
-which it is empty.
+which it is empty. With the names of `ColumnSpec`, a column of the recording is
+
+    value = (scale * unit * raw + offset) * product of the columns `multiply_by`          (1)
+
+Signs are restored and counter wraps are removed from the raw numbers before; jumps by whole turns
+are removed from the values.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,35 +19,41 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, RecordingError, closest, listed, unknown
+from mjfim.errors import RecordingError, closest, listed, unknown
 from mjfim.model.coordinates import state_components, unknown_coordinate
+from mjfim.quantities import TURN
 from mjfim.recordings import formats
-from mjfim.recordings.angle_units import check_angles
-from mjfim.recordings.channels import Channels
-from mjfim.recordings.column_units import check_unit, convert, units_of
-from mjfim.recordings.formats.table import Table
-from mjfim.recordings.law_columns import (
-    check_references,
+from mjfim.recordings.channels import (
+    UNIT_FACTORS,
+    Channels,
+    check_spec,
     require_law,
     require_one_source,
-    units_of_inputs,
 )
-from mjfim.recordings.spec import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
-from mjfim.recordings.summary import LogSummary, summarize
-from mjfim.recordings.validity import (
+from mjfim.recordings.checks import (
     SECONDS,
+    check_angles,
     check_clock,
     check_finite,
     check_held,
     check_measured,
-    hold_last_value,
 )
+from mjfim.recordings.formats.table import Table
+from mjfim.recordings.spec import INPUT_PREFIXES, LAW_PREFIXES, ColumnSpec, RecordingSpec
+from mjfim.recordings.summary import LogSummary, summarize
 from mjfim.records.trajectory import Recording
 
-# Endings of the names in a LeRobot dataset: of measured states, with the coordinates that they are,
-# and of controls.
-LEROBOT_STATES = {".pos": "qpos:", ".vel": "qvel:"}
-LEROBOT_CONTROLS = (".pos", ".vel", ".effort")
+# Names of columns in bags and in LeRobot datasets, and what they are in mjfim.
+OTHER_NAMES = (
+    (r"position:(.+)", ("qpos:",)),
+    (r"velocity:(.+)", ("qvel:",)),
+    (r"observation\.state:(.+)\.vel", ("qvel:",)),
+    (r"observation\.state:(.+?)(?:\.pos)?", ("qpos:",)),
+    (r"action:(.+?)(?:\.pos|\.vel|\.effort)?", ("ctrl:", "reference:")),
+)
+
+# What a message proposes where no column of a log has a similar name.
+ANY_COLUMN = "<name of the column in the log>"
 
 # Tolerance of the beginning and the end of the window [s].
 WINDOW_TOLERANCE = 1e-9
@@ -52,8 +64,8 @@ class Log:
     """A recording, and a summary of the log from which it was read.
 
     Attributes:
-        recording: The measured data in SI units.
-        summary: Clock and columns of the log.
+        recording: The recording, in SI units.
+        summary: Clock of the log, and the range of its columns.
     """
 
     recording: Recording
@@ -61,19 +73,7 @@ class Log:
 
 
 def read_recording(path: Path, channels: Channels) -> Recording:
-    """Read a recording from a log of any format.
-
-    Args:
-        path: The log: a file, or the folder of a ROS 2 bag.
-        channels: The signals of the experiment, and how to read them.
-
-    Returns:
-        The recording, in SI units.
-
-    Raises:
-        ExperimentError: The `[recording]` table does not fit the model.
-        RecordingError: The log cannot be used; the message names file and column.
-    """
+    """Read a recording from a log of any format. See `read_log`."""
     return read_log(path, channels).recording
 
 
@@ -93,7 +93,6 @@ def read_log(path: Path, channels: Channels) -> Log:
     """
     check_spec(channels)
     spec = channels.spec
-
     table = formats.read_columns(path, spec)
     if "time" not in spec.model_fields_set:
         _require_default(table, "time", spec.time, key="[recording] time")
@@ -112,19 +111,17 @@ def read_log(path: Path, channels: Channels) -> Log:
     if table.unit_hint:
         _check_units_of_controls(table, sources)
     try:
-        check_angles(str(path), channels.model, t, columns, stated)
+        check_angles(str(path), channels, t, columns, stated)
     except RecordingError as error:
         raise RecordingError(f"{error}. {table.unit_hint}" if table.unit_hint else error) from None
-    check_references(path, channels, columns, stated)
 
     column_names = {name: source.column for name, source in sources.items()}
     summary = summarize(str(path), t, columns, column_names, dropped=len(stamps) - len(t))
-
-    # Columns are dropped as soon as the recording holds them, since logs may be long.
-    table.columns.clear()
+    columns |= {name: np.full(len(t), value) for name, value in spec.constants.items()}
     recording = Recording(
-        t=_frozen(t),
-        ctrl=_controls(columns, channels, len(t) - 1),
+        t=t,
+        # The control of the last row would act after the end.
+        ctrl=_joined(columns, channels.control_columns, len(t) - 1),
         y=_joined(columns, measured, len(t)),
         outputs=measured,
         name=str(path),
@@ -132,46 +129,15 @@ def read_log(path: Path, channels: Channels) -> Log:
     return Log(recording=recording, summary=summary)
 
 
-def _controls(columns: dict[str, Array], channels: Channels, rows: int) -> Array:
-    """(M-1, nu) controls of all rows but the last one, whose control would act after the end.
-
-    A model without actuators has none. The columns of controls are taken out of `columns`.
-    """
-    constants = channels.spec.constants
-    for name in channels.control_columns:
-        if name in constants:
-            columns[name] = np.full(rows, constants[name])
-    return _joined(columns, channels.control_columns, rows)
-
-
-def _joined(columns: dict[str, Array], names: Sequence[str], rows: int) -> Array:
-    """(rows, n) read-only matrix of the first rows of n columns, taken out of `columns`."""
-    matrix = np.empty((rows, len(names)))
-    for j, name in enumerate(names):
-        matrix[:, j] = columns.pop(name)[:rows]
-    return _frozen(matrix)
-
-
-def _frozen(array: Array) -> Array:
-    """This array, read-only from now on, so that records share it."""
-    own = array if array.flags.owndata else np.array(array)
-    own.setflags(write=False)
-    return own
-
-
 def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:
     """List the recordings that logs hold: one for each log, or for each episode of a dataset.
 
     Args:
-        paths: Logs, and folders of LeRobot datasets, of which all episodes or those of
-            `recording.episodes` are recordings.
+        paths: Logs, or folders of LeRobot datasets.
         channels: The signals of the experiment, and how to read them.
 
-    Returns:
-        One path for each recording.
-
     Raises:
-        RecordingError: A dataset cannot be read.
+        RecordingError: A dataset is damaged, or has no such episode.
     """
     found: list[Path] = []
     for path in paths:
@@ -180,42 +146,17 @@ def recording_paths(paths: Sequence[Path], channels: Channels) -> list[Path]:
     return found
 
 
-def check_spec(channels: Channels) -> None:
-    """Check the `[recording]` table against the model.
-
-    Args:
-        channels: The signals of the experiment, and how to read them.
-
-    Raises:
-        ExperimentError: A column has an unknown name, or a unit that does not fit it.
-    """
-    where = f"{channels.source}: recording.columns"
-    units = units_of(channels.model)
-    units.update(dict.fromkeys(channels.control_columns, "any"))
-    units.update(units_of_inputs(channels))
-
-    for name in channels.spec.columns:
-        if name not in units:
-            require_law(where, name, channels)
-            raise ExperimentError(f"{where}: {unknown_coordinate('column', name, list(units))}")
-
-    for name, source in channels.spec.sources.items():
-        check_unit(f"{where}.{name}", source, units[name])
-    for name in channels.spec.constants:
-        if name not in channels.control_columns:
-            raise ExperimentError(
-                f"{where}.{name}: a number is the value of a constant control, and this is a "
-                "measured column; state the name of the column in the log"
-            )
+def _joined(columns: dict[str, Array], names: Sequence[str], rows: int) -> Array:
+    """(rows, n) read-only matrix of the first rows of n columns, taken out of `columns`."""
+    matrix = np.empty((rows, len(names)))
+    for j, name in enumerate(names):
+        matrix[:, j] = columns.pop(name)[:rows]
+    matrix.setflags(write=False)
+    return matrix
 
 
 def _check_units_of_controls(table: Table, sources: Mapping[str, ColumnSpec]) -> None:
-    """Refuse commands without a unit beside positions that have one: both have that of the robot.
-
-    Args:
-        table: The log, in whose format commands of servos end in `.pos`.
-        sources: Rules of the columns.
-    """
+    """Refuse commands without a unit beside positions that have one, which holds for both."""
     converted = [name for name, s in sources.items() if s.unit is not None or s.scale != 1.0]
     positions = [name for name in converted if name.startswith("qpos:")]
     for name, source in sources.items():
@@ -228,17 +169,14 @@ def _check_units_of_controls(table: Table, sources: Mapping[str, ColumnSpec]) ->
             )
 
 
-def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
-    """Rules of all columns of the recording, first the controls, then the measured columns.
+# ---- which column is what
 
-    A control without a stated rule or value is read under its default name. Measured columns are
-    read under their default names only if the experiment file states none of them.
-    """
+
+def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
+    """Rules of all columns of the recording, first the controls, then the measured columns."""
     stated = channels.spec.sources
     default = _columns_by_default_name(table, channels)
-    if channels.laws is not None:
-        require_one_source(table.source, table.names, channels)
-
+    require_one_source(table.source, table.names, channels)
     controls = {
         name: stated.get(name) or ColumnSpec(column=default.get(name, name))
         for name in channels.control_columns
@@ -260,49 +198,47 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
         measured = {
             name: ColumnSpec(column=default[name]) for name in channels.outputs if name in default
         }
+    if any(name in measured for name in channels.outputs):
+        return {**controls, **measured}
 
-    if not any(name in measured for name in channels.outputs):
-        used = {channels.spec.time, *(source.column for source in controls.values())}
-        found = measured or [name for name in table.names if name not in used]
-        fault = unknown("column", listed([*found]), channels.outputs)
-        advice = "" if measured else _advice(channels.outputs, list(found))
-        raise RecordingError(f"{table.source}: no measured column; {fault}{advice}")
+    used = {channels.spec.time, *(source.column for source in controls.values())}
+    found = [*measured] or [name for name in table.names if name not in used]
+    fault = unknown("column", listed(found), channels.outputs)
+    pairs = [(name, _similar(name, found)) for name in channels.outputs]
+    name, column = next((pair for pair in pairs if pair[1] != ANY_COLUMN), pairs[0])
+    advice = (
+        ""
+        if measured
+        else (
+            ". Columns with other names are stated in the experiment file, for example "
+            f'[recording.columns] "{name}" = "{column}"'
+        )
+    )
+    raise RecordingError(f"{table.source}: no measured column; {fault}{advice}")
 
-    return {**controls, **measured}
+
+def _similar(name: str, columns: Sequence[str]) -> str:
+    """The column whose name is most similar; those of other programs have no prefix `ctrl:`."""
+    plain = {own.lower(): own for own in columns}
+    short = name.rpartition(":")[2]
+    near = closest(name.lower(), list(plain)) or closest(short.lower(), list(plain))
+    return plain[near] if near else ANY_COLUMN
 
 
 def _require_default(
     table: Table, name: str, column: str, *, key: str, otherwise: str = ""
 ) -> None:
-    """Raise RecordingError if the log lacks a column that the experiment file does not state.
-
-    Args:
-        table: The log.
-        name: What the column holds.
-        column: Name that the column has in the files of mjfim.
-        key: Key of the experiment file that states another name.
-        otherwise: End of the message, where there is another way.
-    """
-    if column in table.names:
-        return
-
-    # Names of other programs have no prefix such as `ctrl:`, and often other capitals.
-    plain = {own.lower(): own for own in table.names}
-    near = closest(name.lower(), list(plain)) or closest(
-        name.rpartition(":")[2].lower(), list(plain)
-    )
-    proposal = plain[near] if near else "<name of the column in the log>"
-    raise RecordingError(
-        f"{table.source}: column {column!r} is missing; found: {listed(table.names)}. If another "
-        f'column holds it, state its name in the experiment file: {key} = "{proposal}"{otherwise}'
-    )
+    """Raise RecordingError if the log lacks a column that the experiment file does not state."""
+    if column not in table.names:
+        raise RecordingError(
+            f"{table.source}: column {column!r} is missing; found: {listed(table.names)}. If "
+            "another column holds it, state its name in the experiment file: "
+            f'{key} = "{_similar(name, table.names)}"{otherwise}'
+        )
 
 
 def _check_names(table: Table, channels: Channels) -> None:
-    """Refuse a column whose name looks like mjfim's but does not exist in this model.
-
-    A misspelled joint is an example.
-    """
+    """Refuse a column whose name looks like mjfim's but does not exist in this model."""
     known = (*channels.control_columns, *channels.measurable)
     for name in table.names:
         if name.startswith(("ctrl:", "qpos:", "qvel:", *LAW_PREFIXES)) and name not in known:
@@ -311,82 +247,39 @@ def _check_names(table: Table, channels: Channels) -> None:
             raise RecordingError(f"{table.source}: {fault}")
 
 
-def _advice(outputs: Sequence[str], found: Sequence[str]) -> str:
-    """End of a message about a log without a column of mjfim's names.
-
-    outputs: names of the measured outputs. found: names of the columns that the log has.
-    """
-    plain = {own.lower(): own for own in found}
-    pairs = ((name, closest(name.rpartition(":")[2].lower(), list(plain))) for name in outputs)
-    name, near = next(((name, plain[near]) for name, near in pairs if near), (outputs[0], ""))
-    column = near or "<name of the column in the log>"
-    return (
-        ". Columns with other names are stated in the experiment file, for example "
-        f'[recording.columns] "{name}" = "{column}"'
-    )
-
-
 def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]:
-    """Names of the table's columns, by the names that mjfim gives them.
-
-    The joint states of a bag and the matrices of a design.npz have other names there; all other
-    columns keep their names.
-    """
-    found = {}
+    """Names of the table's columns, by the names that mjfim gives them."""
+    found: dict[str, str] = {}
     for name in table.names:
-        for quantity, coordinate in (("position:", "qpos:"), ("velocity:", "qvel:")):
-            if name.startswith(quantity):
-                found[coordinate + name.removeprefix(quantity)] = name
-        found |= dict.fromkeys(_names_of_lerobot_column(name), name)
+        matches = ((re.fullmatch(pattern, name), kinds) for pattern, kinds in OTHER_NAMES)
+        match, kinds = next((pair for pair in matches if pair[0]), (None, ()))
+        found |= {f"{kind}{match[1]}": name for kind in kinds if match}
 
     for matrix, parts in _matrices(channels).items():
         labels = [name for name in table.names if name == matrix or name.startswith(f"{matrix}[")]
-        if not labels:
-            continue
-        if len(labels) != len(parts):
+        if labels and len(labels) != len(parts):
             raise RecordingError(
                 f"{table.source}: array {matrix!r} has {len(labels)} columns; the model needs "
                 f"{len(parts)}: {listed(parts)}"
             )
-        found.update(zip(parts, labels, strict=True))
-
-    found.update({name: name for name in table.names})
-    return found
-
-
-def _names_of_lerobot_column(name: str) -> list[str]:
-    """Names in mjfim that a column of a LeRobot dataset may mean.
-
-    A state without an ending is a position. The control of a motor may have any ending.
-    """
-    feature, _, component = name.partition(":")
-    stem, dot, ending = component.rpartition(".")
-
-    if feature == "observation.state":
-        coordinate = LEROBOT_STATES.get(f"{dot}{ending}")
-        return [f"{coordinate}{stem}"] if coordinate else [f"qpos:{component}"]
-    if feature == "action":
-        actuator = stem if f"{dot}{ending}" in LEROBOT_CONTROLS else component
-        return [f"ctrl:{actuator}", f"reference:{actuator}"]
-    return []
+        found |= dict(zip(parts, labels, strict=False))
+    return found | {name: name for name in table.names}
 
 
 def _matrices(channels: Channels) -> dict[str, list[str]]:
-    """Default names of the columns of the matrices qpos, qvel and ctrl.
-
-    A matrix is left out if stated rules replace it.
-    """
+    """Default names of the columns of the matrices qpos, qvel and ctrl."""
     stated = channels.spec.columns
     state = [component.name for component in state_components(channels.model)]
     nq = channels.model.nq
-
-    matrices = {}
+    matrices: dict[str, list[str]] = {}
     if all(name.startswith(INPUT_PREFIXES) for name in stated):
-        matrices["qpos"] = state[:nq]
-        matrices["qvel"] = state[nq:]
+        matrices |= {"qpos": state[:nq], "qvel": state[nq:]}
     if channels.laws is None and any(name not in stated for name in channels.control_columns):
         matrices["ctrl"] = list(channels.control_columns)
     return matrices
+
+
+# ---- values
 
 
 def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
@@ -394,14 +287,11 @@ def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
     t = table.measurement(spec.time) * SECONDS[spec.time_unit]
     if spec.window is None or not len(t):
         return t, slice(0, len(t))
-
     since = t - t[0]
     begin = _first_true(since >= spec.window[0] - WINDOW_TOLERANCE)
-
     # The window ends at the first time after its end. Only rows after its beginning are searched,
     # because the clock may have restarted before.
     end = begin + _first_true(since[begin:] > spec.window[1] + WINDOW_TOLERANCE)
-
     if end == begin:
         raise RecordingError(
             f"{table.source}: recording.window: no row between {spec.window[0]:g} and "
@@ -418,29 +308,61 @@ def _first_true(condition: np.ndarray) -> int:
 def _columns(
     table: Table, sources: Mapping[str, ColumnSpec], t: Array, rows: slice, spec: RecordingSpec
 ) -> dict[str, Array]:
-    """Converted columns inside the window, by the name of the recording's column.
-
-    Empty rows of a control get its last value, which may be from before the window.
-    """
+    """Converted columns inside the window, by the name of the recording's column."""
     columns = {}
-
     for name, source in sources.items():
         # Truth values may switch a control or a factor on and off.
         if not name.startswith(INPUT_PREFIXES):
             table.measurement(source.column)
-
         for raw in (source.column, *source.multiply_by):
             check_finite(f"{table.source}: column {raw!r}", table.column(raw)[rows], rows.start)
-
-        values = convert(table, source)
+        values = _converted(table, source)
         if name.startswith(INPUT_PREFIXES):
-            values, age = hold_last_value(t, values)
+            # Empty rows hold the last value before them.
+            last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+            values, age = values[last], t - t[last]
             kind = "control" if name.startswith("ctrl:") else "input"
             where = f"{table.source}: column {source.column!r} (the {kind} {name!r})"
             check_held(where, t[rows][:-1], values[rows][:-1], age[rows][:-1], spec.gap)
-
         # Finite raw numbers may become infinite by the conversion.
         columns[name] = values[rows]
         check_finite(f"{table.source}: column {name!r}", columns[name], rows.start)
-
     return columns
+
+
+def _converted(table: Table, spec: ColumnSpec) -> Array:
+    """(M,) one column of a recording by equation (1)."""
+    raw = table.column(spec.column)
+    if spec.signed is not None:
+        raw = _signed(table, spec.column, raw, spec.signed)
+    if spec.period is not None:
+        raw = _unwrapped(raw, spec.period)
+
+    value = spec.scale * (1.0 if spec.unit is None else UNIT_FACTORS[spec.unit]) * raw + spec.offset
+    if spec.unwrap:
+        value = _unwrapped(value, TURN)
+    for name in spec.multiply_by:
+        value = value * table.column(name)
+    return np.asarray(value)
+
+
+def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
+    """(M,) signed integers of bits from their two's complement raw: (M,)."""
+    half = 2.0 ** (bits - 1)
+    outside = (raw < -half) | (raw >= 2.0 * half)
+    invalid = np.isfinite(raw) & (outside | (raw != np.rint(raw)))
+    if invalid.any():
+        row = int(np.argmax(invalid))
+        raise RecordingError(
+            f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is "
+            f"not an integer of {bits} bits"
+        )
+    return np.asarray(np.where(raw >= half, raw - 2.0 * half, raw))
+
+
+def _unwrapped(raw: Array, period: float) -> Array:
+    """(M,) numbers without jumps of more than half a period, also across empty rows."""
+    present = np.isfinite(raw)
+    unwrapped = np.array(raw)
+    unwrapped[present] = np.unwrap(raw[present], period=period)
+    return unwrapped

@@ -44,7 +44,6 @@ class LogSummary:
         duration: Time from the first to the last row [s].
         rate: Inverse of the median step [Hz].
         jitter_std: Standard deviation of the steps about their median [s].
-        jitter_max: Largest deviation of a step from the median [s].
         longest_step: Longest step [s].
         dropped: Number of rows outside the window.
         columns: Summary of each column of the recording.
@@ -55,7 +54,6 @@ class LogSummary:
     duration: float
     rate: float
     jitter_std: float
-    jitter_max: float
     longest_step: float
     dropped: int
     columns: tuple[ColumnSummary, ...]
@@ -78,15 +76,13 @@ def summarize(
     """
     steps = np.diff(t)
     median = float(np.median(steps))
-    jitter = steps - median
 
     return LogSummary(
         file=file,
         rows=len(t),
         duration=float(t[-1] - t[0]),
         rate=1.0 / median,
-        jitter_std=float(jitter.std()),
-        jitter_max=float(np.abs(jitter).max()),
+        jitter_std=float(steps.std()),
         longest_step=float(steps.max()),
         dropped=dropped,
         columns=tuple(_column(name, sources[name], values) for name, values in columns.items()),
@@ -96,17 +92,6 @@ def summarize(
 def _column(name: str, source: str, values: Array) -> ColumnSummary:
     """Summary of one column; values: (M,), NaN where empty."""
     present = np.sort(values[np.isfinite(values)])
-    empty_share = 1.0 - len(present) / len(values)
-
-    if not len(present):
-        return ColumnSummary(
-            name=name,
-            source=source,
-            minimum=float("nan"),
-            maximum=float("nan"),
-            empty_share=empty_share,
-            resolution=0.0,
-        )
 
     differences = np.diff(present)
     rounding = ROUNDING * np.abs(present[[0, -1]]).max()
@@ -117,6 +102,6 @@ def _column(name: str, source: str, values: Array) -> ColumnSummary:
         source=source,
         minimum=float(present[0]),
         maximum=float(present[-1]),
-        empty_share=empty_share,
+        empty_share=1.0 - len(present) / len(values),
         resolution=float(differences.min()) if len(differences) else 0.0,
     )

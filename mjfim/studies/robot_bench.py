@@ -26,7 +26,7 @@ from mjfim.identification.identify import identify_system
 from mjfim.information.marginal import standard_deviations
 from mjfim.model.coordinates import tangent_names
 from mjfim.plant.batch import BatchSimulator
-from mjfim.recordings.design_table import read_playback
+from mjfim.recordings.control_table import read_playback
 from mjfim.records.estimate import Estimate
 from mjfim.records.robustness import RobotConditions, RobotRun
 from mjfim.records.trajectory import Recording

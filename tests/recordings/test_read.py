@@ -433,7 +433,7 @@ def test_infinite_values(name: str, read: Read) -> None:
     columns = {"qpos:pin": wave(), **CTRL, "kp": np.full(M, 2.0)}
     columns[name] = np.where(np.arange(M) == 11, np.inf, columns[name])
     source = {"column": "ctrl:turn", "multiply_by": ["kp"]}
-    with pytest.raises(RecordingError, match=rf"column '{name}' is infinite in data row 12"):
+    with pytest.raises(RecordingError, match=rf"column '{name}' is inf in data row 12"):
         read(columns, columns={"ctrl:turn": source})
 
 
@@ -558,7 +558,7 @@ def test_summary(read: Read) -> None:
     assert (summary.rows, summary.dropped) == (297, M - 297)
     assert summary.rate == pytest.approx(200.0)
     assert summary.duration == pytest.approx(1.5)
-    assert (summary.longest_step, summary.jitter_max) == (pytest.approx(0.025), pytest.approx(0.02))
+    assert summary.longest_step == pytest.approx(0.025)
     assert summary.jitter_std == pytest.approx(0.02 * np.sqrt(1 / 296 - 1 / 296**2))
     assert [c.name for c in summary.columns] == ["ctrl:push", "ctrl:turn", "qpos:pin"]
     pin = summary.columns[2]

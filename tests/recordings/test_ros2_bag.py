@@ -109,20 +109,19 @@ def test_messages_without_a_stamp_have_the_time_of_reception(tmp_path: Path) -> 
     [
         (
             [State(EPOCH, ["a"], [0.0]), State(EPOCH, ["a"], [1.0], received=EPOCH + 10**6)],
-            "message 2: has the stamp of",
+            "position of 'a', message 2 is 0 s after the previous one",
         ),
         (
             [
                 State(EPOCH, ["a"], [0.0], received=EPOCH),
                 State(EPOCH - 10**9, ["a"], [1.0], received=EPOCH + 1),
             ],
-            r"message 2: has an earlier stamp than the previous message \(-1 s\)",
+            "message 2 is -1 s after the previous one; time must increase",
         ),
         (
             [State(EPOCH, ["a", "b"], [0.0])],
             r"message 1: a field does not have one value for each of the 2 joints",
         ),
-        ([State(EPOCH, ["a", "a"], [0.0, 1.0])], "message 1: a joint is listed twice: a, a"),
         ([], "topic /j has no message"),
     ],
 )

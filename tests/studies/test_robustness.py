@@ -28,7 +28,7 @@ from mjfim.optimize.lq import regulator
 from mjfim.output import archive
 from mjfim.output.playback import design_columns, reference_columns, simulate_playback
 from mjfim.output.summaries.robustness import robustness_sentences
-from mjfim.recordings.design_table import read_playback
+from mjfim.recordings.control_table import read_playback
 from mjfim.records.robustness import RobotConditions, Robustness
 from mjfim.records.trajectory import Playback, Recording
 from mjfim.studies import robot_bench

@@ -1,16 +1,14 @@
 """Reader of the joint states in ROS 2 bags.
 
-The library `rosbags` is imported only when a bag is read.
-
-Messages are read with the definition that ROS publishes, not with the one inside the bag: the
-library generates code from definitions, and a file of unknown origin must not control this code.
+The library rosbags is an optional extra (`pip install 'mjfim[ros]'`); no ROS installation is
+needed. Messages of several topics or publishers are merged by their time stamps.
 """
 
 from __future__ import annotations
 
 from array import array
+from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -35,77 +33,36 @@ QUANTITIES = ("position", "velocity", "effort")
 # Nanoseconds per second.
 NANOSECONDS = 1_000_000_000
 
-
-@dataclass(frozen=True, kw_only=True)
-class _Layout:
-    """Joints and quantities of a message; messages of one layout are collected in one block.
-
-    Attributes:
-        topic: Name of the topic.
-        joints: Names of the joints, in the order of the messages.
-        quantities: Fields of `QUANTITIES` that are not empty.
-    """
-
-    topic: str
-    joints: tuple[str, ...]
-    quantities: tuple[str, ...]
-
-    def column_names(self, with_topic: bool) -> list[str]:
-        """Names of the columns, in the order of a message's numbers."""
-        is_control = self.topic == CONTROL_TOPIC
-        prefix = f"{self.topic}:" if with_topic or is_control else ""
-        labels = {quantity: f"{prefix}{quantity}" for quantity in QUANTITIES}
-        if is_control:
-            labels["effort"] = "ctrl"
-
-        return [f"{labels[name]}:{joint}" for name in self.quantities for joint in self.joints]
-
-
-@dataclass(kw_only=True)
-class _Block:
-    """Messages of one layout, which are appended while the bag is read.
-
-    Attributes:
-        stamps: M time stamps [ns].
-        values: The numbers of all messages, message by message.
-    """
-
-    stamps: array[int] = field(default_factory=lambda: array("q"))
-    values: array[float] = field(default_factory=lambda: array("d"))
+# Time stamps [ns] and numbers of every column, by topic, quantity and joint.
+Samples = dict[tuple[str, str, str], "tuple[array[int], array[float]]"]
 
 
 def read_bag(path: Path, spec: RecordingSpec) -> Table:
     """Read the joint states of a ROS 2 bag.
 
-    The columns are `t` [s after the first stamp] and `position:<joint>`, `velocity:<joint>`,
-    `effort:<joint>`. If several topics are read, their names begin with the topic, as in
-    `<topic>:position:<joint>`, and the rows of all topics are merged by time. The efforts of the
-    topic `CONTROL_TOPIC`, which is always read beside the only other one, are `ctrl:<name>`.
-
     Args:
-        path: The folder of the bag, or its file.
-        spec: The `[recording]` table; `topics` selects topics.
+        path: Folder of the bag, or the file in it.
+        spec: Table `[recording]`, which may choose topics.
 
     Returns:
-        All columns; NaN if a topic has no message at a time.
+        The time `t` since the first message [s], and `<quantity>:<joint>` for every quantity in
+        `QUANTITIES`; with several topics `<topic>:<quantity>:<joint>`. Controls are `ctrl:<name>`.
 
     Raises:
-        RecordingError: The bag is damaged, has no joint states, it is not clear which topic to
-            read, or the library is not installed.
+        RecordingError: The bag is damaged, has no joint states, or has several topics of them and
+            none is chosen.
     """
     if spec.time_unit != "s":
         raise RecordingError(
             f"{path}: recording.time_unit: the time of a bag is in seconds; leave this key out"
         )
-
     rosbag2 = rosbags_module(path, "rosbags.rosbag2")
     typesys = rosbags_module(path, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-
     try:
         with rosbag2.Reader(path) as reader:
             connections = _connections(path, reader.connections, spec.topics)
-            blocks = _blocks(path, reader, connections, store)
+            samples = _samples(path, reader, connections, store)
     except RecordingError:
         raise
     except Exception as error:
@@ -114,11 +71,11 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
             f"{path}: not a readable ROS 2 bag (damaged or truncated?): {one_line(error)}"
         ) from None
 
-    if not blocks:
+    if not samples:
         topics = listed([connection.topic for connection in connections])
         raise RecordingError(f"{path}: topic {topics} has no message")
     measured = {topic for topic in spec.topics if topic != CONTROL_TOPIC}
-    return _merged(path, blocks, with_topic=len(measured) > 1)
+    return _merged(path, samples, with_topic=len(measured) > 1)
 
 
 def rosbags_module(path: Path, name: str) -> Any:
@@ -126,7 +83,7 @@ def rosbags_module(path: Path, name: str) -> Any:
 
     Args:
         path: The bag, for the message.
-        name: The module.
+        name: Name of the module.
 
     Raises:
         RecordingError: The library is not installed.
@@ -144,7 +101,6 @@ def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]
     connections = list(connections)
     states = [c for c in connections if c.msgtype == JOINT_STATE]
     available = sorted({c.topic for c in states})
-
     if not available:
         others = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
         raise RecordingError(
@@ -160,86 +116,50 @@ def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]
             f"{path}: several topics of joint states: {listed(measured)}; select one by "
             "recording.topics"
         )
-
     return [c for c in states if c.topic in (topics or available)]
 
 
-def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict[_Layout, _Block]:
-    """Read all messages and collect them by layout."""
-    blocks: dict[_Layout, _Block] = {}
-
-    # Messages of several publishers of one topic may interleave, so the stamps must increase only
-    # among messages with equal joints.
-    last: dict[tuple[str, frozenset[str]], int] = {}
-
+def _samples(path: Path, reader: Any, connections: list[Any], store: Any) -> Samples:
+    """Read all messages, and collect their numbers by column."""
+    samples: Samples = defaultdict(lambda: (array("q"), array("d")))
     for number, (connection, received, raw) in enumerate(reader.messages(connections=connections)):
         message = store.deserialize_cdr(raw, JOINT_STATE)
-        where = f"{path}: topic {connection.topic!r}, message {number + 1}"
-        layout = _layout(where, connection.topic, message)
-
         # A message without a stamp has the time at which it was received.
         stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec or received
-        publisher = (connection.topic, frozenset(layout.joints))
-        _check_order(where, stamp, last.get(publisher))
-        last[publisher] = stamp
-
-        block = blocks.get(layout)
-        if block is None:
-            if len(set(layout.joints)) < len(layout.joints):
-                joints = listed(layout.joints)
-                raise RecordingError(f"{where}: a joint is listed twice: {joints}")
-            block = blocks[layout] = _Block()
-
-        block.stamps.append(stamp)
-        for quantity in layout.quantities:
-            numbers = np.asarray(getattr(message, quantity), dtype=np.float64)
-            block.values.frombytes(numbers.tobytes())
-
-    return blocks
+        for quantity in QUANTITIES:
+            values = getattr(message, quantity).tolist()
+            if values and len(values) != len(message.name):
+                raise RecordingError(
+                    f"{path}: topic {connection.topic!r}, message {number + 1}: a field does not "
+                    f"have one value for each of the {len(message.name)} joints"
+                )
+            for joint, value in zip(message.name, values, strict=False):
+                stamps, numbers = samples[connection.topic, quantity, joint]
+                stamps.append(stamp)
+                numbers.append(value)
+    return samples
 
 
-def _layout(where: str, topic: str, message: Any) -> _Layout:
-    """Layout of a message; a field that is not empty must have one number per joint."""
-    joints = tuple(message.name)
-    quantities = tuple(name for name in QUANTITIES if len(getattr(message, name)))
-
-    if any(len(getattr(message, name)) != len(joints) for name in quantities):
-        raise RecordingError(
-            f"{where}: a field does not have one value for each of the {len(joints)} joints"
-        )
-    return _Layout(topic=topic, joints=joints, quantities=quantities)
-
-
-def _check_order(where: str, stamp: int, last: int | None) -> None:
-    """Refuse a stamp [ns] that is not later than the last one."""
-    if last is None or stamp > last:
-        return
-
-    fault = (
-        "has the stamp of the previous message"
-        if stamp == last
-        else "has an earlier stamp than the previous message"
-    )
-    raise RecordingError(
-        f"{where}: {fault} ({(stamp - last) / NANOSECONDS:g} s); time must increase"
-    )
-
-
-def _merged(path: Path, blocks: dict[_Layout, _Block], with_topic: bool) -> Table:
-    """Merge all messages into one table with one row per stamp."""
-    all_stamps = [np.frombuffer(block.stamps, dtype=np.int64) for block in blocks.values()]
+def _merged(path: Path, samples: Samples, with_topic: bool) -> Table:
+    """Merge all columns into one table with one row per stamp."""
+    all_stamps = [np.frombuffer(stamps, dtype=np.int64) for stamps, _ in samples.values()]
     stamps = np.unique(np.concatenate(all_stamps))
-
     # Subtract integers first: a float64 cannot hold nanoseconds since 1970 exactly.
-    t = (stamps - stamps[0]).astype(np.float64) / NANOSECONDS
-    columns: dict[str, Array] = {"t": t}
-
-    for (layout, block), block_stamps in zip(blocks.items(), all_stamps, strict=True):
-        names = layout.column_names(with_topic)
-        rows = np.searchsorted(stamps, block_stamps)
-        values = np.frombuffer(block.values, dtype=np.float64).reshape(len(rows), len(names))
-
-        for name, column in zip(names, values.T, strict=True):
-            columns.setdefault(name, np.full(len(stamps), np.nan))[rows] = column
-
-    return Table(source=path, columns=columns)
+    columns = {"t": (stamps - stamps[0]).astype(np.float64) / NANOSECONDS}
+    for ((topic, quantity, joint), (_, numbers)), own in zip(
+        samples.items(), all_stamps, strict=True
+    ):
+        steps = np.diff(own)
+        if np.any(steps <= 0):
+            row = int(np.argmax(steps <= 0))
+            raise RecordingError(
+                f"{path}: topic {topic!r}: {quantity} of {joint!r}, message {row + 2} is "
+                f"{steps[row] / NANOSECONDS:g} s after the previous one; time must increase"
+            )
+        is_control = topic == CONTROL_TOPIC
+        prefix = f"{topic}:" if with_topic or is_control else ""
+        label = "ctrl" if is_control and quantity == "effort" else f"{prefix}{quantity}"
+        column: Array = np.full(len(stamps), np.nan)
+        column[np.searchsorted(stamps, own)] = np.frombuffer(numbers, dtype=np.float64)
+        columns[f"{label}:{joint}"] = column
+    return Table.of(path, columns, RecordingSpec(time="t"))

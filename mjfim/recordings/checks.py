@@ -1,0 +1,317 @@
+"""Checks that refuse an unusable log, with a message that says where and what to do.
+
+They concern the clock, gaps, dead channels, numbers that cannot be measured, and angles in degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import RecordingError
+from mjfim.model.coordinates import joint_names
+from mjfim.model.units import ANGLE
+from mjfim.recordings.channels import Channels
+from mjfim.recordings.plausibility import displacements
+
+# Smallest number of rows of a usable log.
+MIN_ROWS = 3
+
+# Shortest and longest plausible median step of a robot's log [s]. Outside this range, the unit of
+# time is probably wrong. A typical step, from which the unit is guessed.
+MIN_MEDIAN_STEP, MAX_MEDIAN_STEP = 1e-6, 1.0
+TYPICAL_STEP = 5e-3
+
+# A gap of up to this number of median steps is bridged, even if it is longer than `gap`.
+MIN_GAP_STEPS = 5.0
+
+# A measured column with at least this number of values, all equal, is a dead channel.
+DEAD_CHANNEL_ROWS = 10
+
+# A clock that jumps back to less than this fraction of the elapsed time has restarted. After a
+# smaller jump back, the rows are out of order.
+RESTART_SHARE = 0.1
+
+# Largest number whose square is finite in float64.
+LARGEST_VALUE = float(np.sqrt(np.finfo(np.float64).max))
+
+# Seconds per unit of time.
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+# Degrees per radian, and the relative tolerance for this ratio and for a joint's range.
+DEGREES = 180.0 / np.pi
+TOLERANCE = 0.2
+
+# Correlation above which two columns are considered to belong to one motion.
+MIN_CORRELATION = 0.5
+
+# Time between the positions whose difference is taken [s]; it is long enough that resolution and
+# noise have little effect.
+DIFFERENCE_TIME = 0.05
+
+# Angles beyond this multiple of a joint's range are implausible.
+MAX_RANGE_RATIO = 3.0
+
+# An angle [rad] and a speed [rad/s] that are implausible if a joint exceeds both.
+MAX_PLAUSIBLE_ANGLE, MAX_PLAUSIBLE_SPEED = 50.0, 200.0
+
+
+def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None:
+    """Refuse times that cannot be the clock of a robot's log.
+
+    Args:
+        where: File and column, for messages.
+        t: (M,) times inside the window [s].
+        first: Number of rows before the window, for the row numbers in messages.
+        unit: Unit of time that the experiment file states.
+        gap: Longest accepted gap [s].
+
+    Raises:
+        RecordingError: Too few rows, a time that is not finite or does not increase, an implausible
+            rate, or a gap.
+    """
+    if len(t) < MIN_ROWS:
+        raise RecordingError(
+            f"{where}: too few rows ({len(t)}); an identification needs at least {MIN_ROWS}"
+        )
+    if not np.isfinite(t).all():
+        row = int(np.argmax(~np.isfinite(t)))
+        fault = "NaN" if np.isnan(t[row]) else "an infinite time"
+        raise RecordingError(f"{where} holds {fault} in data row {first + row + 1}")
+
+    steps = np.diff(t)
+    if np.any(steps <= 0.0):
+        row = int(np.argmax(steps <= 0.0))
+        raise RecordingError(
+            f"{where} does not increase in data row {first + row + 2}: {t[row]:.9g} s, then "
+            f"{t[row + 1]:.9g} s {_why_not_later(t, steps, row)}"
+        )
+    median = float(np.median(steps))
+    if not MIN_MEDIAN_STEP <= median <= MAX_MEDIAN_STEP:
+        # Logarithms neither vanish nor overflow where a step is extremely short or long.
+        size = np.log(median) - np.log(SECONDS[unit] * TYPICAL_STEP)
+        likely = min(SECONDS, key=lambda other: abs(size + np.log(SECONDS[other])))
+        raise RecordingError(
+            f"{where}: the median step is {median:g} s, which is unlikely for a robot's log; "
+            f'should it be recording.time_unit = "{likely}"?'
+        )
+
+    limit = longest_bridged_gap(t, gap)
+    row = int(np.argmax(steps))
+    if steps[row] > limit:
+        raise RecordingError(
+            f"{where}: a gap of {steps[row]:g} s after data row {first + row + 1} "
+            f"({t[row] - t[0]:g} s after the first one); gaps longer than {limit:g} s are not "
+            "bridged: exclude this gap by recording.window, or raise recording.gap"
+        )
+
+
+def longest_bridged_gap(t: Array, gap: float) -> float:
+    """Longest gap that is bridged [s]: the stated one, or some median steps of t: (M,)."""
+    return max(gap, MIN_GAP_STEPS * float(np.median(np.diff(t))))
+
+
+def _why_not_later(t: Array, steps: Array, row: int) -> str:
+    """Probable cause of a time that is not later than the one before, and its cure."""
+    if steps[row] == 0.0:
+        count = int(np.sum(steps == 0.0))
+        others = f", one of {count}" if count > 1 else ""
+        return f"(a duplicate{others}); every row needs a different time"
+    # A clock that restarts jumps back to the beginning and continues from there.
+    is_last = row + 2 == len(t)
+    if t[row + 1] - t[0] < RESTART_SHARE * (t[row] - t[0]) and not is_last:
+        return (
+            "(the clock restarted or wrapped around); cut the log there by recording.window, or in "
+            "two files"
+        )
+    return "(rows out of order); sort them by time"
+
+
+def check_finite(where: str, values: Array, first: int) -> None:
+    """Refuse a column with a value that is infinite or whose square is; NaN is an empty field.
+
+    Raises:
+        RecordingError: There is such a value; the message names its row, after `first` others.
+    """
+    too_large = np.abs(values) > LARGEST_VALUE
+    if too_large.any():
+        at = int(np.argmax(too_large))
+        raise RecordingError(
+            f"{where} is {values[at]:g} in data row {first + at + 1}, which is too large to be a "
+            "measured number; leave the field empty if there is no number"
+        )
+
+
+def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
+    """Refuse a measured column that is empty or constant, or has gaps that are too long.
+
+    Args:
+        where: File and column, for messages.
+        t: (M,) times [s].
+        values: (M,) numbers, NaN where the column is empty.
+        gap: Longest accepted gap [s].
+
+    Raises:
+        RecordingError: The column cannot be used.
+    """
+    present = np.flatnonzero(np.isfinite(values))
+    advice = "remove it from the file or from [recording.columns]"
+    if not len(present):
+        raise RecordingError(f"{where} holds no number; {advice}")
+    if len(present) >= DEAD_CHANNEL_ROWS and np.ptp(values[present]) == 0.0:
+        raise RecordingError(
+            f"{where} is {values[present[0]]:g} in all of its {len(present)} rows, which suggests "
+            f"a dead channel; {advice}"
+        )
+
+    # A column with a low rate is empty in most rows, so its gaps are compared with its median step.
+    limit = longest_bridged_gap(t[present], gap) if len(present) > 1 else gap
+    edges = np.concatenate([t[:1], t[present], t[-1:]])
+    longest = int(np.argmax(np.diff(edges)))
+    if edges[longest + 1] - edges[longest] > limit:
+        begin, end = edges[longest] - t[0], edges[longest + 1] - t[0]
+        raise RecordingError(
+            f"{where} is empty from {begin:g} to {end:g} s; gaps longer than {limit:g} s are not "
+            "bridged: exclude this time by recording.window, or raise recording.gap"
+        )
+
+
+def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> None:
+    """Refuse a control that is missing in the first row, or that is held for too long.
+
+    Args:
+        where: File and column, for messages.
+        t: (M,) times [s].
+        values: (M,) numbers, each held over the empty rows after it.
+        age: (M,) times since they were set [s].
+        gap: Longest time for which a control is held [s].
+
+    Raises:
+        RecordingError: The control cannot be used.
+    """
+    if np.isnan(values[0]):
+        reason = "it holds no number"
+        if np.isfinite(values).any():
+            row = int(np.argmax(~np.isnan(values)))
+            reason = f"it begins {t[row] - t[0]:g} s later"
+        raise RecordingError(
+            f"{where} has no value in the first row; {reason}; every control is needed from the "
+            "first row on"
+        )
+    limit = longest_bridged_gap(t, gap)
+    if age.max() > limit:
+        end = int(np.argmax(age))
+        raise RecordingError(
+            f"{where} is empty for {age[end]:g} s until {t[end] - t[0]:g} s; a control is not held "
+            f"longer than {limit:g} s: exclude this time by recording.window, or raise "
+            "recording.gap"
+        )
+
+
+# ---- degrees
+
+
+def check_angles(
+    where: str, channels: Channels, t: Array, columns: Mapping[str, Array], stated: Collection[str]
+) -> None:
+    """Refuse angles of hinge joints, and references for them, that are probably in degrees.
+
+    Args:
+        where: The file, for messages.
+        channels: The signals of the experiment.
+        t: (M,) times [s].
+        columns: (M,) columns of the recording by name.
+        stated: Names of columns whose unit the experiment file states; they are not doubted.
+
+    Raises:
+        RecordingError: A column is probably in degrees.
+    """
+    for name, why in (
+        *_doubtful_angles(channels.model, t, columns),
+        *_doubtful_references(channels, columns),
+    ):
+        if name not in stated:
+            per_second = "/s" if name.startswith("qvel:") else ""
+            raise RecordingError(
+                f"{where}: {why}; {name!r} is probably in deg{per_second}: state unit = "
+                f'"deg{per_second}" for it in [recording.columns], or unit = "rad{per_second}" if '
+                "it is not"
+            )
+
+
+def _doubtful_angles(
+    model: mujoco.MjModel, t: Array, columns: Mapping[str, Array]
+) -> Iterator[tuple[str, str]]:
+    """Columns of hinge joints that look like degrees, and why."""
+    for j, joint in enumerate(joint_names(model)):
+        if int(model.jnt_type[j]) != int(mujoco.mjtJoint.mjJNT_HINGE):
+            continue
+        position, velocity = f"qpos:{joint}", f"qvel:{joint}"
+        q, v = columns.get(position), columns.get(velocity)
+        if q is not None and v is not None:
+            ratio = _slope_ratio(t, q, v)
+            why = f"the slope of {position!r} is {ratio:.3g} times {velocity!r}"
+            if abs(ratio / DEGREES - 1.0) < TOLERANCE:
+                yield position, why
+            if abs(ratio * DEGREES - 1.0) < TOLERANCE:
+                yield velocity, why
+        if q is None:
+            continue
+
+        smallest, largest = float(np.nanmin(q)), float(np.nanmax(q))
+        size = max(abs(smallest), abs(largest))
+        low, high = model.jnt_range[j].tolist()
+        tolerance = TOLERANCE * (high - low)
+        is_beyond = size > MAX_RANGE_RATIO * max(abs(low), abs(high))
+        is_inside = low - tolerance <= smallest / DEGREES and largest / DEGREES <= high + tolerance
+        if model.jnt_limited[j] and is_beyond and is_inside:
+            yield (
+                position,
+                f"column {position!r} ranges from {smallest:g} to {largest:g}, but its joint from "
+                f"{low:g} to {high:g} rad",
+            )
+        present = np.isfinite(q)
+        speed = np.abs(np.diff(q[present]) / np.diff(t[present])).max(initial=0.0)
+        if size > MAX_PLAUSIBLE_ANGLE and speed > MAX_PLAUSIBLE_SPEED:
+            yield position, f"column {position!r} reaches {size:g} rad at {speed:.3g} rad/s"
+
+
+def _doubtful_references(
+    channels: Channels, columns: Mapping[str, Array]
+) -> Iterator[tuple[str, str]]:
+    """References of control laws that move as far in degrees as the position does in radians."""
+    if channels.laws is None:
+        return
+    for law in channels.laws.laws:
+        column = channels.laws.inputs[law.columns["reference"]]
+        q, r = columns.get(f"qpos:{law.joint}"), columns.get(column.name)
+        if q is None or r is None or column.unit != ANGLE:
+            continue
+        both = np.isfinite(q) & np.isfinite(r)
+        ratio = _ratio(q[both] - q[both].mean(), r[both] - r[both].mean())
+        if abs(ratio / DEGREES - 1.0) < TOLERANCE:
+            yield (
+                column.name,
+                f"{column.name!r} moves {ratio:.3g} times as far as 'qpos:{law.joint}'",
+            )
+
+
+def _slope_ratio(t: Array, q: Array, v: Array) -> float:
+    """Ratio of the slope of q: (M,) to v: (M,), where both belong to one motion."""
+    both = np.isfinite(q) & np.isfinite(v)
+    if both.sum() < MIN_ROWS:
+        return float("nan")
+    lag = max(1, int(both.sum()) // 10)
+    dq, dv, _ = displacements(t[both], q[both], v[both], DIFFERENCE_TIME, lag)
+    return _ratio(dv, dq)
+
+
+def _ratio(x: Array, y: Array) -> float:
+    """Least-squares ratio of y: (M,) to x: (M,); NaN where they hardly belong to one motion."""
+    square, product = float(x @ x), float(x @ y)
+    if product <= MIN_CORRELATION * np.sqrt(square * float(y @ y)):
+        return float("nan")
+    return product / square
