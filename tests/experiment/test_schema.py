@@ -939,8 +939,8 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     ),
     "table stray column": (control('"stray.csv"'), R, ["stray.csv", "'torque'", "force, t"]),
     "table without t": (control('"timeless.csv"'), R, ["timeless.csv", "'t' is missing", "force"]),
-    "table NaN": (control('"nan.csv"'), R, ["nan.csv", "NaN", "row 2", "finite"]),
-    "table hole": (control('"hole.csv"'), R, ["hole.csv", "NaN", "row 3", "finite"]),
+    "table NaN": (control('"nan.csv"'), R, ["nan.csv", "'force'", "row 2", "finite"]),
+    "table hole": (control('"hole.csv"'), R, ["hole.csv", "'force'", "row 3", "finite"]),
     "table too short": (
         control('"short.csv"'),
         R,
