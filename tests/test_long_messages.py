@@ -15,8 +15,8 @@ from mjfim.excitation.joint_design import _require_common_parameters
 from mjfim.excitation.target_accuracy import require_reachable
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.identification.fit_start import _divergence
 from mjfim.identification.report import _warnings_of_bounds, _warnings_of_search
+from mjfim.identification.starts import divergence_at_start
 from mjfim.identification.task import _start
 from mjfim.output.campaign_folder import accuracy_sentence
 from mjfim.output.summaries.robustness import MAX_MISSED_LIMITS, _limit_sentences
@@ -208,7 +208,7 @@ def test_a_diverging_start_lists_the_first_values() -> None:
         parameters=SimpleNamespace(names=NAMES), channels=SimpleNamespace(control_columns=())
     )
     task = SimpleNamespace(system=system, start=np.ones(300), recordings=())
-    error = _divergence(task, SimpleNamespace(), "the output angle is 1e9 at 2 s")
+    error = divergence_at_start(task, SimpleNamespace(), "the output angle is 1e9 at 2 s")
     assert "inertia_of_link_0 = 1, " in str(error)
     require_short(str(error))
 

@@ -7,7 +7,6 @@ the other parts. The initial state of a predicted part is estimated from that pa
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import TypeVar
@@ -31,7 +30,7 @@ from mjfim.identification.left_out_parts import (
     masks_of,
     with_initial_states,
 )
-from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution
+from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.events import begin_stage
@@ -97,10 +96,7 @@ def predict_unfitted(
         if held_out is None
         else _predict_held_out(held_out, solution.unknowns.theta, budget)
     )
-    predictions: list[Prediction] = []
-    with suppress(InterruptedPassError):
-        predictions.extend(found)
-    return tuple(predictions)
+    return tuple(found)
 
 
 def _predict_held_out(held_out: FitProblem, theta: Array, budget: Budget) -> Iterator[Prediction]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.next_step import spread_over_data
+from mjfim.identification.segments import spread_over_data
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 # Number of samples of a segment that tell enough. Where the part would contain fewer of each

@@ -19,7 +19,6 @@ from mjfim.budget import Budget
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
-from mjfim.identification.fit_segments import has_free_starts, segments_of_fit
 from mjfim.identification.pins import Pins
 from mjfim.identification.prior_rows import PriorRows
 from mjfim.identification.residual_blocks import BlockDivision
@@ -28,7 +27,13 @@ from mjfim.identification.segment_simulation import (
     SegmentRows,
     SegmentSimulation,
 )
-from mjfim.identification.segments import Segment, recorded_release
+from mjfim.identification.segments import (
+    Segment,
+    free_segments,
+    has_free_starts,
+    recorded_release,
+    stated_segments,
+)
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.identification.whitened_rows import WhitenedRows
 from mjfim.information.null_space import NullSpace
@@ -142,7 +147,7 @@ class FitProblem:
 
         # The initial states of segments are not stated; they come from the measured values.
         free_starts = has_free_starts(system)
-        segments, directions = segments_of_fit(system, aligned, free_starts)
+        segments, directions = stated_segments(system, aligned)
 
         masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
         if not any(mask.any() for mask in masks):
@@ -250,6 +255,32 @@ class FitProblem:
             recording = self.recordings[segment.recording]
             segments.append(segment.first_part(recording.t, recording.dt, share))
         return replace(self, simulation=replace(self.simulation, segments=tuple(segments)))
+
+    def cut(self, length: float) -> FitProblem | None:
+        """This problem over segments of a length [s] with free initial states.
+
+        Parameters of the initial state say nothing about segments, and keep their values.
+
+        Returns:
+            The problem without pins; None where the segments would be too short.
+        """
+        parameters = self.system.parameters
+        moving = parameters.initial_state_derivative(self.system.space.nx).any(axis=0)
+        held = [*self.system.experiment.fit.hold, *np.array(parameters.names)[moving].tolist()]
+        try:
+            segments, directions = free_segments(self.system, self.recordings, length)
+        except RecordingError:
+            return None
+        count = len(self.recordings)
+        simulation = replace(
+            self.simulation,
+            segments=segments,
+            layout=UnknownLayout.of(parameters, count, free_starts=True, bounded=True, held=held),
+            start_directions=directions,
+        )
+        masks = tuple(np.array(recording.measured) for recording in self.recordings)
+        pins = Pins.none(parameters)
+        return replace(self, simulation=simulation, masks=masks, pins=pins)
 
     def from_known_states(
         self, at: UnknownValues, unknown: Sequence[int] = ()
@@ -452,32 +483,15 @@ class FitProblem:
         return self.simulation.motion(at, recording, max_samples)
 
     def errors_at(self, at: UnknownValues) -> list[Array] | None:
-        """Predicted minus measured values of every output, without the predictions themselves.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            One array for each output [y-unit]; None where a simulation diverges.
-        """
-        parts: list[list[Array]] = [[np.zeros(0)] for _ in self.system.outputs.names]
-        batches = self.batches(derivatives=False)
-        for batch in self.of_batches(FitProblem.outputs_of_batch, batches, at):
-            if batch is None:
-                return None
-            for rows in batch:
-                for found, errors in zip(parts, self.whitened.errors(rows), strict=True):
-                    found.append(errors)
-        return [np.concatenate(found) for found in parts]
+        """Predicted minus measured values of every output; None where a simulation diverges."""
+        predicted = self.predict(at)
+        return None if predicted is None else self.errors(predicted)
 
     def errors(self, predicted: Sequence[Array]) -> list[Array]:
         """Predicted minus measured values of every output, for all recordings in their order.
 
         Args:
             predicted: (M, ny) predicted outputs of every recording [y-unit].
-
-        Returns:
-            One array for each output [y-unit].
         """
         return [self.errors_of(j, predicted) for j in range(len(self.system.outputs))]
 
@@ -549,24 +563,6 @@ class FitProblem:
         private = self.prior_rows.private(at)[:, :, -1]
         return 0.5 * (float(common @ common) + float(np.sum(private**2)))
 
-    def squares(self, at: UnknownValues) -> Array | None:
-        """Sums of squared errors, which do not depend on the noise.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (ny,) sum of every output [y-unit^2]; None where a simulation diverges.
-        """
-        total = np.zeros(len(self.system.outputs))
-        batches = self.batches(derivatives=False)
-        for squares in self.of_batches(FitProblem.squares_of_batch, batches, at):
-            if squares is None:
-                return None
-            for found in squares:
-                total += found
-        return total
-
     def condense(self, at: UnknownValues) -> Condensed | None:
         """Linearise about the unknowns and condense block by block.
 
@@ -628,23 +624,6 @@ class FitProblem:
                 return None
             losses.append((rows.segment, self.loss.value(self.whitened.residual(rows))))
         return losses
-
-    def squares_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[Array] | None:
-        """Squared errors of a batch, which `squares` adds in this order.
-
-        Args:
-            at: The unknowns.
-            batch: The batch.
-
-        Returns:
-            (ny,) sums of the outputs [y-unit^2]; None where a simulation diverges.
-        """
-        squares = []
-        for rows in self.simulation.rows_of_batch(at, batch):
-            if rows is None:
-                return None
-            squares.append(np.array([float(e @ e) for e in self.whitened.errors(rows)]))
-        return squares
 
     def blocks_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> dict[int, Array] | None:
         """Condensed blocks of a batch, all of whose rows are in it.

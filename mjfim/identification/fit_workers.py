@@ -24,10 +24,11 @@ from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
-from mjfim.optimize.levenberg_marquardt import InterruptedPassError
+from mjfim.interruption import hurried
 from mjfim.parallel import (
     ExecutorLike,
     Workers,
+    carry_out,
     one_blas_thread,
     pool_stop_token,
     results_or_here,
@@ -117,12 +118,10 @@ class FitWorkers:
 
     Args:
         executor: Executor that carries out the tasks.
-        stop: Token that ends the pass that runs.
     """
 
-    def __init__(self, executor: ExecutorLike, stop: StopToken | None = None) -> None:
+    def __init__(self, executor: ExecutorLike) -> None:
         self._executor = Workers.of(executor)
-        self._stop = StopToken() if stop is None else stop
 
         # Variants of a problem share systems and recordings, which are sent once.
         self._problems: weakref.WeakKeyDictionary[
@@ -141,17 +140,22 @@ class FitWorkers:
     def of_batches(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> Sequence[T]:
         """Do works that are one pass over the data.
 
-        Raises:
-            InterruptedPassError: The pass was stopped. Passes that begin after the request to stop
-                are those that a result needs; this process does them, because a second Ctrl-C may
-                have ended the workers.
+        A request to stop takes effect after the pass. A second Ctrl-C ends what runs on workers,
+        and this process does the rest, as it does the works of lost workers.
         """
-        if len(works) < 2 or self._stop.requested:
+        if len(works) < 2:
             return [work(problem, Budget()) for work in works]
-        found = list(self.of_whole(problem, works, Budget(stop=self._stop)))
-        if len(found) < len(works):
-            raise InterruptedPassError
-        return found
+        orders = self._orders(problem, works)
+        found: dict[int, T] = {}
+        budget = Budget(stop=StopToken(also=hurried))
+        for outcome in carry_out(self._executor, _carry_out, orders, budget):
+            if not outcome.is_lost:
+                found[outcome.index] = self._counted(problem, outcome.result)
+        alone = replace(problem, workers=None)
+        return [
+            found[index] if index in found else work(alone, Budget())
+            for index, work in enumerate(works)
+        ]
 
     def of_whole(
         self, problem: FitProblem, works: Sequence[ProblemWork[T]], budget: Budget
@@ -161,18 +165,26 @@ class FitWorkers:
         Returns:
             The results in their order; those that a request to stop has prevented are missing.
         """
-        threads = self._executor.threads_for(len(works))
-        shared = self._shared(problem, threads)
         alone = replace(problem, workers=None)
 
         def here(order: _Order[T]) -> tuple[T, int]:
             """Do the work of a lost worker; the simulator counts its steps."""
             return order.work(alone, budget), 0
 
-        orders = [_Order(problem=shared, work=work) for work in works]
-        for result, steps in results_or_here(self._executor, _carry_out, orders, budget, here):
-            problem.system.plant.simulator.add_steps(steps)
-            yield result
+        orders = self._orders(problem, works)
+        for found in results_or_here(self._executor, _carry_out, orders, budget, here):
+            yield self._counted(problem, found)
+
+    def _orders(self, problem: FitProblem, works: Sequence[ProblemWork[T]]) -> list[_Order[T]]:
+        """Orders for works on a problem."""
+        shared = self._shared(problem, self._executor.threads_for(len(works)))
+        return [_Order(problem=shared, work=work) for work in works]
+
+    def _counted(self, problem: FitProblem, found: tuple[T, int]) -> T:
+        """A result of a worker, whose engine steps are added to those of the problem."""
+        result, steps = found
+        problem.system.plant.simulator.add_steps(steps)
+        return result
 
     def _shared(self, problem: FitProblem, threads: int) -> SharedValue[_SharedProblem]:
         """A problem as workers with some number of threads receive it."""

@@ -9,14 +9,12 @@ relative error over all these times, so that no time dominates because its error
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.identification.continuation import WholeFit
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.held_out_losses import BLOCKS, HeldOutLosses, losses_by_block
 from mjfim.identification.jackknife import jackknife_std, student_quantile
@@ -27,12 +25,10 @@ from mjfim.identification.left_out_parts import (
     left_out_parts,
     with_initial_states,
 )
-from mjfim.identification.next_step import spread_over_data
-from mjfim.identification.searches import FitSearch
-from mjfim.identification.segment_fits import problem_of_segments, segment_lengths
-from mjfim.identification.task import FitTask
-from mjfim.information.null_space import NullSpace
-from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution
+from mjfim.identification.report import FitResult
+from mjfim.identification.search import FitSearch
+from mjfim.identification.segments import spread_over_data
+from mjfim.identification.starts import segment_lengths
 from mjfim.records.estimate import HorizonStudy
 from mjfim.records.events import begin_stage
 
@@ -56,206 +52,137 @@ CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HorizonChoice:
-    """Lengths of segments that were compared, and the fit over the chosen length.
-
-    Attributes:
-        study: The comparison.
-        length: Length of the chosen segments [s]; None for whole recordings.
-        theta: (p,) estimate of the fit over the chosen length [theta-unit].
-    """
-
-    study: HorizonStudy
-    length: float | None
-    theta: Array
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _LengthFit:
     """Fit over segments of one length.
 
     Attributes:
         length: Length of the segments [s]; None for whole recordings.
-        theta: (p,) estimate [theta-unit].
-        without: (K, p) estimates without each part of the data [theta-unit].
+        problem: The problem of segments of this length.
+        theta: (p,) estimate.
+        without: (K, p) estimates without each part of the data.
     """
 
     length: float | None
+    problem: FitProblem
     theta: Array
     without: Array
 
 
-def choose_horizon(
-    search: FitSearch, problem: FitProblem, whole: WholeFit, null_space: NullSpace
-) -> HorizonChoice | None:
+def choose_length(
+    search: FitSearch, problem: FitProblem, whole: FitResult
+) -> tuple[HorizonStudy, float | None, Array] | None:
     """Compare lengths of segments by predictions of left-out data, and choose one.
 
     Args:
-        search: The searches of the identification.
-        problem: Problem of the whole recordings, with the stated noise.
-        whole: Its solution.
-        null_space: Combinations of parameters that the fit holds.
+        search: Searches of the identification.
+        problem: The problem of whole recordings, with the noise of their fit.
+        whole: The fit over whole recordings.
 
     Returns:
-        The choice; None after a request to stop, where fewer than two lengths are possible, and
-        where parameters move the stated initial state, which segments do not have.
+        The comparison, the chosen length [s], None for whole recordings, and the (p,) estimate over
+        it; None where fewer than two lengths can be compared, where a parameter moves the initial
+        state, or after a request to stop.
     """
-    task = search.task
-    parameters = task.system.parameters
-    if parameters.initial_state_derivative(task.system.space.nx).any():
+    system = search.task.system
+    if system.parameters.initial_state_derivative(system.space.nx).any():
+        return None
+    problems = _problems(search, problem, whole)
+    parts = _parts(problem)
+    fits: list[_LengthFit] = []
+    for number, (length, part) in enumerate(problems):
+        begin_stage("comparing lengths of the segments", number, len(problems))
+        found = _fitted(search, whole, length, part, parts)
+        if search.interrupted:
+            return None
+        fits += [] if found is None else [found]
+    if len(fits) < 2:
         return None
 
+    # Losses of each fit over each horizon.
+    sigma = system.noise.sigma
+    losses = [[_losses(search, fit, each.problem, parts, sigma) for each in fits] for fit in fits]
+    if search.interrupted:
+        return None
+    chosen = _chosen([_over_all_horizons(losses, i) for i in range(len(fits))])
+    longest = max(float(recording.t[-1]) for recording in problem.recordings)
+    study = HorizonStudy(
+        lengths=np.array([longest if fit.length is None else fit.length for fit in fits]),
+        errors=np.array([[each.error for each in row] for row in losses]),
+        chosen=chosen,
+        is_whole=fits[-1].length is None,
+        parameters=system.parameters.names,
+        units=tuple(system.units),
+        theta=np.array([fit.theta for fit in fits]),
+        half_widths=np.array([_half_width(fit.without, CONFIDENCE) for fit in fits]),
+        is_apart=np.array([_is_apart(fit, fits[chosen]) for fit in fits]),
+    )
+    return study, fits[chosen].length, fits[chosen].theta
+
+
+def _problems(
+    search: FitSearch, problem: FitProblem, whole: FitResult
+) -> list[tuple[float | None, FitProblem]]:
+    """Lengths of segments [s], shortest first, and their problems; None for the whole."""
+    found: list[tuple[float | None, FitProblem]] = []
+    for length in segment_lengths(problem.recordings):
+        part = problem.cut(length)
+        if part is not None:
+            found.append((length, part.pinned(search.task.start, whole.null_space)))
+    if problem.sample_count <= MAX_WHOLE_SAMPLES:
+        found.append((None, problem))
+    return [(length, _affordable(part)) for length, part in found]
+
+
+def _fitted(
+    search: FitSearch,
+    whole: FitResult,
+    length: float | None,
+    problem: FitProblem,
+    parts: Sequence[LeftOutPart],
+) -> _LengthFit | None:
+    """Fit segments of a length, also without each part; None where a simulation diverges."""
+    name = "whole recordings" if length is None else f"segments of {length:.2g} s"
+    begin = search.with_initial_states(problem, problem.begin(whole.theta))
     try:
-        study = _Study(search=search, problem=problem, whole=whole, null_space=null_space)
-        return study.choice()
-    except InterruptedPassError:
+        weighted, solution = search.solve(problem, begin, f"comparison, {name}", is_rough=True)
+    except SimulationDivergedError:
         return None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Study:
-    """Fits and predictions of one comparison.
-
-    Attributes:
-        search: The searches of the identification.
-        problem: Problem of the whole recordings, with the stated noise.
-        whole: Its solution.
-        null_space: Combinations of parameters that the fits hold.
-    """
-
-    search: FitSearch
-    problem: FitProblem
-    whole: WholeFit
-    null_space: NullSpace
-
-    @property
-    def task(self) -> FitTask:
-        """The task of the identification."""
-        return self.search.task
-
-    def choice(self) -> HorizonChoice | None:
-        """Compare all lengths."""
-        problems = self._problems()
-        parts = _parts(self.problem)
-        fits: list[_LengthFit] = []
-        kept: list[FitProblem] = []
-        for number, (length, problem) in enumerate(problems):
-            begin_stage("comparing lengths of the segments", number, len(problems))
-            found = self._fitted(length, problem, parts)
-            if self.search.interrupted():
-                return None
-            if found is not None:
-                fits.append(found)
-                kept.append(problem)
-        if len(fits) < 2:
+    without = []
+    for step in leave_out_steps(weighted, solution, parts):
+        others = fit_to_others(weighted, step, search.budget)
+        if others is None:
             return None
+        without.append(weighted.theta(others.unknowns))
+    return _LengthFit(
+        length=length,
+        problem=problem,
+        theta=weighted.theta(solution.unknowns),
+        without=np.array(without),
+    )
 
-        # Losses of each fit over each horizon.
-        losses = [[self._losses(fit, problem, parts) for problem in kept] for fit in fits]
-        if self.search.interrupted():
-            return None
-        chosen = _chosen([_over_all_horizons(losses, i) for i in range(len(fits))])
-        return HorizonChoice(
-            study=self._study(fits, losses, chosen),
-            length=fits[chosen].length,
-            theta=fits[chosen].theta,
-        )
 
-    def _problems(self) -> list[tuple[float | None, FitProblem]]:
-        """Lengths of segments [s], shortest first, and their problems; None for the whole."""
-        noise = self.whole.problem.noise
-        found: list[tuple[float | None, FitProblem]] = []
-        for length in segment_lengths(self.problem.recordings):
-            part = problem_of_segments(self.problem, self.task, self.task.system, length)
-            if part is not None:
-                found.append((length, part))
-        if self.problem.sample_count <= MAX_WHOLE_SAMPLES:
-            found.append((None, self.problem))
-
-        theta = self.task.start
-        return [
-            (length, _affordable(part.with_noise(noise)).pinned(theta, self.null_space))
-            for length, part in found
-        ]
-
-    def _fitted(
-        self, length: float | None, problem: FitProblem, parts: Sequence[LeftOutPart]
-    ) -> _LengthFit | None:
-        """Fit segments of a length, also without each part; None where a simulation diverges."""
-        theta = self.whole.problem.theta(self.whole.solution.unknowns)
-        name = "whole recordings" if length is None else f"segments of {length:.2g} s"
-        begin = self.search.with_initial_states(problem, problem.begin(theta))
-        try:
-            weighted, solution = self.search.solve(
-                problem, begin, f"comparison, {name}", is_rough=True
-            )
-        except SimulationDivergedError:
-            return None
-
-        without = self._without_parts(weighted, solution, parts)
-        if without is None:
-            return None
-        return _LengthFit(length=length, theta=weighted.theta(solution.unknowns), without=without)
-
-    def _without_parts(
-        self, problem: FitProblem, solution: Solution, parts: Sequence[LeftOutPart]
-    ) -> Array | None:
-        """(K, p) estimates without each part; None where one of them is not possible."""
-        found = []
-        for step in leave_out_steps(problem, solution, parts):
-            others = fit_to_others(problem, step, self.search.budget)
-            if others is None:
-                return None
-            found.append(problem.theta(others.unknowns))
-        return np.array(found)
-
-    def _losses(
-        self, fit: _LengthFit, problem: FitProblem, parts: Sequence[LeftOutPart]
-    ) -> HeldOutLosses:
-        """Losses of a fit over one horizon: that of a problem.
-
-        Args:
-            fit: The fit.
-            problem: Problem of segments as long as the horizon.
-            parts: Parts of the data that are predicted from the others.
-        """
-        pieces = sum(len(part.recordings) for part in parts)
-        blocks = -(-BLOCKS // max(pieces, 1))
-        found = []
-        for part, theta in zip(parts, fit.without, strict=True):
-            masks = part.masks(problem)
-            predicted, at = with_initial_states(problem, theta, masks, self.search.budget)
-            y = predicted.predict(at)
-            sigma = self.problem.noise.sigma
-            losses, counts = losses_by_block(problem, y, masks, part.recordings, blocks, sigma)
-            found.append((losses, counts))
-
-        return HeldOutLosses(
-            losses=np.concatenate([losses for losses, _ in found]),
-            counts=np.concatenate([counts for _, counts in found]),
-            parts=np.repeat(np.arange(len(found)), [len(losses) for losses, _ in found]),
-            estimates=fit.without,
-        )
-
-    def _study(
-        self, fits: Sequence[_LengthFit], losses: Sequence[Sequence[HeldOutLosses]], chosen: int
-    ) -> HorizonStudy:
-        """The record of the comparison."""
-        longest = max(float(recording.t[-1]) for recording in self.problem.recordings)
-        lengths = [longest if fit.length is None else fit.length for fit in fits]
-        parameters = self.task.system.parameters
-        is_apart = [_is_apart(fit, fits[chosen]) for fit in fits]
-        return HorizonStudy(
-            lengths=np.array(lengths),
-            errors=np.array([[each.error for each in row] for row in losses]),
-            chosen=chosen,
-            is_whole=fits[-1].length is None,
-            parameters=parameters.names,
-            units=tuple(self.task.system.units),
-            theta=np.array([fit.theta for fit in fits]),
-            half_widths=np.array([_half_width(fit.without, CONFIDENCE) for fit in fits]),
-            is_apart=np.array(is_apart),
-        )
+def _losses(
+    search: FitSearch,
+    fit: _LengthFit,
+    problem: FitProblem,
+    parts: Sequence[LeftOutPart],
+    sigma: Array,
+) -> HeldOutLosses:
+    """Losses of a fit over one horizon: that of a problem."""
+    pieces = sum(len(part.recordings) for part in parts)
+    blocks = -(-BLOCKS // max(pieces, 1))
+    found = []
+    for part, theta in zip(parts, fit.without, strict=True):
+        masks = part.masks(problem)
+        predicted, at = with_initial_states(problem, theta, masks, search.budget)
+        y = predicted.predict(at)
+        found.append(losses_by_block(problem, y, masks, part.recordings, blocks, sigma))
+    return HeldOutLosses(
+        losses=np.concatenate([losses for losses, _ in found]),
+        counts=np.concatenate([counts for _, counts in found]),
+        parts=np.repeat(np.arange(len(found)), [len(losses) for losses, _ in found]),
+        estimates=fit.without,
+    )
 
 
 def _parts(problem: FitProblem) -> tuple[LeftOutPart, ...]:
@@ -334,16 +261,3 @@ def _is_apart(fit: _LengthFit, chosen: _LengthFit) -> np.ndarray:
         return np.zeros(len(fit.theta), dtype=bool)
     allowed = _half_width(fit.without - chosen.without, 1.0 - SIGNIFICANCE)
     return np.asarray(np.abs(fit.theta - chosen.theta) > allowed)
-
-
-def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTask:
-    """The task of fitting segments of a length.
-
-    Args:
-        task: The task.
-        length: The length [s], or "whole"; None for a length that the fit chooses.
-    """
-    system = task.system
-    settings = task.settings.model_copy(update={"segments": length})
-    experiment = system.experiment.model_copy(update={"fit": settings})
-    return replace(task, system=replace(system, experiment=experiment), settings=settings)

@@ -1,16 +1,15 @@
 """Least-squares identification of parameters from recordings.
 
-It minimises `sum_k |Sigma^-1/2 (y~_k - y_k(theta))|^2` over theta; the Jacobian is the sensitivity
-G = dy/dtheta. The default method is Levenberg-Marquardt inside the bounds. The method `newton` is
-the paper's Newton-Raphson iteration, with the Fisher information as Hessian (Gauss-Newton).
+One search over all data begins at the best start that is known: the stated one, the first rows, the
+equation of motion, or a subset of the data. Where its result does not explain the data, other
+starts follow, and then other lengths of the segments. The best result is kept.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -20,23 +19,16 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.cad_prior import CadPrior
-from mjfim.identification.continuation import (
-    WholeFit,
-    continued_fit,
-    is_doubtful,
-    may_be_repeated,
-)
 from mjfim.identification.fit_problem import FitProblem, have_same_initial_states
 from mjfim.identification.fit_quality import fit_quality
-from mjfim.identification.fit_start import begin_fit
 from mjfim.identification.fit_workers import FitWorkers
-from mjfim.identification.horizons import HorizonChoice, choose_horizon, with_length
-from mjfim.identification.next_step import spread_over_data
+from mjfim.identification.horizons import choose_length
 from mjfim.identification.report import FitResult, estimate_from
-from mjfim.identification.searches import NEWTON, FitSearch
+from mjfim.identification.residual_tests import misfit_reasons
+from mjfim.identification.search import NEWTON, FitSearch, first_subset, of_subset, quick_subset
 from mjfim.identification.sensitivity_rows import sensitivity_rows
-from mjfim.identification.subsets import first_subset, of_subset, quick_subset
-from mjfim.identification.task import FitTask, Method
+from mjfim.identification.starts import SPREAD_STARTS, begin_fit, start_from_segments
+from mjfim.identification.task import FitTask, Method, with_length
 from mjfim.information.null_space import (
     CLEAR_SINGULAR_VALUE,
     NullSpace,
@@ -44,30 +36,27 @@ from mjfim.information.null_space import (
     has_weak_column,
 )
 from mjfim.optimize.levenberg_marquardt import (
-    InterruptedPassError,
     SearchSettings,
     Solution,
     UnknownValues,
-    completed,
     minimise,
 )
 from mjfim.parallel import ExecutorLike, one_blas_thread
-from mjfim.records.estimate import Estimate
+from mjfim.records.estimate import Estimate, Restart
 from mjfim.records.events import FitEvent, begin_stage, shown_progress
 from mjfim.records.trajectory import Recording
 
-# Shares of the segments, or of each one of few, on which combinations without effect are searched
-# for in turn with one-sided differences. Only where all data leave a doubt, differences of two
-# lengths show how large the error is.
-SHARES_THAT_DETERMINE = (0.2, 0.5, 1.0)
+# Share of each segment on which combinations without effect are searched for first, with one-sided
+# differences. Only where all data leave a doubt, differences of two lengths show how large the
+# error is.
+SHARE_THAT_DETERMINES = 0.2
 
-# A smaller share that is tried first where it has enough segments.
-SMALL_SHARE = 0.05
-SEGMENTS_OF_SMALL_SHARE = 3
+# Difference of two costs that is not relevant. A step to the minimum that is 0.14 standard
+# deviations long lowers the cost by this much.
+SAME_COST = 1e-2
 
-# Reasons for an estimate over whole recordings, although segments predict left-out data better.
+# Reason for an estimate over whole recordings, although segments predict left-out data better.
 DIVERGED = "the fit over this length diverged"
-STOPPED = "the search was stopped before the fit over this length was complete"
 
 Callback = Callable[[FitEvent], None]
 
@@ -182,7 +171,7 @@ def identify_task(
     steps_before = task.system.plant.engine_steps
 
     with one_blas_thread(), stop_on_interrupt(stop) as token:
-        workers = None if executor is None else FitWorkers(executor, token)
+        workers = None if executor is None else FitWorkers(executor)
         search = FitSearch(task=task, budget=Budget(stop=token), callback=callback)
         estimate = estimate_from(fit_task(search, workers), search.budget)
 
@@ -197,122 +186,144 @@ def fit_task(search: FitSearch, workers: FitWorkers | None = None) -> FitResult:
     """Search for the parameters of a task from its start.
 
     Args:
-        search: The task, and the budget of its searches.
-        workers: Workers that simulate parts of the data; None for this process.
-
-    Returns:
-        The fit, whose accuracy is not yet assessed.
+        search: The searches of the identification.
+        workers: Workers that do parts of the work; None for this process.
 
     Raises:
-        RecordingError: A recording cannot be used.
-        SimulationDivergedError: The model diverges at the start.
+        SimulationDivergedError: The simulation diverges at the start, and no other start is found.
+        RecordingError: The recordings do not fit the experiment.
     """
     stated = search.task
     problem, held_out = _problems(stated, workers)
-
-    # A fit to the equation of motion gives the start where that is asked for, or where the model
-    # diverges at the stated one.
     begun = begin_fit(search, problem)
     search = begun.search
     task = search.task
 
-    # With much data, the search begins on a subset of the segments.
-    subset = quick_subset(problem)
-    begin = problem.begin(task.start)
-
     # Combinations of parameters that no recording determines are held at their start values.
     begin_stage("testing what the recordings determine")
-    null_space = completed(partial(_unseen_directions, task, problem.of_segments(subset)))
+    subset = quick_subset(problem)
+    begin = problem.begin(task.start)
+    null_space = _unseen_directions(task, problem.of_segments(subset))
     problem = problem.pinned(task.start, null_space)
 
-    # Short searches from several starts avoid local minima. The best result continues over all
-    # data.
-    problem, subset, first = _first_fit(search, problem, subset, begin)
-
-    # A result that does not explain the data may be a local minimum. Fits over short segments then
-    # give another start, and the better one of the two results is kept.
-    fit = continued_fit(search, problem, first, null_space)
-    result = FitResult(
+    # With much data, the search begins on a subset. A request to stop ends it there.
+    begin = search.best_start(problem, begin)
+    searched, status = problem, ""
+    if search.interrupted:
+        first = first_subset(problem)
+        if len(first) < len(problem.segments):
+            searched, begin = problem.of_segments(first), of_subset(begin, first)
+            status = f", from {len(first)} of {len(problem.segments)} segments"
+            subset = np.arange(len(first))
+    weighted, solution = search.solve(searched, begin)
+    fit = FitResult(
         task=stated,
-        problem=fit.problem,
-        solution=fit.solution,
-        quality=fit.quality,
+        problem=weighted,
+        solution=replace(solution, status=solution.status + status),
+        quality=fit_quality(weighted, solution),
         null_space=null_space,
         held_out=held_out,
         subset=subset,
-        restart=fit.restart,
-        inverse_dynamics=begun.inverse_dynamics or fit.inverse_dynamics,
+        restart=None,
+        inverse_dynamics=begun.inverse_dynamics,
         begun_instead=begun.instead,
     )
 
+    # A result that does not explain the data may be a local minimum: fits over short segments give
+    # other starts, the second time from many starts where most of the motion is unexplained.
+    if task.settings.segment_length is None and task.method != "newton":
+        for is_spread in (False, True):
+            is_poor = bool(fit.quality.unexplained) if is_spread else is_doubtful(fit)
+            if search.interrupted or not is_poor:
+                break
+            fit = _restarted(search, problem, fit, is_spread=is_spread)
+    fit = _with_solution(fit, *search.over_roughness(fit.problem, fit.solution))
+
     # Where the model does not explain whole recordings, the length of the segments matters.
-    if not _chooses_length(task) or search.interrupted() or not is_doubtful(task, fit):
-        return result
-    return _over_chosen_length(search, problem, fit, result, workers)
+    chooses_length = task.settings.segments is None and task.method != "newton"
+    if chooses_length and not search.interrupted and is_doubtful(fit):
+        fit = _over_chosen_length(search, problem, fit)
+    return fit
 
 
-def _chooses_length(task: FitTask) -> bool:
-    """Whether the length of the segments is left to the fit."""
-    return task.settings.segments is None and task.method != "newton"
+def is_doubtful(fit: FitResult) -> bool:
+    """Whether a fit may have ended in a local minimum, or before a minimum."""
+    quality, is_stated = fit.quality, fit.task.noise_is_stated
+    if quality.unexplained or not (fit.solution.success or is_stated):
+        return True
+    tests = quality.whiteness
+    return bool(misfit_reasons(quality.chi2, quality.dof, is_stated, tests, missing=()))
 
 
-def _over_chosen_length(
-    search: FitSearch,
-    problem: FitProblem,
-    fit: WholeFit,
-    result: FitResult,
-    workers: FitWorkers | None,
+def _with_solution(fit: FitResult, problem: FitProblem, solution: Solution) -> FitResult:
+    """The fit with another solution."""
+    if solution is fit.solution:
+        return fit
+    quality = fit_quality(problem, solution)
+    return replace(fit, problem=problem, solution=solution, quality=quality)
+
+
+def _restarted(
+    search: FitSearch, problem: FitProblem, fit: FitResult, *, is_spread: bool
 ) -> FitResult:
-    """The fit over the length of segments that predicts left-out data best.
-
-    Args:
-        search: The searches of the identification.
-        problem: Problem of the whole recordings, with the stated noise.
-        fit: The fit over whole recordings.
-        result: Its result.
-        workers: Workers that simulate parts of the data; None for this process.
-    """
-    choice = choose_horizon(search, problem, fit, result.null_space)
-    if choice is None:
-        return result
-    if choice.length is None:
-        return replace(result, horizons=choice.study)
-    if search.interrupted():
-        return _not_over_length(result, choice, STOPPED)
-
-    task = with_length(search.task, choice.length)
-    cut, held_out = _problems(task, workers)
-    cut = cut.pinned(task.start, result.null_space)
-    chosen = replace(search, task=task)
-    try:
-        begin = chosen.with_initial_states(cut, cut.begin(choice.theta))
-        weighted, solution = chosen.solve(cut, begin, f"segments of {choice.length:.2g} s")
-        quality = fit_quality(weighted, solution)
-    except InterruptedPassError:
-        return _not_over_length(result, choice, STOPPED)
-    except SimulationDivergedError:
-        return _not_over_length(result, choice, DIVERGED)
-    return replace(
-        result,
-        task=replace(task, start=result.task.start),
-        problem=weighted,
-        solution=solution,
-        quality=quality,
-        held_out=held_out,
-        subset=quick_subset(cut),
-        horizons=choice.study,
+    """The fit, or its repetition from fits over segments if that costs less."""
+    segments = start_from_segments(search, problem, fit.null_space, spread=is_spread)
+    if not segments.lengths:
+        return fit
+    before = fit.solution.cost
+    restart = Restart(
+        lengths=segments.lengths,
+        cost_before=before,
+        cost=before,
+        by_dynamics=segments.inverse_dynamics is not None,
+        starts=SPREAD_STARTS if is_spread else 1,
     )
+    if not is_spread:
+        fit = replace(fit, inverse_dynamics=fit.inverse_dynamics or segments.inverse_dynamics)
+    if segments.start is None:
+        return replace(fit, restart=fit.restart or restart)
+    try:
+        placed = search.with_initial_states(problem, segments.start)
+        weighted, solution = search.solve(problem, placed, "again all data", cost_to_beat=before)
+        again = _with_solution(fit, weighted, solution)
+    except SimulationDivergedError:
+        return replace(fit, restart=fit.restart or restart)
+
+    # Costs can be compared only with the same noise. Of two equal fits, that which has converged.
+    cost = fit.problem.cost(solution.unknowns)
+    converges = solution.success and not fit.solution.success
+    if before - cost > SAME_COST or (converges and before - cost > -SAME_COST):
+        if fit.restart is not None:
+            restart = replace(restart, cost_before=fit.restart.cost_before)
+        return replace(again, restart=replace(restart, cost=cost))
+    return replace(fit, restart=fit.restart or restart)
 
 
-def _not_over_length(result: FitResult, choice: HorizonChoice, reason: str) -> FitResult:
-    """The fit over whole recordings, in place of one over the chosen length.
-
-    Args:
-        result: The fit.
-        choice: The chosen length.
-        reason: Why there is no fit over it, in words.
-    """
-    return replace(result, horizons=replace(choice.study, why_not_used=reason))
+def _over_chosen_length(search: FitSearch, problem: FitProblem, fit: FitResult) -> FitResult:
+    """The fit over the length of segments that predicts left-out data best."""
+    choice = choose_length(search, problem.with_noise(fit.problem.noise), fit)
+    if choice is None or search.interrupted:
+        return fit
+    study, length, theta = choice
+    cut = None if length is None else problem.cut(length)
+    if length is None or cut is None:
+        return replace(fit, horizons=study)
+    task = with_length(search.task, length)
+    cut = cut.pinned(task.start, fit.null_space)
+    chosen = replace(search, task=task)
+    begin = chosen.with_initial_states(cut, cut.begin(theta))
+    try:
+        weighted, solution = chosen.solve(cut, begin, f"segments of {length:.2g} s")
+        found = _with_solution(fit, weighted, solution)
+    except SimulationDivergedError:
+        return replace(fit, horizons=replace(study, why_not_used=DIVERGED))
+    return replace(
+        found,
+        task=replace(task, start=fit.task.start),
+        held_out=None if fit.held_out is None else fit.held_out.cut(length),
+        subset=quick_subset(cut),
+        horizons=study,
+    )
 
 
 def refit_task(
@@ -326,39 +337,29 @@ def refit_task(
     """Search for the parameters of a task near its start, where a similar fit has ended.
 
     Args:
-        search: The task, whose start is near the solution, and the budget of its search.
-        near: The similar fit to the same recordings, whose initial states of the segments and
-            values of single recordings are used.
-        workers: Workers that simulate parts of the data; None for this process.
-        is_rough: True for a fit whose predictions alone count (`FitSearch.solve`).
-        other_start: (p,) parameters where the search begins instead if the recordings cost less
-            there [theta-unit]; None for none.
-
-    Returns:
-        The fit, whose accuracy is not yet assessed.
-
-    Raises:
-        SimulationDivergedError: The model diverges at the start.
+        search: The searches, with the start of the task.
+        near: The similar fit, which has the initial states of the begin.
+        workers: Workers that do parts of the work; None for this process.
+        is_rough: Whether the fit is only compared with others.
+        other_start: (p,) another start, which is taken if it costs less.
     """
     task = search.task
     problem, held_out = _problems(task, workers)
     subset = quick_subset(problem)
-    null_space = completed(partial(_unseen_directions, task, problem.of_segments(subset)))
+    null_space = _unseen_directions(task, problem.of_segments(subset))
     problem = problem.pinned(task.start, null_space)
-
-    begin = _begin_near(problem, problem.begin(task.start), near)
-    if other_start is not None:
-        other = _begin_near(problem, problem.begin(other_start), near)
-        begin = min(begin, other, key=problem.cost)
+    starts = [task.start] if other_start is None else [task.start, other_start]
+    begins = [_begin_near(problem, problem.begin(start), near) for start in starts]
+    begin = begins[0] if len(begins) == 1 else min(begins, key=problem.cost)
     nearby = replace(search, begins_near=True)
-    weighted, solution = nearby.solve(problem, begin, "near a similar fit", is_rough=is_rough)
+    found = nearby.solve(problem, begin, "near a similar fit", is_rough=is_rough)
     if not is_rough:
-        weighted, solution = nearby.over_roughness(weighted, solution)
+        found = nearby.over_roughness(*found)
     return FitResult(
         task=task,
-        problem=weighted,
-        solution=solution,
-        quality=fit_quality(weighted, solution),
+        problem=found[0],
+        solution=found[1],
+        quality=fit_quality(*found),
         null_space=null_space,
         held_out=held_out,
         subset=subset,
@@ -445,124 +446,38 @@ def newton_raphson(problem: FitProblem, start: Array, budget: Budget | None = No
     return least_squares(problem.unbounded(), start, NEWTON, budget)
 
 
-def _first_fit(
-    search: FitSearch, problem: FitProblem, subset: np.ndarray, begin: UnknownValues
-) -> tuple[FitProblem, np.ndarray, tuple[FitProblem, Solution]]:
-    """The fit from the best start.
-
-    After a request to stop before the first pass over all data is complete, it is a fit to the
-    segments alone on which the search began. Initial states were improved only there.
-
-    Args:
-        search: The searches of the identification.
-        problem: Problem of all segments.
-        subset: Indices of segments that are quick to simulate.
-        begin: Unknowns at the stated start.
-
-    Returns:
-        The problem that was solved, its segments that are quick to simulate, and the problem with
-        the noise of the fit and its solution.
-    """
-    count = len(problem.segments)
-    searched = first_subset(problem)
-    try:
-        begin = search.best_start(problem, begin)
-        if not search.interrupted() or len(searched) == count:
-            is_judged = may_be_repeated(search.task)
-            return problem, subset, search.solve(problem, begin, is_judged=is_judged)
-    except InterruptedPassError:
-        pass
-
-    part = replace(problem.of_segments(searched), workers=None)
-    weighted, solution = search.solve(part, of_subset(begin, searched))
-    if len(searched) < count:
-        status = f"{solution.status}, from {len(searched)} of {count} segments"
-        solution = replace(solution, status=status)
-    return part, np.arange(len(searched)), (weighted, solution)
-
-
 def _unseen_directions(task: FitTask, problem: FitProblem) -> NullSpace:
-    """Directions of theta, at the start, about which the data contain no information.
-
-    The data are the recordings and the priors. What a part of them determines clearly, all of them
-    determine as well, and one difference step is enough to see it, unless an effect is so weak that
-    it may be round-off.
-    """
-    tested = _tested_parameters(task)
-    if not tested.any():
-        count = len(task.system.parameters)
-        nothing = np.zeros((count, 0))
-        return NullSpace(directions=nothing, silent=(), basis=np.eye(count), smallest=1.0)
-
-    for part in _parts_that_determine(problem):
-        J, change = _stacked_sensitivity(task, part, with_error=False)
-        if has_weak_column(J[:, tested], task.system.parameters.magnitude[tested]):
-            continue
-        quick = _null_space(task, J, change)
-        if not quick.count and quick.smallest > CLEAR_SINGULAR_VALUE:
-            return quick
-    return _null_space(task, *_stacked_sensitivity(task, problem, with_error=True))
-
-
-def _tested_parameters(task: FitTask) -> np.ndarray:
-    """(p,) True for the parameters of which the data may contain no information.
-
-    Those that are held are none, and no direction of inertias with a CAD prior is without it.
-    """
+    """Directions of theta, at the start, about which the data contain no information."""
     parameters = task.system.parameters
     tested = ~np.isin(parameters.names, task.settings.hold)
     tested[CadPrior.of(parameters).columns] = False
-    return tested
-
-
-def _parts_that_determine(problem: FitProblem) -> Iterator[FitProblem]:
-    """Parts of the data that may determine all parameters, small ones first."""
-    count = len(problem.segments)
-    is_much = SMALL_SHARE * count >= SEGMENTS_OF_SMALL_SHARE
-    for share in (*[SMALL_SHARE] * is_much, *SHARES_THAT_DETERMINE):
-        wanted = int(share * count)
-        if wanted:
-            yield problem.of_segments(spread_over_data(count, wanted))
-        else:
-            yield problem.of_first_parts(share)
-
-
-def _stacked_sensitivity(
-    task: FitTask, problem: FitProblem, *, with_error: bool
-) -> tuple[Array, Array]:
-    """(n, p) rows of the sensitivity of some segments and of the priors, and their error.
-
-    Args:
-        task: The task.
-        problem: Problem of the segments.
-        with_error: Whether to simulate with a second difference step, which shows round-off.
-    """
-    begin, tested = problem.begin(task.start), _tested_parameters(task)
-    rows = sensitivity_rows(problem, begin, with_error=with_error, wanted=tested)
-    J = np.concatenate([row for row, _ in rows])
-    change = np.concatenate([error for _, error in rows])
-
-    # Priors are further rows, which have no error of finite differences.
-    prior = task.system.parameters.prior_rows
-    return np.concatenate([J, prior]), np.concatenate([change, np.zeros_like(prior)])
-
-
-def _null_space(task: FitTask, J: Array, change: Array) -> NullSpace:
-    """Directions of theta without effect on (n, p) rows, whose error is `change`.
-
-    Only tested parameters are in them.
-    """
-    parameters = task.system.parameters
-    free = np.flatnonzero(_tested_parameters(task))
+    free = np.flatnonzero(tested)
     count = len(free)
-    found = find_null_space(
-        J[:, free],
-        change[:, free],
-        parameters.magnitude[free],
-        parameters.scale[free],
-        np.arange(count),
-        np.zeros((count, count)),
-    )
+    if not count:
+        none = np.zeros((len(parameters), 0))
+        return NullSpace(directions=none, silent=(), basis=np.eye(len(parameters)), smallest=1.0)
+    for part, with_error in (
+        (problem.of_first_parts(SHARE_THAT_DETERMINES), False),
+        (problem, False),
+        (problem, True),
+    ):
+        begin = part.begin(task.start)
+        rows = sensitivity_rows(part, begin, with_error=with_error, wanted=tested)
+        # Priors are further rows, which have no error of finite differences.
+        prior = parameters.prior_rows
+        J = np.concatenate([*(row for row, _ in rows), prior])[:, free]
+        change = np.concatenate([*(error for _, error in rows), np.zeros_like(prior)])[:, free]
+        found = find_null_space(
+            J,
+            change,
+            parameters.magnitude[free],
+            parameters.scale[free],
+            np.arange(count),
+            np.zeros((count, count)),
+        )
+        is_clear = not found.count and found.smallest > CLEAR_SINGULAR_VALUE
+        if is_clear and not has_weak_column(J, parameters.magnitude[free]):
+            break
     directions = np.zeros((len(parameters), found.count))
     directions[free] = found.directions
     silent = tuple(free[list(found.silent)].tolist())

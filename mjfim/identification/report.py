@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +22,6 @@ from mjfim.identification.cad_prior import CadPrior
 from mjfim.identification.cross_validation import predict_unfitted
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_quality import FitQuality
-from mjfim.identification.fit_start import values_of_start
 from mjfim.identification.flipped_signs import (
     POOR_FIT,
     flipped_signs,
@@ -36,10 +34,11 @@ from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
 from mjfim.identification.recording_comparison import compare_recordings
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
+from mjfim.identification.starts import values_of_start
 from mjfim.identification.task import FitTask
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
-from mjfim.optimize.levenberg_marquardt import InterruptedPassError, Solution
+from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,
@@ -232,13 +231,10 @@ def _term_tests(result: FitResult, quality: FitQuality, budget: Budget) -> TermT
 
     There are none where the fit is too poor for the test, and none after a request to stop.
     """
-    tests = TermTests()
     if budget.stop.requested or quality.unexplained:
-        return tests
+        return TermTests()
 
-    with suppress(InterruptedPassError):
-        unknowns = result.solution.unknowns
-        tests = find_missing_terms(result.problem, result.task.recordings, unknowns)
+    tests = find_missing_terms(result.problem, result.task.recordings, result.solution.unknowns)
     return TermTests() if budget.stop.requested else tests
 
 
@@ -252,13 +248,11 @@ def _flipped_signs(result: FitResult, quality: FitQuality, budget: Budget) -> tu
     unknowns = result.solution.unknowns
     at = replace(unknowns, private=unknowns.private[result.subset])
     problem = result.problem.of_segments(result.subset)
-    with suppress(InterruptedPassError):
-        squares = 2.0 * problem.cost(at)
-        enough = sufficient_squares(squares, problem.value_count, noise_is_stated=noise_is_stated)
-        return flipped_signs(
-            result.task, result.problem, enough, result.subset, result.null_space, budget
-        )
-    return ()
+    squares = 2.0 * problem.cost(at)
+    enough = sufficient_squares(squares, problem.value_count, noise_is_stated=noise_is_stated)
+    return flipped_signs(
+        result.task, result.problem, enough, result.subset, result.null_space, budget
+    )
 
 
 def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:

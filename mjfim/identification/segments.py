@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError
+from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording
 from mjfim.identification.known_activations import KnownActivations
+from mjfim.model.parameters import ParameterSet
 from mjfim.plant.outputs import outputs_by_state
 
 # Number of measured rows before and after a time to which a polynomial is fitted, to find the state
@@ -28,6 +29,17 @@ MIN_SAMPLES = 4
 
 # Largest ratio of the lengths of segments that are simulated in one batch.
 MAX_LENGTH_RATIO = 1.1
+
+# Largest increase of a delay during the search, in prior standard deviations of its parameters, or
+# in their scales where there is no prior.
+MAX_DELAY_GROWTH = 5.0
+
+# Largest increase of a delay without a prior, relative to the duration of the shortest recording;
+# five samples of a fast log would be too short.
+MAX_DELAY_SHARE = 0.025
+
+# Multiples of the golden ratio, modulo 1, spread evenly without a period.
+GOLDEN_RATIO = 0.6180339887498949
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,6 +76,68 @@ class Segment:
             samples=min(max(samples, MIN_SAMPLES), self.samples),
             rows=slice(self.rows.start, last),
         )
+
+
+def has_free_starts(system: System) -> bool:
+    """Whether the initial states of segments are free, and begin at measured values."""
+    settings = system.experiment.fit
+    is_measured = settings.start != "stated" or settings.segment_length is not None
+    return is_measured or free_release(system)
+
+
+def stated_segments(
+    system: System, recordings: Sequence[AlignedRecording]
+) -> tuple[tuple[Segment, ...], Array]:
+    """Divide recordings into the segments that the table `[fit]` states.
+
+    Returns:
+        The segments, and (nx, n) directions in which their private unknowns move the initial state.
+
+    Raises:
+        ExperimentError: A parameter moves the initial state, which is measured.
+        RecordingError: The segments are too short.
+    """
+    parameters = system.parameters
+    by_theta = parameters.initial_state_derivative(system.space.nx)
+    if not has_free_starts(system):
+        return whole_recordings(system, recordings), by_theta[:, parameters.initial_deviations]
+
+    fit = system.experiment.fit
+    moves_start = by_theta.any(axis=0)
+    if moves_start.any():
+        name = parameters.names[int(np.argmax(moves_start))]
+        stated = "measured" if fit.start == "stated" else fit.start
+        raise ExperimentError(
+            f"{system.experiment.source}: {name}: the initial state is free where fit.segments or "
+            f'fit.start = "{stated}" is stated; remove nuisance.initial and '
+            "parameters of the initial state, or remove the settings of the fit"
+        )
+    return free_segments(system, recordings, fit.segment_length)
+
+
+def free_segments(
+    system: System, recordings: Sequence[AlignedRecording], length: float | None
+) -> tuple[tuple[Segment, ...], Array]:
+    """Cut recordings into segments with free initial states.
+
+    Args:
+        system: The system.
+        recordings: The recordings.
+        length: About the length of a segment [s]; None for whole recordings.
+
+    Returns:
+        The segments, and (nx, n) directions of a free initial state: all but the activations of
+        physical terms.
+
+    Raises:
+        RecordingError: The segments are too short.
+    """
+    space = system.space
+    known = [2 * space.nv + address for address in KnownActivations.of(system).addresses]
+    duration = min(float(recording.t[-1]) for recording in recordings)
+    lead = _max_delay(system.parameters, duration)
+    segments = cut_into_segments(system, recordings, length, lead)
+    return segments, np.delete(np.eye(space.nx), known, axis=1)
 
 
 def whole_recordings(system: System, recordings: Sequence[AlignedRecording]) -> tuple[Segment, ...]:
@@ -192,6 +266,37 @@ def _on_ticks(bounds: np.ndarray, ticks: int) -> np.ndarray:
         return bounds
     begins = np.unique(np.rint(bounds[:-1] / ticks).astype(int) * ticks)
     return np.append(begins[(begins == 0) | (begins <= bounds[-1] - MIN_SAMPLES)], bounds[-1])
+
+
+def _max_delay(parameters: ParameterSet, duration: float) -> float:
+    """Largest delay of the outputs that the search may try [s].
+
+    Args:
+        parameters: The parameters.
+        duration: Duration of the shortest recording [s].
+    """
+    per_parameter = parameters.delay_derivative
+    if not per_parameter.any():
+        return 0.0
+
+    growth = MAX_DELAY_GROWTH * np.array([p.prior or p.scale for p in parameters.parameters])
+    has_prior = np.array([p.prior is not None for p in parameters.parameters])
+    grows = ~has_prior & (per_parameter != 0.0)
+    share = MAX_DELAY_SHARE * duration / np.abs(per_parameter[grows])
+    growth[grows] = np.maximum(growth[grows], share)
+
+    latest = np.minimum(parameters.guess + growth, parameters.upper)
+    return max(float(per_parameter @ latest), 0.0)
+
+
+def spread_over_data(count: int, wanted: int) -> np.ndarray:
+    """Indices of some segments: one of each of equal stretches of the data, the first one included.
+
+    Recordings that repeat in turn, such as one of each joint, are not met in step.
+    """
+    stretch = np.arange(wanted)
+    place = stretch * GOLDEN_RATIO % 1.0 if wanted < count else 0.0
+    return np.unique(((stretch + place) * (count / wanted)).astype(np.intp))
 
 
 def measured_initial_states(

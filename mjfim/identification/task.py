@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -146,6 +146,19 @@ class FitTask:
             RecordingError: A recording cannot be used.
         """
         return FitProblem.of(self.system, self.held_out) if self.held_out else None
+
+
+def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTask:
+    """The task of fitting segments of a length.
+
+    Args:
+        task: The task.
+        length: The length [s], or "whole"; None for a length that the fit chooses.
+    """
+    system = task.system
+    settings = task.settings.model_copy(update={"segments": length})
+    experiment = system.experiment.model_copy(update={"fit": settings})
+    return replace(task, system=replace(system, experiment=experiment), settings=settings)
 
 
 def _require_held(system: System, names: Sequence[str]) -> None:

@@ -83,20 +83,6 @@ class WhitenedRows:
         residual = np.where(mask, rows.y - measured, 0.0)
         return self.noise.whiten_present(residual, mask)
 
-    def errors(self, rows: SegmentRows) -> list[Array]:
-        """Predicted minus measured values of some rows that count.
-
-        Args:
-            rows: Predictions.
-
-        Returns:
-            One array for each output [y-unit].
-        """
-        mask = self._mask_of(rows)
-        segment = self.simulation.segments[rows.segment]
-        difference = rows.y - self.simulation.recordings[segment.recording].y[rows.rows]
-        return [difference[mask[:, j], j] for j in range(difference.shape[1])]
-
     def linearised(self, rows: SegmentRows) -> LinearisedRows:
         """Whitened residuals of some rows and their derivatives by the unknowns.
 

@@ -30,7 +30,6 @@ from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability, IdentifiabilityTest
 from mjfim.information.marginal import shared
-from mjfim.optimize.levenberg_marquardt import completed
 from mjfim.parallel import ExecutorLike, one_blas_thread
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
@@ -163,7 +162,7 @@ def check_recordings(
     begin_stage("simulating the recordings")
     fit = FitProblem.of(system, recordings, data_only=True)
     if executor is not None:
-        fit = fit.on_workers(FitWorkers(executor, stop))
+        fit = fit.on_workers(FitWorkers(executor))
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     task = _task_along(recorded_release(system, longest), system, longest.ctrl[:MAX_TESTED_SAMPLES])
 
@@ -172,7 +171,7 @@ def check_recordings(
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
     # Rows of G at the times of the measurements, and the error of their finite differences.
-    recorded = completed(lambda: sensitivity_rows(fit, fit.begin(task.theta)))
+    recorded = sensitivity_rows(fit, fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
     count = len(recordings)
 

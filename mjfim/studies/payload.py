@@ -21,11 +21,10 @@ from mjfim.errors import ExperimentError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.honest_covariance import honest_covariance
-from mjfim.identification.horizons import with_length
 from mjfim.identification.identify import Callback, fit_task, identify_system
 from mjfim.identification.report import FitResult, estimate_from
-from mjfim.identification.searches import FitSearch
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitSearch
+from mjfim.identification.task import FitTask, with_length
 from mjfim.model.terms.base import AXES
 from mjfim.parallel import one_blas_thread
 from mjfim.records.estimate import Estimate

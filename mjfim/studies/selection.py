@@ -20,16 +20,14 @@ from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.continuation import WholeFit, is_doubtful
 from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction, held_out_losses
-from mjfim.identification.horizons import with_length
-from mjfim.identification.identify import Callback, fit_task, refit_task
+from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
 from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.identification.report import FitResult, estimate_from
-from mjfim.identification.searches import FitSearch
-from mjfim.identification.task import FitTask
+from mjfim.identification.search import FitSearch
+from mjfim.identification.task import FitTask, with_length
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError
 from mjfim.parallel import ExecutorLike, one_blas_thread
@@ -171,7 +169,7 @@ def select_terms_system(
             held_out=tuple(held_out),
             budget=Budget(stop=token),
             callback=callback,
-            workers=None if executor is None else FitWorkers(executor, token),
+            workers=None if executor is None else FitWorkers(executor),
             max_terms=max_terms,
         )
         task = FitTask.of(system, recordings, held_out=held_out)
@@ -319,8 +317,7 @@ class _Selector:
             is_free: Whether the length of the segments is left to the fit.
             is_changed: Whether the chosen model differs from the stated one.
         """
-        fit = WholeFit(problem=result.problem, solution=result.solution, quality=result.quality)
-        is_settled = not is_changed and not (is_free and is_doubtful(result.task, fit))
+        is_settled = not is_changed and not (is_free and is_doubtful(result))
         if is_settled or self._is_stopped():
             return result
         final = replace(result.task, start=result.theta, held_out=self.held_out)

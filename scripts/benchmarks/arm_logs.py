@@ -57,7 +57,7 @@ from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import fit_task, identify_system
 from mjfim.identification.linear_coordinates import LinearCoordinates
 from mjfim.identification.residual_tests import misfit_reasons
-from mjfim.identification.searches import FitSearch
+from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.inertia_distance import barycentric_of, logcholesky_factor

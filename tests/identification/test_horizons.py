@@ -14,9 +14,9 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.held_out_losses import HeldOutLosses
-from mjfim.identification.horizons import HorizonChoice, _chosen, choose_horizon
+from mjfim.identification.horizons import _chosen
 from mjfim.identification.identify import DIVERGED
-from mjfim.identification.searches import FitSearch
+from mjfim.identification.search import FitSearch
 from mjfim.output.summaries.horizons import describe_horizons
 from mjfim.records.estimate import HorizonStudy
 from mjfim.records.trajectory import Recording
@@ -173,22 +173,15 @@ def test_an_estimate_that_is_not_over_the_chosen_length_covers_it() -> None:
 def test_a_failed_fit_over_the_chosen_length_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     """The estimate is over whole recordings where segments were chosen but cannot be fitted."""
     solve = FitSearch.solve
-    choose = choose_horizon
-
-    def chosen_segments(*arguments: Any) -> HorizonChoice:
-        choice = choose(*arguments)
-        assert choice is not None
-        study = replace(choice.study, chosen=0)
-        return replace(choice, study=study, length=float(study.lengths[0]), theta=study.theta[0])
 
     def failing(
-        search: FitSearch, problem: Any, begin: Any, phase: str = "", *others: Any, **settings: Any
+        search: FitSearch, problem: Any, begin: Any, phase: str = "", **settings: Any
     ) -> Any:
         if not phase.startswith("segments of"):
-            return solve(search, problem, begin, phase, *others, **settings)
+            return solve(search, problem, begin, phase, **settings)
         raise SimulationDivergedError("it diverges")
 
-    monkeypatch.setattr("mjfim.identification.identify.choose_horizon", chosen_segments)
+    monkeypatch.setattr("mjfim.identification.horizons._chosen", lambda _: 0)
     monkeypatch.setattr(FitSearch, "solve", failing)
     found = mjfim.identify(stated(), recorded(0.6, 2))
     assert found.horizons is not None

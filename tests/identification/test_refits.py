@@ -16,7 +16,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.identify import fit_task, refit_task
 from mjfim.identification.missing_terms import TermTests
 from mjfim.identification.report import FitResult, estimate_from
-from mjfim.identification.searches import FitSearch
+from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
 from mjfim.records.events import FitEvent
 from mjfim.records.trajectory import Recording

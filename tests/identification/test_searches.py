@@ -13,15 +13,13 @@ import mjfim
 from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import searches, segment_simulation
+from mjfim.identification import segment_simulation
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.searches import FitSearch
+from mjfim.identification.search import FitSearch, first_subset
 from mjfim.identification.segment_simulation import SegmentBatch
-from mjfim.identification.subsets import first_subset
 from mjfim.identification.task import FitTask
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import (
-    InterruptedPassError,
     SearchSettings,
     Solution,
     UnknownValues,
@@ -258,112 +256,26 @@ def test_the_search_over_all_data_begins_where_all_data_cost_less(
     assert np.isfinite(problem.cost(found))
 
 
-def test_of_several_starts_the_stated_one_is_searched_as_far_as_the_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    shares = []
-
-    def recorded(problem: Any, begin: Any, settings: SearchSettings, *more: Any) -> Any:
-        """Search, and keep the settings."""
-        shares.append(settings.rough_share)
-        return minimise(problem, begin, settings, *more)
-
-    monkeypatch.setattr(searches, "minimise", recorded)
-    monkeypatch.setattr(FitSearch, "_from_random_starts", lambda *_: [])
-    problem = parts(3.0, 3.0)
-    search(starts=1, noise_is_stated=False).best_start(problem, begin_of(1.1))
-    search(starts=3, noise_is_stated=False).best_start(problem, begin_of(1.1))
-    assert shares[0] > 0.0
-    assert shares[1] == 0.0
-
-
-class Edge:
-    """Stands for the problem with estimated noise, beside whose begin the simulation diverges."""
-
-    def __init__(self, problem: Any, smallest: Array) -> None:
-        self.linearised = problem
-
-    def cost(self, at: UnknownValues) -> float:
-        """The begin itself can be simulated."""
-        return 1.0
-
-    def condense(self, at: UnknownValues) -> None:
-        """Differences cannot."""
-
-
-def test_a_search_that_ends_next_to_divergence_is_kept_where_the_noise_is_estimated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(searches, "EstimatedNoiseProblem", Edge)
-    problem = parts(3.0, 3.0)
-    searched = search(starts=1, noise_is_stated=False)
-    kept, found = searched.solve(problem, begin_of(1.1))
+def test_a_search_that_ends_next_to_divergence_is_kept_where_the_noise_is_estimated() -> None:
+    """The first search leads to its minimum, and differences there diverge with other noise."""
+    problem: Any = NoisyParts(segments=(2.5,) * 25)
+    kept, found = search(noise_is_stated=False).solve(problem, begin_of(1.1))
     assert kept is problem
     assert not found.success and "diverges next to the estimate" in found.status
-    assert found.unknowns.theta[0] == pytest.approx(3.0, abs=0.1)
+    assert found.unknowns.theta[0] == pytest.approx(2.5, abs=0.1)
 
 
-def test_a_judged_fit_that_is_stopped_before_it_converges_is_no_success(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Without a request to stop, it converges."""
-    problem: Any = parts(3.0, 3.0)
-    searched = search(starts=1, noise_is_stated=True)
-    found = minimise(problem, begin_of(1.1), SearchSettings())
-    assert found is not None
-    rough = replace(found, rough=True, status="near the minimum")
-    _, converged = searched.converged(problem, rough)
-    assert converged.success and not converged.rough and not converged.interrupted
+class NoisyParts(Parts):
+    """Segments that diverge as soon as their noise changes."""
 
-    monkeypatch.setattr(FitSearch, "interrupted", lambda _: True)
-    _, stopped = searched.converged(problem, rough)
-    assert stopped.interrupted and not stopped.success
-    assert "the best estimate so far" in stopped.status
+    noise = SimpleNamespace(sigma=np.ones(1), strides=np.ones(1, dtype=int))
+    value_count = 25
+    unknown_count = 1
 
+    def errors_at(self, at: UnknownValues) -> list[Array]:
+        """Errors of one output."""
+        return [self.residuals(at.theta[0]) + 0.5]
 
-class Stopped:
-    """Stands for the problem with estimated noise, whose first pass a request to stop ends."""
-
-    def __init__(self, problem: Any, smallest: Array) -> None:
-        self.linearised = problem
-
-    def cost(self, at: UnknownValues) -> float:
-        """The pass is not completed."""
-        raise InterruptedPassError
-
-
-def test_a_search_that_is_stopped_before_the_noise_is_estimated_is_no_success(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The search with the stated noise has converged, but its minimum is not the wanted one."""
-    monkeypatch.setattr(searches, "EstimatedNoiseProblem", Stopped)
-    problem: Any = parts(3.0, 3.0)
-    _, found = search(starts=1, noise_is_stated=False).solve(problem, begin_of(1.1))
-    assert found.interrupted and not found.success
-    assert "the best estimate so far" in found.status
-    assert found.unknowns.theta[0] == pytest.approx(3.0, abs=0.1)
-
-
-def test_a_robust_search_that_is_stopped_while_the_noise_is_estimated_is_no_success(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    searched = search(starts=1, noise_is_stated=False)
-    searched.task.settings.loss = "huber"
-    found = minimise(parts(3.0, 3.0), begin_of(1.1), SearchSettings())
-    assert found is not None and found.success
-    solutions = iter([found])
-
-    def interrupted(*_: Any) -> Solution:
-        """The first search converges, and a request to stop ends the first pass of the second."""
-        for solution in solutions:
-            return solution
-        raise InterruptedPassError
-
-    reweighted = SimpleNamespace(noise=SimpleNamespace(sigma=np.ones(1), strides=np.ones(1, int)))
-    reweighted.with_noise = lambda noise: reweighted
-    monkeypatch.setattr(FitSearch, "_minimise", interrupted)
-    monkeypatch.setattr(FitSearch, "_final_settings", lambda *_: SearchSettings())
-    monkeypatch.setattr(FitSearch, "_robust_sigma", lambda *_: np.array([2.0]))
-    _, stopped = searched.solve(reweighted, begin_of(1.1))
-    assert stopped.interrupted and not stopped.success
-    assert "the best estimate so far" in stopped.status
+    def with_noise(self, noise: Any) -> Parts:
+        """Segments that diverge."""
+        return replace(self, limit=-np.inf)

@@ -10,7 +10,7 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.spread_starts import SPREAD_STARTS, spread_starts
+from mjfim.identification.starts import SPREAD_STARTS, spread_starts
 from mjfim.records.trajectory import Recording
 from tests.identification.test_inverse_dynamics import CART, cart, cart_log
 

@@ -1,0 +1,396 @@
+"""Searches of one identification: over a subset, from several starts, and over all data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from mjfim.arrays import Array, evenly_spread_indices
+from mjfim.budget import Budget
+from mjfim.errors import SimulationDivergedError
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.segment_simulation import SAMPLES_FOR_ONE_SIDED
+from mjfim.identification.segments import spread_over_data
+from mjfim.identification.task import FitTask
+from mjfim.model.parameter_samples import sample_parameters
+from mjfim.optimize.levenberg_marquardt import (
+    IterationReport,
+    SearchSettings,
+    Solution,
+    UnknownValues,
+    minimise,
+)
+from mjfim.plant.noise import Noise
+from mjfim.records.events import FitEvent, begin_stage
+
+# Settings of the paper's Newton-Raphson iteration.
+NEWTON = SearchSettings(max_iterations=50, tolerance=1e-5, damped=False)
+
+# Length of a step [standard deviations] below which the search over all data has converged, and
+# that length with much data, where every linearisation takes long.
+FINAL_TOLERANCE = 1e-3
+FINAL_TOLERANCE_OF_MUCH_DATA = 1e-2
+
+# Number of samples that one linearisation simulates, with two-sided differences, above which the
+# amount of data is large.
+SAMPLES_OF_MUCH_DATA = SAMPLES_FOR_ONE_SIDED
+
+# Length of a step [standard deviations] at which the search over the first data ends, and decrease
+# of the cost, as a share of it, that its last step may bring.
+FIRST_TOLERANCE = 0.1
+FIRST_ROUGH_SHARE = 1e-3
+
+# That share where the stated noise is only the first guess.
+ROUGH_SHARE = 0.1
+
+# That share in a fit that is only compared with others by its predictions.
+COMPARED_ROUGH_SHARE = 1e-4
+
+# A search from a random start, or for initial states at given parameters.
+SHORT_SEARCH = SearchSettings(max_iterations=8, tolerance=1e-2, relinearise_at_end=False)
+INITIAL_STATES = replace(SHORT_SEARCH, tolerance=0.1, rough_share=0.01)
+
+# Iterations of the initial states of all segments, after theta was found on a subset of them, and
+# the share of each segment, at its begin, that is enough for them.
+INITIAL_STATE_ITERATIONS = 2
+INITIAL_STATE_SHARE = 0.2
+
+# Largest number of times that the noise is estimated, and relative change of a standard deviation
+# below which it stays.
+MAX_NOISE_ROUNDS = 10
+NOISE_TOLERANCE = 5e-4
+
+# Smallest estimated standard deviation, as a share of the stated one.
+MIN_NOISE_SHARE = 1e-3
+
+# Standard deviation of normal noise over its median absolute value.
+SIGMA_PER_MEDIAN = 1.4826
+
+# Factors by which the differences of the derivatives are longer where the residuals are rough, and
+# iterations with them.
+LONGER_DIFFERENCES = (100.0, 1000.0)
+ROUGH_ITERATIONS = 15
+
+# Number of samples of a subset of segments that is quick to simulate.
+QUICK_SAMPLES = 40_000
+
+# Share of the data on which the search begins, where that leaves enough samples, and the least
+# number of segments, which are half of the data at most.
+FIRST_SHARE = 0.25
+MIN_FIRST_SAMPLES = 2_000
+MIN_FIRST_SEGMENTS = 3
+
+# Number of samples, and least number of segments, that lead near enough to a minimum for a search
+# over all data to begin there.
+RESTART_SAMPLES = 3_000
+MIN_RESTART_SEGMENTS = 12
+
+Callback = Callable[[FitEvent], None]
+
+
+# ---- subsets of the segments
+
+
+def quick_subset(problem: FitProblem) -> np.ndarray:
+    """Indices of segments that are quick to simulate, evenly spread over the data."""
+    count = len(problem.segments)
+    wanted = max(min(QUICK_SAMPLES * count // problem.sample_count, count), 1)
+    return evenly_spread_indices(count, wanted)
+
+
+def first_subset(problem: FitProblem) -> np.ndarray:
+    """Indices of the segments on which the search begins, evenly spread over the data."""
+    quick = quick_subset(problem)
+    count = len(problem.segments)
+    wanted = max(int(FIRST_SHARE * count), MIN_FIRST_SEGMENTS)
+    enough = FIRST_SHARE * problem.sample_count >= MIN_FIRST_SAMPLES
+    if not enough or 2 * wanted > count:
+        return quick
+    return spread_over_data(count, min(wanted, len(quick)))
+
+
+def restart_subset(problem: FitProblem) -> np.ndarray:
+    """Indices of the segments of a fit that only leads to a start for another one."""
+    count = len(problem.segments)
+    wanted = max(RESTART_SAMPLES * count // problem.sample_count, MIN_RESTART_SEGMENTS)
+    return spread_over_data(count, min(wanted, count))
+
+
+def of_subset(at: UnknownValues, subset: np.ndarray) -> UnknownValues:
+    """The unknowns of some segments."""
+    return replace(at, private=at.private[subset])
+
+
+# ---- searches
+
+
+def _from_start(problem: FitProblem, budget: Budget, *, begin: UnknownValues) -> Solution | None:
+    """Short search from one start; None where the simulation diverges there."""
+    return minimise(problem, begin, SHORT_SEARCH, budget)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitSearch:
+    """Searches of one identification, which share a budget and report their iterations.
+
+    Attributes:
+        task: Task of the identification.
+        budget: Budget of all searches; its token ends them.
+        callback: Called after each iteration; None for no calls.
+        begins_near: Whether searches over all data begin near their minimum.
+    """
+
+    task: FitTask
+    budget: Budget
+    callback: Callback | None = None
+    begins_near: bool = False
+
+    @property
+    def interrupted(self) -> bool:
+        """True after a request to stop."""
+        return self.budget.stop.requested
+
+    def minimise(
+        self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
+    ) -> Solution | None:
+        """Search for a minimum, and report the iterations; None where the start diverges."""
+        callback = self.callback
+
+        def report(iteration: IterationReport) -> None:
+            """Report one iteration as an event."""
+            if callback is not None:
+                callback(
+                    FitEvent(
+                        phase=phase,
+                        iteration=iteration.iteration,
+                        cost=iteration.cost,
+                        step=iteration.step_length,
+                    )
+                )
+
+        return minimise(problem, begin, settings, self.budget, report)
+
+    def solve(
+        self,
+        problem: FitProblem,
+        begin: UnknownValues,
+        phase: str = "all data",
+        *,
+        is_rough: bool = False,
+        cost_to_beat: float = np.inf,
+    ) -> tuple[FitProblem, Solution]:
+        """Search over all data.
+
+        Args:
+            problem: The problem, with the stated noise.
+            begin: Unknowns at the begin.
+            phase: Name of the search in events.
+            is_rough: Whether the fit is only compared with others, so that few digits are enough.
+            cost_to_beat: Cost of another fit with the stated noise. A search without a chance to
+                cost less ends early.
+
+        Returns:
+            The problem, weighted with the noise of the fit, and the solution.
+
+        Raises:
+            SimulationDivergedError: The simulation diverges at the begin.
+        """
+        settings = self._settings(problem)
+        if is_rough:
+            settings = replace(
+                settings,
+                tolerance=FIRST_TOLERANCE,
+                rough_share=COMPARED_ROUGH_SHARE,
+                stagnant_share=COMPARED_ROUGH_SHARE,
+            )
+        if self.task.noise_is_stated:
+            settings = replace(settings, cost_to_beat=cost_to_beat)
+            return problem, self._found(problem, begin, settings, phase)
+
+        # The stated noise is only the first guess: its minimum is left as soon as it is near. The
+        # noise of the residuals weights them in the next search, until it stays the same.
+        first = replace(settings, relinearise_at_end=False, rough_share=ROUGH_SHARE)
+        solution = self._found(problem, begin, first, phase)
+        settings = replace(settings, begins_near=True)
+        for number in range(MAX_NOISE_ROUNDS):
+            sigma = self._residual_sigma(problem, solution.unknowns)
+            change = np.abs(sigma / problem.noise.sigma - 1.0).max()
+            if solution.interrupted or (number and change < NOISE_TOLERANCE):
+                break
+            noise = Noise(covariance=np.diag(sigma**2), strides=problem.noise.strides)
+            reweighted = problem.with_noise(noise)
+            found = self.minimise(
+                reweighted, solution.unknowns, settings, f"{phase}, noise estimated"
+            )
+            if found is None:
+                status = "stopped: the simulation diverges next to the estimate"
+                return problem, replace(solution, success=False, status=status)
+            problem, solution = reweighted, _after(solution, found)
+        return problem, solution
+
+    def best_start(self, problem: FitProblem, begin: UnknownValues) -> UnknownValues:
+        """Find where the search over all data begins: on a subset of them, from several starts.
+
+        Args:
+            problem: The problem of all data.
+            begin: Unknowns at the stated start.
+
+        Raises:
+            SimulationDivergedError: The simulation diverges at the stated start.
+        """
+        subset = first_subset(problem)
+        part = problem.of_segments(subset)
+        starts = self.task.settings.starts
+        is_whole = len(subset) == len(problem.segments)
+
+        # Initial states are estimated first; otherwise theta would compensate for their errors.
+        placed = self.with_initial_states(part, of_subset(begin, subset))
+        if is_whole and starts == 1:
+            return placed
+
+        # Costs of several starts can be compared only if all searches come close to their minimum.
+        rough_share = 0.0
+        if starts == 1:
+            rough_share = FIRST_ROUGH_SHARE if self.task.noise_is_stated else ROUGH_SHARE
+        settings = replace(
+            self._settings(part),
+            tolerance=FIRST_TOLERANCE,
+            relinearise_at_end=False,
+            rough_share=rough_share,
+        )
+        found = [self._found(part, placed, settings, "part of the data")]
+        found += self._from_random_starts(part)
+        best = min(found, key=lambda solution: solution.cost).unknowns
+        if is_whole:
+            return best
+
+        # The other segments may diverge at the theta that suits the subset, or contradict it.
+        private = np.array(begin.private)
+        private[subset] = best.private
+        whole = replace(best, private=private)
+        if self.interrupted:
+            return whole
+        first_parts = problem.of_first_parts(INITIAL_STATE_SHARE)
+        candidates = [
+            self.with_initial_states(first_parts, each, INITIAL_STATE_ITERATIONS)
+            for each in (whole, begin)
+        ]
+        return min(candidates, key=problem.cost)
+
+    def with_initial_states(
+        self,
+        problem: FitProblem,
+        begin: UnknownValues,
+        iterations: int = INITIAL_STATES.max_iterations,
+    ) -> UnknownValues:
+        """Unknowns with measured initial states improved for the given theta."""
+        if not problem.layout.free_starts or self.interrupted:
+            return begin
+        settings = replace(INITIAL_STATES, max_iterations=iterations)
+        found = self.minimise(problem.with_shared_held(), begin, settings, "initial states")
+        return begin if found is None else found.unknowns
+
+    def over_roughness(
+        self, problem: FitProblem, solution: Solution
+    ) -> tuple[FitProblem, Solution]:
+        """Continue a search that ended because no step lowered the cost.
+
+        Contacts and dry friction make residuals rough, over which longer differences reach.
+
+        Returns:
+            The problem of the last search and its solution; the given ones where the search had
+            converged, or where longer differences lead nowhere.
+        """
+        for factor in LONGER_DIFFERENCES:
+            if not solution.stuck or self.task.method == "newton" or self.interrupted:
+                break
+            longer = problem.with_longer_differences(factor)
+            settings = replace(self._settings(longer), max_iterations=ROUGH_ITERATIONS)
+            found = self.minimise(
+                longer, solution.unknowns, settings, "all data, longer differences"
+            )
+            if found is None:
+                break
+            found = _after(solution, found)
+            if found.success:
+                return longer, found
+
+            # A lower cost counts, but slopes that lead nowhere do not.
+            condensed = problem.condense(found.unknowns)
+            if condensed is not None and found.cost < solution.cost:
+                solution = replace(found, condensed=condensed)
+        return problem, solution
+
+    def _found(
+        self, problem: FitProblem, begin: UnknownValues, settings: SearchSettings, phase: str
+    ) -> Solution:
+        """Solution of a search. Raises SimulationDivergedError where its start diverges."""
+        found = self.minimise(problem, begin, settings, phase)
+        if found is None:
+            raise SimulationDivergedError(
+                f"the simulation diverges next to the start of the fit ({phase})"
+            )
+        return found
+
+    def _settings(self, problem: FitProblem) -> SearchSettings:
+        """Settings of a search that ends at the minimum."""
+        if self.task.method == "newton":
+            return NEWTON
+        is_linear = self.task.settings.loss == "linear"
+        samples = problem.sample_count * 2 * len(self.task.system.parameters)
+        is_much = samples >= SAMPLES_OF_MUCH_DATA
+        return SearchSettings(
+            max_iterations=self.task.settings.max_iterations,
+            tolerance=FINAL_TOLERANCE_OF_MUCH_DATA if is_much else FINAL_TOLERANCE,
+            relinearise_at_end=not is_much,
+            curved_rows=problem.curved_rows,
+            begins_near=self.begins_near,
+            in_true_deviations=True,
+            lengthens=not is_linear,
+        )
+
+    def _from_random_starts(self, problem: FitProblem) -> list[Solution]:
+        """Results of short searches from random parameters; those that diverge are left out."""
+        settings, system = self.task.settings, self.task.system
+        if settings.starts == 1 or self.interrupted:
+            return []
+        # The first sample is the stated start, which was searched before.
+        samples = sample_parameters(
+            system.parameters, self.task.start, settings.starts, settings.seed, system.impossible
+        )
+        works = [partial(_from_start, begin=problem.begin(theta)) for theta in samples[1:]]
+        searched = []
+        for number, solution in enumerate(problem.of_whole(works, self.budget), start=1):
+            begin_stage("searching from random starts", number, len(works))
+            searched.append(solution)
+        return [solution for solution in searched if solution is not None]
+
+    def _residual_sigma(self, problem: FitProblem, at: UnknownValues) -> Array:
+        """(ny,) standard deviations of the residuals, without outliers for a robust loss [y-unit].
+
+        Those of the problem where the simulation diverges, or where an output has no values.
+        """
+        sigma = np.array(problem.noise.sigma)
+        smallest = MIN_NOISE_SHARE * self.task.system.noise.sigma
+        # Fitted parameters make residuals smaller than the noise.
+        count = problem.value_count
+        correction = np.sqrt(count / max(count - problem.unknown_count, 1))
+        for j, errors in enumerate(problem.errors_at(at) or ()):
+            if len(errors):
+                spread = correction * np.sqrt(np.mean(errors**2))
+                if self.task.settings.loss != "linear":
+                    spread = SIGMA_PER_MEDIAN * np.median(np.abs(errors))
+                sigma[j] = max(float(spread), smallest[j])
+        return sigma
+
+
+def _after(first: Solution, found: Solution) -> Solution:
+    """A solution with the iterates of the search at whose end its own search began before them."""
+    return replace(
+        found,
+        iterates=(*first.iterates, *found.iterates[1:]),
+        iterations=first.iterations + found.iterations,
+    )
