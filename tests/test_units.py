@@ -244,7 +244,7 @@ def fit_in_units(rescaled: Rescaled, found: Estimate) -> dict[str, Any]:
         "std": found.std[:count] / factors,
         "sandwich": found.std_sandwich[:count] / factors,
         "chi2": found.chi2,
-        "term": [term.value / rescaled.units.factor(term.unit) for term in terms],
+        "term": [each.main.value / rescaled.units.factor(each.main.unit) for each in terms],
         "sigmas": [term.sigmas for term in terms],
         "status": found.status,
         "misfit": found.misfit,

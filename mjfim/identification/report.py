@@ -30,12 +30,12 @@ from mjfim.identification.flipped_signs import (
 )
 from mjfim.identification.honest_covariance import with_honest_covariance
 from mjfim.identification.laws_in_loop import laws_in_loop
-from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.identification.predictability import UnpredictableMotion, unpredictable_motion
 from mjfim.identification.recording_comparison import compare_recordings
 from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
 from mjfim.identification.starts import values_of_start
 from mjfim.identification.task import FitTask
+from mjfim.identification.terms import TermTests, find_missing_terms
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution
@@ -164,7 +164,7 @@ def estimate_from(
     Args:
         result: The fit.
         budget: Budget with the stop token.
-        refuted: Keys of terms (`MissingTerm.key`) that are not missing, because a fit or the
+        refuted: Keys of terms (`Term.key`) that are not missing, because a fit or the
             prediction of left-out data is no better with them. They are not named as missing terms,
             and are no reason for a misfit.
         tests: Tests of terms that this model may lack, where they are known; None to make them.

@@ -16,7 +16,7 @@ from mjfim.records.inverse_dynamics import InverseDynamicsFit
 from mjfim.records.labels import Labels
 from mjfim.records.payload import PayloadEstimate
 from mjfim.records.robots import RecordingComparison
-from mjfim.records.terms import MissingTerm, Selection, TermTestData
+from mjfim.records.terms import Selection, Term, TermTestData
 from mjfim.records.trajectory import Recording, Trajectory
 
 # Ratio of the errors over the longest and the shortest horizon above which they grow.
@@ -500,7 +500,7 @@ class Estimate(ShownRecord):
     worst_residual: WorstResidual | None = None
     predictions: tuple[Prediction, ...] = ()
     sloppy: tuple[str, ...] = ()
-    missing_terms: tuple[MissingTerm, ...] = ()
+    missing_terms: tuple[Term, ...] = ()
     per_recording: dict[str, tuple[float, ...]] = field(default_factory=dict)
     robust_uncertainty: Uncertainty | None = None
     motion: Trajectory | None = None

@@ -14,15 +14,17 @@ from mjfim.records.base import NamedEnum, Record, record
 
 
 @record
-class TermParameter(Record):
-    """A parameter that a term needs.
+class TermNumber(Record):
+    """A number of a term, for which a parameter of the experiment stands.
 
     Attributes:
         path: Target of the parameter.
-        value: Value where a search begins [unit].
+        value: Where a fit begins; of a number that a test has estimated, its estimated change
+            [unit].
         unit: Its unit; may be empty.
-        scale: Size of the parameter, larger than 0 [unit].
-        is_size: Whether it is one of the sizes of the term that its test has estimated.
+        scale: Size with which the parameter is compared [unit].
+        is_size: Whether a test has estimated it.
+        name: Name of the parameter in a selected model; empty before it has one.
     """
 
     path: str
@@ -30,6 +32,7 @@ class TermParameter(Record):
     unit: str
     scale: float
     is_size: bool = False
+    name: str = ""
 
     @property
     def table(self) -> dict[str, object]:
@@ -38,112 +41,94 @@ class TermParameter(Record):
 
 
 @record
-class AddedTerm(Record):
-    """A table `[terms.<name>]` that a term needs.
-
-    Attributes:
-        name: Name of the term.
-        kind: Its kind.
-        element: Key of the element on which it acts, such as `joint`; empty for the base.
-        element_name: Name of this element.
-        values: Values of fields that no parameter sets [unit of the field].
-    """
-
-    name: str
-    kind: str
-    element: str
-    element_name: str
-    values: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def table(self) -> dict[str, object]:
-        """The table in an experiment file."""
-        acts_on = {self.element: self.element_name} if self.element else {}
-        values = {"values": dict(self.values)} if self.values else {}
-        return {"kind": self.kind, **acts_on, **values}
-
-
-@record
-class MissingTerm(Record):
-    """A physical term that the model lacks and that would explain part of the residuals.
+class Term(Record):
+    """A physical term that a model lacks or to which it was added.
 
     Attributes:
         description: The term in words.
-        path: Target of a parameter that would add it.
-        value: Estimated value of that parameter [unit].
-        unit: Its unit; may be empty.
-        sigmas: `value` divided by its standard deviation; for a term with several parameters, the
-            size of the deviation of a normal variable with the same probability. For an elastic
-            joint or backlash, the root of the reduction of the sum of squares by the best of a few
-            values, which is no probability.
-        share: Fraction of the sum of squared residuals that the term explains, 0 to 1.
-        further: Further parameters that belong to the term.
-        added: Table of the library of terms that it needs; None for a number of the model.
-        more_added: The tables of further joints, where it is one kind of term at several joints.
-        joints: Names of these joints, that of the main parameter first; empty for a single term.
+        numbers: Its numbers; the first one is its size.
+        tables: Tables `[terms.<name>]` of the library that it needs, by name.
+        sigmas: Its size in standard deviations by the score test.
+        share: Share of the sum of squared residuals that it explains, 0 to 1.
+        joints: Names of the joints of one kind of term at several joints, that of the first number
+            first; empty for a single term.
         source: Publication that describes the term; may be empty.
     """
 
     description: str
-    path: str
-    value: float
-    unit: str
-    sigmas: float
-    share: float
-    further: tuple[TermParameter, ...] = ()
-    added: AddedTerm | None = None
-    more_added: tuple[AddedTerm, ...] = ()
+    numbers: tuple[TermNumber, ...]
+    tables: dict[str, dict[str, str | dict[str, float]]] = field(default_factory=dict)
+    sigmas: float = 0.0
+    share: float = 0.0
     joints: tuple[str, ...] = ()
     source: str = ""
+
+    @property
+    def main(self) -> TermNumber:
+        """The number that is the size of the term."""
+        return self.numbers[0]
+
+    @property
+    def path(self) -> str:
+        """Target of the main parameter."""
+        return self.main.path
 
     @property
     def key(self) -> str:
         """Key of the term; see `key_of_term`."""
         return key_of_term(self.path, self.description, self.joints)
 
-    def contains(self, other: MissingTerm) -> bool:
+    @property
+    def parameters(self) -> dict[str, dict[str, object]]:
+        """The tables of its parameters in an experiment file, by name."""
+        return {number.name: number.table for number in self.numbers}
+
+    def contains(self, other: Term) -> bool:
         """Whether this is a term at several joints, and another one is that of one of them.
 
         Args:
             other: The other term.
         """
-        sizes = {self.path, *(each.path for each in self.further if each.is_size)}
+        sizes = {number.path for number in self.numbers if number.is_size}
         return bool(self.joints) and not other.joints and other.path in sizes
 
     @property
     def recipe(self) -> str:
         """Lines of TOML to add to the experiment file, with a semicolon between them.
 
-        Of a term at several joints, the lines of the first joint stand for those of the others.
+        Of a term at several joints, those of the first one.
         """
-        tables = [] if self.added is None else [_toml_line("terms", self.added)]
         element = self.path.partition(":")[0]
-        own = [each.path for each in self.further if each.path.partition(":")[0] == element]
-        targets = [self.path, *(own if self.joints else (each.path for each in self.further))]
+        first = [each.path for each in self.numbers if each.path.partition(":")[0] == element]
+        targets = first if self.joints else [each.path for each in self.numbers]
+        tables = [f"terms.{name} = {_value(table)}" for name, table in self.tables.items()][:1]
         others = [f"the same for {listed(self.joints[1:])}"] if self.joints else []
         return "; ".join([*tables, *(f'target = "{path}"' for path in targets), *others])
 
     def __str__(self) -> str:
-        amount = f"{self.value:.2g} {self.unit}".strip()
+        amount = f"{self.main.value:.2g} {self.main.unit}".strip()
         share = f"{100 * self.share:.2g} % of the sum of squares"
         evidence = f"about {amount} ({self.sigmas:.0f} σ, {share})"
         return f"{self.description}, {evidence}; to estimate it, add: {self.recipe}"
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of one entry of `suspects` in estimate.json."""
-        found = {
+        """Return the term in estimate.json, as a suspect or with the names of its parameters."""
+        main, *further = self.numbers
+        found: dict[str, Any] = {
             "words": self.description,
-            "path": self.path,
-            "value": self.value,
-            "unit": self.unit,
+            "path": main.path,
+            "value": main.value,
+            "unit": main.unit,
             "sigmas": self.sigmas,
             "share": self.share,
         }
-        if self.further:
-            found["further"] = {each.path: each.value for each in self.further}
-        if self.added is not None:
-            tables = (self.added, *self.more_added)
-            found["terms"] = {table.name: table.table for table in tables}
+        if main.name:
+            names = {"name": main.name, "scale": main.scale, "parameters": self.parameters}
+            found |= names
+        if further:
+            found["further"] = {each.path: each.value for each in further}
+        if self.tables:
+            found["terms"] = self.tables
         if self.joints:
             found["joints"] = list(self.joints)
         return found
@@ -234,25 +219,11 @@ def key_of_term(path: str, description: str, joints: Sequence[str]) -> str:
     return f"{description}: {', '.join(sorted(joints))}" if joints else path
 
 
-def _toml_line(section: str, added: AddedTerm) -> str:
-    """A table in one line of TOML, such as `terms.x = { kind = "stribeck", joint = "pivot" }`.
-
-    Args:
-        section: Name of the table of tables.
-        added: The table.
-    """
-    return f"{section}.{added.name} = {_value(added.table)}"
-
-
-def _entries(table: Mapping[str, object]) -> str:
-    """Entries of a table in one line."""
-    return ", ".join(f"{key} = {_value(value)}" for key, value in table.items())
-
-
 def _value(value: object) -> str:
     """A value in TOML; numbers with two digits."""
     if isinstance(value, Mapping):
-        return f"{{ {_entries(value)} }}"
+        entries = ", ".join(f"{key} = {_value(entry)}" for key, entry in value.items())
+        return f"{{ {entries} }}"
     return f"{value:.2g}" if isinstance(value, float) else f'"{value}"'
 
 
@@ -273,52 +244,6 @@ class Decision(NamedEnum):
     def in_json(self) -> str:
         """The decision in JSON."""
         return str(self.value)
-
-
-@record
-class SelectedTerm(Record):
-    """A term that was added to a model, which parameters of the experiment stand for.
-
-    Attributes:
-        name: Name of its main parameter.
-        description: The term in words.
-        path: Target of the main parameter.
-        unit: Unit of the main parameter; may be empty.
-        scale: Size of the term [unit].
-        further: Its further parameters by name.
-        added: Table of the library of terms that it needs; None for a number of the model.
-        more_added: The tables of further joints, where it is one kind of term at several joints.
-        joints: Names of these joints, that of the main parameter first; empty for a single term.
-        source: Publication that describes the term; may be empty.
-    """
-
-    name: str
-    description: str
-    path: str
-    unit: str
-    scale: float
-    further: dict[str, TermParameter] = field(default_factory=dict)
-    added: AddedTerm | None = None
-    more_added: tuple[AddedTerm, ...] = ()
-    joints: tuple[str, ...] = ()
-    source: str = ""
-
-    @property
-    def table(self) -> dict[str, object]:
-        """The table of the main parameter in an experiment file."""
-        return {"target": self.path, "scale": self.scale}
-
-    @property
-    def parameters(self) -> dict[str, dict[str, object]]:
-        """The tables of all its parameters, by name."""
-        further = {name: parameter.table for name, parameter in self.further.items()}
-        return {self.name: self.table, **further}
-
-    @property
-    def terms(self) -> dict[str, dict[str, object]]:
-        """The tables of the library of terms that it needs, by name; empty without one."""
-        tables = () if self.added is None else (self.added, *self.more_added)
-        return {table.name: table.table for table in tables}
 
 
 @record
@@ -462,7 +387,7 @@ class Selection(Record):
             stated experiment decides on it.
     """
 
-    terms: tuple[SelectedTerm, ...]
+    terms: tuple[Term, ...]
     steps: tuple[SelectionStep, ...]
     ending: str
     pooled: tuple[PooledParameter, ...] = ()
@@ -510,7 +435,7 @@ class Selection(Record):
     @property
     def library_terms(self) -> dict[str, dict[str, object]]:
         """Tables of the library that the terms need, for `experiment.replace(terms=...)`."""
-        return {name: table for term in self.terms for name, table in term.terms.items()}
+        return {name: {**table} for term in self.terms for name, table in term.tables.items()}
 
     @property
     def tables(self) -> dict[str, dict[str, dict[str, object]]]:

@@ -15,18 +15,16 @@ from mjfim.experiment.system import System
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction
 from mjfim.identification.honest_covariance import with_honest_covariance
 from mjfim.identification.jackknife import student_quantile
-from mjfim.identification.missing_terms import TermTests
 from mjfim.identification.report import FitResult
+from mjfim.identification.terms import TermTests
 from mjfim.model.parameters import ParameterSet
 from mjfim.records.estimate import Estimate
 from mjfim.records.terms import (
     Decision,
-    MissingTerm,
     PooledParameter,
-    SelectedTerm,
     Selection,
     SelectionStep,
-    TermParameter,
+    Term,
 )
 from mjfim.studies.simplification import simplified_experiment
 
@@ -58,7 +56,7 @@ class FittedModel:
     result: FitResult
     losses: HeldOutLosses
     cost: float
-    terms: tuple[SelectedTerm, ...]
+    terms: tuple[Term, ...]
     pooled: tuple[PooledParameter, ...] = ()
     held: tuple[str, ...] = ()
     tests: TermTests | None = None
@@ -74,48 +72,20 @@ class FittedModel:
         return self.cost + sum(len(term.parameters) for term in self.terms)
 
 
-def selected_term(candidate: MissingTerm, taken: Iterable[str]) -> SelectedTerm:
-    """The term that a candidate stands for, with names of its parameters.
+def selected_term(candidate: Term, taken: Iterable[str]) -> Term:
+    """The term with names of its parameters, and with rounded sizes, which people read.
 
     Args:
-        candidate: The candidate.
-        taken: Names of the present parameters.
+        candidate: The term that tests have found.
+        taken: Names of the parameters that the model has already.
     """
-    name = _name_of(candidate.path, taken)
-    further: dict[str, TermParameter] = {}
-    for parameter in candidate.further:
-        used = {*taken, name, *further}
-        further[_name_of(parameter.path, used)] = parameter
-    return SelectedTerm(
-        name=name,
-        description=candidate.description,
-        path=candidate.path,
-        unit=candidate.unit,
-        scale=abs(candidate.value),
-        further=further,
-        added=candidate.added,
-        more_added=candidate.more_added,
-        joints=candidate.joints,
-        source=candidate.source,
-    )
-
-
-def as_recorded(term: SelectedTerm) -> SelectedTerm:
-    """A term with rounded sizes, for people to read; a size is no result.
-
-    Args:
-        term: The term.
-    """
-    further = {
-        name: replace(parameter, scale=_rounded(parameter.scale))
-        for name, parameter in term.further.items()
-    }
-    return replace(term, scale=_rounded(term.scale), further=further)
-
-
-def _rounded(size: float) -> float:
-    """A size with two digits."""
-    return float(f"{size:.2g}")
+    used = set(taken)
+    numbers = []
+    for number in candidate.numbers:
+        name = _name_of(number.path, used)
+        used.add(name)
+        numbers.append(replace(number, name=name, scale=float(f"{number.scale:.2g}")))
+    return replace(candidate, numbers=tuple(numbers))
 
 
 def selected_experiment(experiment: Experiment, selection: Selection) -> Experiment:
@@ -218,7 +188,7 @@ def stated_values(model: FittedModel, first: FittedModel) -> dict[str, float]:
     return {name: values[name] for name in stated if name in values}
 
 
-def tried_step(candidate: MissingTerm, model: FittedModel, reduction: Reduction) -> SelectionStep:
+def tried_step(candidate: Term, model: FittedModel, reduction: Reduction) -> SelectionStep:
     """Step of a term that was tried, before it is decided on.
 
     Args:
@@ -235,7 +205,7 @@ def tried_step(candidate: MissingTerm, model: FittedModel, reduction: Reduction)
     )
 
 
-def unhelpful_step(candidate: MissingTerm, count: int) -> SelectionStep:
+def unhelpful_step(candidate: Term, count: int) -> SelectionStep:
     """Step of a term with which the fit is no better, so that left-out data were not predicted.
 
     Args:

@@ -24,10 +24,10 @@ from mjfim.identification.fit_problem import have_same_initial_states
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.held_out_losses import HeldOutLosses, Reduction, held_out_losses
 from mjfim.identification.identify import Callback, fit_task, is_doubtful, refit_task
-from mjfim.identification.missing_terms import TermTests, find_missing_terms
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask, with_length
+from mjfim.identification.terms import TermTests, find_missing_terms
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError
 from mjfim.parallel import ExecutorLike, one_blas_thread
@@ -37,15 +37,13 @@ from mjfim.records.terms import (
     AlternativeTerm,
     Decision,
     HeldOutRefit,
-    MissingTerm,
-    SelectedTerm,
     Selection,
     SelectionStep,
+    Term,
 )
 from mjfim.records.trajectory import Recording
 from mjfim.studies.selected_models import (
     FittedModel,
-    as_recorded,
     different,
     pooled_values,
     poorly_known,
@@ -252,7 +250,7 @@ class _Selector:
             result = self._final(model.result, is_whole, is_changed=model.is_changed)
         result = _reported(result, is_free)
         selection = Selection(
-            terms=tuple(as_recorded(term) for term in model.terms),
+            terms=model.terms,
             steps=tuple(steps),
             ending=ending,
             pooled=model.pooled,
@@ -480,7 +478,7 @@ class _Selector:
         self,
         model: FittedModel,
         first: FittedModel,
-        candidates: Sequence[MissingTerm],
+        candidates: Sequence[Term],
         steps: list[SelectionStep],
     ) -> FittedModel | None:
         """The model with the one of some terms that predicts best; None where none is better."""
@@ -543,7 +541,7 @@ class _Selector:
             if not tested:
                 break
             begin_stage("testing whether all added terms are needed")
-            needless: list[tuple[Reduction, SelectedTerm, FittedModel]] = []
+            needless: list[tuple[Reduction, Term, FittedModel]] = []
             for term in tested:
                 fewer = self._without(model, first, term)
                 if fewer is None:
@@ -643,7 +641,7 @@ class _Selector:
         self,
         model: FittedModel,
         first: FittedModel,
-        candidate: MissingTerm,
+        candidate: Term,
         steps: list[SelectionStep],
     ) -> tuple[FittedModel, SelectionStep] | None:
         """The model with one term more, and the step that tried it, before it is decided on.
@@ -659,8 +657,7 @@ class _Selector:
         names = model.result.task.system.parameters.names
         term = selected_term(candidate, names)
         values = dict(zip(names, model.result.theta, strict=True))
-        starts = {name: parameter.value for name, parameter in term.further.items()}
-        changes = {term.name: candidate.value, **starts}
+        changes = {number.name: number.value for number in term.numbers}
         terms = (*model.terms, term)
         fit = self._refitted(model, first, terms, values, changes, sizes=_sizes_of(term))
         if fit is None or self._is_stopped():
@@ -677,9 +674,7 @@ class _Selector:
         reduction = model.losses.reduction(extended.losses)
         return extended, tried_step(candidate, extended, reduction)
 
-    def _without(
-        self, model: FittedModel, first: FittedModel, term: SelectedTerm
-    ) -> FittedModel | None:
+    def _without(self, model: FittedModel, first: FittedModel, term: Term) -> FittedModel | None:
         """The model without a term; None where it cannot be simulated, or after a stop.
 
         There is none either where a pool replaces parameters of the term, and where all other
@@ -702,7 +697,7 @@ class _Selector:
         self,
         model: FittedModel,
         first: FittedModel,
-        terms: tuple[SelectedTerm, ...],
+        terms: tuple[Term, ...],
         values: dict[str, float],
         changes: dict[str, float],
         sizes: Collection[str] = (),
@@ -855,13 +850,12 @@ def _refuted(steps: Sequence[SelectionStep]) -> Collection[str]:
     return Selection(terms=(), steps=tuple(steps), ending="").refuted
 
 
-def _sizes_of(term: SelectedTerm) -> set[str]:
+def _sizes_of(term: Term) -> set[str]:
     """Names of the parameters of a term that its test has estimated, which are its sizes.
 
     The others, such as a Stribeck speed, have no effect without them.
     """
-    further = {name for name, parameter in term.further.items() if parameter.is_size}
-    return {term.name, *further}
+    return {number.name for number in term.numbers if number.is_size}
 
 
 def _start_of(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,10 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
-from mjfim.identification import missing_terms
-from mjfim.identification.candidates import Candidate, CandidateParameter
 from mjfim.identification.identify import identify_system
 from mjfim.identification.task import FitTask
+from mjfim.identification.terms import find_missing_terms, score_tests
+from mjfim.identification.terms.candidates import Candidate, Effect
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array
 from tests.support.paths import ROOT
@@ -71,7 +70,7 @@ def test_the_missing_term_comes_first_and_in_about_its_size(
     assert rank == 0 or path.endswith("armature")  # the bob's inertia does nearly the same
     first = found.missing_terms[rank]
     assert first.sigmas > 5.0
-    assert amount / 2.0 < first.value < 2.0 * amount
+    assert amount / 2.0 < first.main.value < 2.0 * amount
     assert any(path in sentence for sentence in found.warnings)
 
 
@@ -85,7 +84,7 @@ def test_a_bias_and_a_delay_are_found(tmp_path: Path) -> None:
         task.system, [Recording(t=clean.t, ctrl=clean.ctrl, y=off, outputs=clean.outputs)]
     )
     assert biased.missing_terms[0].path == "output/qvel:hinge:bias"
-    assert biased.missing_terms[0].value == pytest.approx(0.03, rel=0.4)
+    assert biased.missing_terms[0].main.value == pytest.approx(0.03, rel=0.4)
     late = Recording(
         t=clean.t[2:] - clean.t[2], ctrl=clean.ctrl[2:], y=clean.y[:-2], outputs=clean.outputs
     )
@@ -147,14 +146,14 @@ def test_estimated_parameters_are_no_missing_terms(tmp_path: Path) -> None:
 
 def with_failing(failing: Candidate, monkeypatch: pytest.MonkeyPatch) -> None:
     """Test a further candidate between the others."""
-    usual = missing_terms.candidates_of
+    usual = score_tests.candidates_of
 
-    def extended(system: System, speeds: Array) -> Iterator[Candidate]:
+    def extended(system: System, speeds: Array) -> tuple[list[Candidate], list[str]]:
         """The candidates, of which the third one fails."""
-        found = list(usual(system, speeds))
-        yield from (*found[:2], failing, *found[2:])
+        found, impossible = usual(system, speeds)
+        return [*found[:2], failing, *found[2:]], impossible
 
-    monkeypatch.setattr(missing_terms, "candidates_of", extended)
+    monkeypatch.setattr(score_tests, "candidates_of", extended)
 
 
 @pytest.mark.parametrize("path", ["joint/pivot:stiffness", "joint/pivot:nothing"])
@@ -166,15 +165,13 @@ def test_a_candidate_that_diverges_or_is_invalid_is_named_and_hides_no_other(
     task = FitTask.resolve(stated, [rubbing_pendulum(tmp_path)], threads=1)
     problem = task.problem()
     at = problem.begin(task.start)
-    usual = missing_terms.find_missing_terms(problem, task.recordings, at)
+    usual = find_missing_terms(problem, task.recordings, at)
     assert usual.data is not None and not usual.data.untested
     assert "joint/pivot:frictionloss" in {term.path for term in usual.terms}
 
-    number = CandidateParameter(
-        path=path, unit="", positive=False, value=0.0, linearised_at=-1e9, size=1.0
-    )
+    number = Effect(path=path, unit="", value=-1e9, begin=-1e9, size=1.0)
     with_failing(Candidate(description="a strange spring", tested=(number,)), monkeypatch)
-    found = missing_terms.find_missing_terms(problem, task.recordings, at)
+    found = find_missing_terms(problem, task.recordings, at)
     assert found.data is not None and found.data.untested == ("a strange spring",)
     assert [term.path for term in found.terms] == [term.path for term in usual.terms]
     assert found.remark.endswith("cannot have it: a strange spring.")
@@ -186,9 +183,7 @@ def test_a_selection_says_which_terms_it_could_not_test(
 ) -> None:
     stated = experiment_of(tmp_path, "tilt", terms={}, parameters=DAMPED, fit={"bootstrap": 0})
     log = rubbing_pendulum(tmp_path)
-    number = CandidateParameter(
-        path="joint/pivot:nothing", unit="", positive=False, value=0.0, linearised_at=0.0, size=1.0
-    )
+    number = Effect(path="joint/pivot:nothing", unit="", value=0.0, begin=0.0, size=1.0)
     with_failing(Candidate(description="a strange spring", tested=(number,)), monkeypatch)
     found = mjfim.select_terms(stated, [log])
     assert found.selection is not None

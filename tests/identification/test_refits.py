@@ -14,10 +14,10 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.identification.identify import fit_task, refit_task
-from mjfim.identification.missing_terms import TermTests
 from mjfim.identification.report import FitResult, estimate_from
 from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask
+from mjfim.identification.terms import TermTests
 from mjfim.records.events import FitEvent
 from mjfim.records.trajectory import Recording
 from tests.support.paths import ROOT

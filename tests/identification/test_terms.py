@@ -13,12 +13,12 @@ import scipy
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.identification import missing_terms
 from mjfim.identification.aligned_recording import align
-from mjfim.identification.candidates import Candidate, CandidateParameter
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.known_activations import KnownActivations
-from mjfim.identification.missing_terms import equivalent_sigmas, find_missing_terms
+from mjfim.identification.terms import find_missing_terms, score_tests
+from mjfim.identification.terms.candidates import Candidate, Effect
+from mjfim.identification.terms.score_tests import equivalent_sigmas
 from mjfim.model.terms.library import KINDS
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
 from mjfim.studies.selected_models import selected_term
@@ -160,16 +160,16 @@ def test_the_missing_term_of_the_library_is_among_the_first(tmp_path: Path, kind
     # Score tests are linear, so that a selection of terms compares fits with the first ones.
     compared = [t for t in found if t.sigmas**2 >= SIMILAR_SHARE * found[0].sigmas ** 2]
     first = next(term for term in compared if term.path == MISSED[kind])
-    assert first.added is not None
-    assert first.added.kind == kind
+    ((name, stated_table),) = first.tables.items()
+    assert stated_table["kind"] == kind
     assert first.source in KINDS[kind].sources
 
     # What the term needs can be added as it is said.
     term = selected_term(first, system.parameters.names)
-    extended = System.resolve(stated.replace(parameters=term.parameters, terms=term.terms))
+    extended = System.resolve(stated.replace(parameters=term.parameters, terms=term.tables))
     assert set(term.parameters) < set(extended.parameters.names)
     table, *targets = first.recipe.split("; ")
-    assert tomllib.loads(table)["terms"][first.added.name]["kind"] == kind
+    assert tomllib.loads(table)["terms"][name]["kind"] == kind
     assert tomllib.loads(targets[0]) == {"target": first.path}
 
 
@@ -218,7 +218,7 @@ def test_many_candidates_are_tested_in_groups(
     whole = find_missing_terms(problem, logs, at).terms
     assert "output:delay" in {term.path for term in whole}
 
-    monkeypatch.setattr(missing_terms, "MAX_TESTED", 4)
+    monkeypatch.setattr(score_tests, "MAX_TESTED", 4)
     in_groups = find_missing_terms(problem, logs, at).terms
 
     # The last one may be any of several terms with the same effect, here a gain or a payload.
@@ -229,14 +229,12 @@ def test_many_candidates_are_tested_in_groups(
 
 @pytest.mark.parametrize("counts", [[], [1], [3] * 40, [1] * 100, [1] * 101, [1, 3, 1] * 41])
 def test_groups_hold_all_candidates_in_their_order(counts: list[int]) -> None:
-    number = CandidateParameter(
-        path="p", unit="", positive=False, value=0.0, linearised_at=0.0, size=1.0
-    )
+    number = Effect(path="p", unit="", value=0.0, begin=0.0, size=1.0)
     candidates = [
         Candidate(description=str(i), tested=(number,) * count) for i, count in enumerate(counts)
     ]
-    groups = missing_terms.in_groups(candidates)
+    groups = score_tests.in_groups(candidates)
     sizes = [sum(len(each.tested) for each in group) for group in groups]
     assert [each for group in groups for each in group] == candidates
-    assert max(sizes, default=0) <= missing_terms.MAX_TESTED
-    assert len(groups) <= sum(counts) // missing_terms.MAX_TESTED + 1
+    assert max(sizes, default=0) <= score_tests.MAX_TESTED
+    assert len(groups) <= sum(counts) // score_tests.MAX_TESTED + 1

@@ -10,9 +10,9 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.identification.candidates import Candidate, CandidateParameter
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.missing_terms import (
+from mjfim.identification.terms.candidates import Candidate, Effect
+from mjfim.identification.terms.score_tests import (
     MAX_NAMED_TERMS,
     MAX_TESTED,
     TermTests,
@@ -21,7 +21,7 @@ from mjfim.identification.missing_terms import (
     in_groups,
 )
 from mjfim.optimize.levenberg_marquardt import SearchSettings, minimise
-from mjfim.records.terms import MissingTerm, TermParameter
+from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording
 from mjfim.signals import multisine
 from mjfim.studies.selected_models import selected_term
@@ -114,11 +114,11 @@ def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: 
     first = tests.terms[0]
     assert first.description == "Stribeck friction at 3 joints"
     assert set(first.joints) == set(JOINTS)
-    assert len(first.more_added) == 2
+    assert len(first.tables) == 3
     assert np.isfinite(first.sigmas)
 
     # The test estimates the size at every joint.
-    values = {first.path: first.value} | {each.path: each.value for each in first.further}
+    values = {each.path: each.value for each in first.numbers}
     for joint, excess in zip(JOINTS, EXCESS, strict=True):
         assert 0.3 < values[f"term/{joint}_stribeck:excess"] / excess < 3.0
 
@@ -130,7 +130,7 @@ def test_friction_that_all_joints_lack_is_named_first_and_as_one_term(tmp_path: 
 
     # What the term needs can be added as one.
     term = selected_term(first, ())
-    extended = System.resolve(experiment.replace(parameters=term.parameters, terms=term.terms))
+    extended = System.resolve(experiment.replace(parameters=term.parameters, terms=term.tables))
     assert len(term.parameters) == 6
     assert set(term.parameters) < set(extended.parameters.names)
     assert len(first.summary()["terms"]) == 3
@@ -152,7 +152,7 @@ def test_friction_that_one_joint_lacks_is_a_term_of_this_joint(tmp_path: Path) -
     assert first == tests.terms[0]
     assert first.path == "term/lift_stribeck:excess"
     assert first.joints == ()
-    assert first.more_added == ()
+    assert len(first.tables) == 1
 
 
 @pytest.mark.slow
@@ -175,34 +175,30 @@ def test_a_selection_adds_the_friction_of_all_joints_in_one_step(tmp_path: Path)
 
 def test_terms_of_joints_that_follow_each_other_are_in_one_group() -> None:
     def candidate(kind: str) -> Candidate:
-        number = CandidateParameter(
-            path="p", unit="", positive=False, value=0.0, linearised_at=0.0, size=1.0
-        )
+        number = Effect(path="p", unit="", value=0.0, begin=0.0, size=1.0)
         return Candidate(description=kind, tested=(number,), kind=kind, joint=kind and "j")
 
     # By their number alone, the second group would begin within the terms of the joints.
     plain, of_joint = candidate(""), candidate("damping")
     candidates = [plain] * 60 + [of_joint] * 80
     assert [len(group) for group in in_groups(candidates)] == [60, 80]
-    assert [len(group) for group in in_groups([plain] * 140)] == [70, 70]
+    assert [len(group) for group in in_groups([plain] * 140)] == [MAX_TESTED, 40]
 
     # More of them than one linearisation tests are divided.
     assert max(len(group) for group in in_groups([of_joint] * 250)) <= MAX_TESTED
 
 
-def missing(path: str, *, sigmas: float, joints: tuple[str, ...] = ()) -> MissingTerm:
+def missing(path: str, *, sigmas: float, joints: tuple[str, ...] = ()) -> Term:
     """A significant term; one at several joints contains damping at them."""
     paths = [f"joint/{joint}:damping" for joint in joints[1:]]
-    return MissingTerm(
+    return Term(
         description=f"damping at {len(joints)} joints" if joints else path,
-        path=path,
-        value=1.0,
-        unit="",
+        numbers=tuple(
+            TermNumber(path=each, value=1.0, unit="", scale=1.0, is_size=True)
+            for each in (path, *paths)
+        ),
         sigmas=sigmas,
         share=0.1,
-        further=tuple(
-            TermParameter(path=each, value=1.0, unit="", scale=1.0, is_size=True) for each in paths
-        ),
         joints=joints,
     )
 

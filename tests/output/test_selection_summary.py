@@ -12,20 +12,19 @@ import pytest
 
 import mjfim
 from mjfim.experiment.system import System
-from mjfim.identification.missing_terms import TermTests
+from mjfim.identification.terms import TermTests
 from mjfim.output import html as page
 from mjfim.output.rerun import text
 from mjfim.output.summaries.selection import describe_selection
 from mjfim.output.summaries.verdicts import verdict_of
 from mjfim.output.summary_parts import Emphasis, Listing, Paragraph, Summary, SummaryTable
 from mjfim.records.terms import (
-    AddedTerm,
     AlternativeTerm,
     Decision,
-    SelectedTerm,
     Selection,
     SelectionStep,
-    TermParameter,
+    Term,
+    TermNumber,
 )
 from mjfim.studies.selected_models import selected_experiment
 from mjfim.studies.simplification import possible_pools
@@ -70,25 +69,22 @@ def test_the_tables_to_keep_state_the_selected_experiment() -> None:
     )
 
     # A number of the model, a term of the library with two parameters, a pool and held parameters.
-    further = {
-        "stribeck_speed": TermParameter(
-            path="term/elbow_stribeck:velocity", value=0.1, unit="rad/s", scale=1 / 3
-        )
-    }
-    stribeck = SelectedTerm(
-        name="stribeck_friction",
+    places = [("friction", "N", 0.1 + 0.2), ("velocity", "rad/s", 1 / 3)]
+    stribeck = Term(
         description="Stribeck friction of elbow",
-        path="term/elbow_stribeck:friction",
-        unit="N",
-        scale=0.1 + 0.2,
-        further=further,
-        added=AddedTerm(
-            name="elbow_stribeck",
-            kind="stribeck",
-            element="joint",
-            element_name="elbow",
-            values={"velocity": 1e-5},
+        numbers=tuple(
+            TermNumber(
+                name=f"stribeck_{name}",
+                path=f"term/elbow_stribeck:{name}",
+                value=0.1,
+                unit=unit,
+                scale=scale,
+            )
+            for name, unit, scale in places
         ),
+        tables={
+            "elbow_stribeck": {"kind": "stribeck", "joint": "elbow", "values": {"velocity": 1e-5}}
+        },
     )
     (pool,) = possible_pools(System.resolve(experiment).parameters, ("d1", "d2"))
     selection = Selection(
@@ -219,13 +215,17 @@ def test_a_term_at_several_joints_is_refuted_apart_from_that_of_its_first_joint(
         tried("joint/pan:damping", Decision.REJECTED, -reduction, joints),
     )
     selection = Selection(terms=(), steps=(BEGUN, *steps[::order]), ending="No further term.")
-    single = replace(results.missing_term(), path="joint/pan:damping")
+    pan, roll = (
+        (TermNumber(path=f"joint/{joint}:damping", value=0.1, unit="", scale=0.1),)
+        for joint in ("pan", "roll")
+    )
+    single = replace(results.missing_term(), numbers=pan)
     of_joints = replace(single, description="damping at 3 joints", joints=joints)
     left = TermTests(terms=(of_joints, single)).without(selection.refuted)
     assert left.terms == ((single,) if is_joint_refuted else (of_joints,))
 
     # The same joints in another order are the same term.
-    again = replace(of_joints, path="joint/roll:damping", joints=joints[::-1])
+    again = replace(of_joints, numbers=roll, joints=joints[::-1])
     assert (again.key in selection.refuted) == is_joint_refuted
 
 

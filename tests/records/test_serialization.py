@@ -118,7 +118,8 @@ class AwkwardValues:
         origin = get_origin(hint)
         if origin in (Union, UnionType):
             inner = next(entry for entry in get_args(hint) if entry is not NoneType)
-            return self.build(inner) if self.optional else None
+            is_given = self.optional or NoneType not in get_args(hint)
+            return self.build(inner) if is_given else None
         if origin is np.ndarray:
             shape = (self.count, self.next_of((1, 2, 3)))
             return np.array([self.next_of(NUMBERS) for _ in range(shape[0] * shape[1])]).reshape(

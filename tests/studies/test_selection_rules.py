@@ -11,8 +11,8 @@ import pytest
 
 from mjfim.budget import Budget
 from mjfim.identification.held_out_losses import Reduction
-from mjfim.identification.missing_terms import TermTests
-from mjfim.records.terms import Decision, MissingTerm, SelectionStep
+from mjfim.identification.terms import TermTests
+from mjfim.records.terms import Decision, SelectionStep, Term, TermNumber
 from mjfim.studies import selection
 from mjfim.studies.selection import EQUAL_COST, INTERRUPTED, _Selector
 
@@ -104,11 +104,9 @@ def test_tests_do_not_hold_after_a_request_to_stop() -> None:
     assert stopped._tests_of(model, model.result, model) is None
 
 
-CANDIDATE = MissingTerm(
+CANDIDATE = Term(
     description="dry friction of hinge",
-    path="joint/hinge:frictionloss",
-    value=0.1,
-    unit="N m",
+    numbers=(TermNumber(path="joint/hinge:frictionloss", value=0.1, unit="N m", scale=0.1),),
     sigmas=9.0,
     share=0.4,
 )

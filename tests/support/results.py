@@ -27,7 +27,7 @@ from mjfim.records.labels import Labels
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.robots import RobotComparison
 from mjfim.records.robustness import AssessedLimit, RobotConditions, Robustness
-from mjfim.records.terms import MissingTerm, SelectedTerm
+from mjfim.records.terms import Term, TermNumber
 from mjfim.records.trajectory import Recording, Trajectory
 from tests.support.made_records import make_recording_comparison, ten_iterates
 
@@ -43,12 +43,17 @@ BOUND = 1.125
 CORRELATION = 0.8
 
 # A term that a selection has added to the cart-pendulum.
-SLIDE_FRICTION = SelectedTerm(
-    name="slide_frictionloss",
+SLIDE_FRICTION = Term(
     description="dry friction of slide",
-    path="joint/slide:frictionloss",
-    unit="N",
-    scale=0.5,
+    numbers=(
+        TermNumber(
+            name="slide_frictionloss",
+            path="joint/slide:frictionloss",
+            value=0.5,
+            unit="N",
+            scale=0.5,
+        ),
+    ),
 )
 
 
@@ -212,13 +217,11 @@ def draws(std: Array) -> ParameterDraws:
     )
 
 
-def missing_term() -> MissingTerm:
+def missing_term() -> Term:
     """A term that the residuals ask for."""
-    return MissingTerm(
+    return Term(
         description="dry friction of the hinge",
-        path="joint/hinge:frictionloss",
-        value=0.1,
-        unit="N m",
+        numbers=(TermNumber(path="joint/hinge:frictionloss", value=0.1, unit="N m", scale=0.1),),
         sigmas=12.0,
         share=0.3,
     )

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mujoco
 import numpy as np
 import scipy
 
@@ -13,6 +14,7 @@ from mjfim.errors import ExperimentError
 from mjfim.model.sizes import model_length
 from mjfim.model.terms.term import (
     FieldDescription,
+    Shape,
     Term,
     TermQuantity,
     TermTable,
@@ -24,6 +26,15 @@ from mjfim.model.terms.term import (
 
 # Axes of the world, and of the frame of a body.
 AXES = ("x", "y", "z")
+
+# Places of a payload that are tested, as multiples of the vector from the origin of the body to its
+# centre of mass: the centre itself, and about the end of the body.
+PLACES = (1.0, 2.0)
+
+# Poses of the robot in which the directions of a body are compared, and their smallest difference
+# that counts; the directions have length 1.
+POSES = 8
+LEAST_TURN = 1e-6
 
 # Name of the body that does not move.
 WORLD = "world"
@@ -124,6 +135,10 @@ class Payload(Term):
         ),
     )
     sources = (ATKESON_1986,)
+    words = "a payload at {}"
+    size = "mass"
+    # Its mass would change the inertias at which terms with equal effects are compared.
+    alone = True
 
     body: str
 
@@ -161,8 +176,54 @@ class Payload(Term):
         )
         return cls(name=table.name, body=name, quantities=quantities)
 
+    @classmethod
+    def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:
+        """Places on a line through the centre of mass of a body that carries no moving one."""
+        body = int(model.body(element).id)
+        is_last = not any(
+            int(model.body_weldid[model.body_parentid[other]]) == body
+            for other in np.flatnonzero(model.body_jntnum)
+        )
+        if not model.body_jntnum[body] or not is_last:
+            return []
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        rotation = data.xmat[body].reshape(3, 3)
+        centre = rotation.T @ (data.subtree_com[body] - data.xpos[body])
+        # At the origin of the body, both places are the same.
+        is_apart = np.linalg.norm(centre) > LEAST_TURN * model_length(model)
+        estimated = tuple(AXES[i] for i in _axes_with_effect(model, body))
+        return [
+            (dict(zip(AXES, (share * centre).tolist(), strict=True)), estimated)
+            for share in (PLACES if is_apart else PLACES[:1])
+        ]
+
     def edit(self, spec: Any) -> None:
         """Add the body of the load."""
         mass, inertia = self.value("mass"), self.value("inertia")
         load = add_body(spec.body(self.body), self.name, mass, inertia, np.zeros(3))
         load.pos = [self.value(axis) for axis in AXES]
+
+
+def _axes_with_effect(model: mujoco.MjModel, body: int) -> tuple[int, ...]:
+    """Axes of a body along which the place of a load has an effect of its own.
+
+    Along an axis whose direction in the world never changes, such as that of the hinges of a planar
+    robot, the place changes neither the velocity of a load nor the work of gravity.
+    """
+    rng = np.random.default_rng(0)
+    data = mujoco.MjData(model)
+    directions = []
+    for _ in range(POSES):
+        data.qpos[:] = model.qpos0
+        mujoco.mj_integratePos(model, data.qpos, rng.standard_normal(model.nv), 1.0)
+        mujoco.mj_kinematics(model, data)
+        directions.append(data.xmat[body].reshape(3, 3).copy())
+
+    # Of the axes of a body that is turned against the hinges, as many have an effect of their own
+    # as there are directions in which a place has one; those with the largest effect come first.
+    turned = np.concatenate(directions[1:]) - np.tile(directions[0], (POSES - 1, 1))
+    _, R, order = scipy.linalg.qr(turned, mode="economic", pivoting=True)
+    count = int((np.abs(np.diag(R)) > LEAST_TURN).sum())
+    return tuple(sorted(order[:count].tolist()))

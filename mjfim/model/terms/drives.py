@@ -65,6 +65,10 @@ class ActuatorLag(Term):
         FieldDescription(name="time_constant", description="time constant of the lag", unit="s"),
     )
     sources = (KRAUSE_2013,)
+    words = "a lag of {}"
+    size = "time_constant"
+    words = "a lag of {}"
+    size = "time_constant"
 
     actuator: str
     explicit: bool

@@ -22,6 +22,7 @@ from mjfim.model.terms.term import (
     NEGLIGIBLE,
     FieldDescription,
     JointSizes,
+    Shape,
     Term,
     TermQuantity,
     TermTable,
@@ -100,6 +101,11 @@ class JointElasticity(Term):
         FieldDescription(name="damping", description="damping of the deflection", unit="N m s/rad"),
     )
     sources = (SPONG_1987,)
+    words = "elasticity of {}"
+    size = "compliance"
+    beside = "armature"
+    screened = True
+    estimated: ClassVar[tuple[str, ...]] = ("damping",)
     # MuJoCo keeps the stiffness, the inverse of the compliance.
     is_written_as_a_whole = True
     damping_ratio: ClassVar[float] = 0.1
@@ -113,6 +119,11 @@ class JointElasticity(Term):
     carrier: tuple[float, float]
     motors: tuple[str, ...]
     encoder: str
+
+    @classmethod
+    def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:
+        """A joint that a motor drives may be elastic."""
+        return [({}, cls.estimated)] if motors_at(model, int(model.joint(element).id)) else []
 
     @classmethod
     def of(cls, table: TermTable, model: Any, period: float) -> Self:
@@ -244,6 +255,9 @@ class Backlash(JointElasticity):
         ),
     )
     sources = (NORDIN_2002,)
+    words = "backlash of {}"
+    size = "gap"
+    estimated: ClassVar[tuple[str, ...]] = ()
     damping_ratio = 0.05
 
     @classmethod

@@ -20,6 +20,7 @@ from mjfim.model.integrators import is_rk4
 from mjfim.model.terms.term import (
     FieldDescription,
     JointSizes,
+    Shape,
     Term,
     TermQuantity,
     TermTable,
@@ -28,6 +29,9 @@ from mjfim.model.terms.term import (
     stated_quantities,
 )
 from mjfim.model.units import FORCE_UNITS, JOINT_FIELD_UNITS, per_second
+
+# Stribeck speeds that a test tries, over the root mean square of the speed of the joint.
+TRIED_SHARES = (0.03, 0.1, 0.3)
 
 # Stiffness of the bristle times the timestep squared over the inertia of the joint. The larger it
 # is, the shorter the displacement before sliding; above 1, an explicit step overshoots.
@@ -108,6 +112,13 @@ class _PassiveDevice(Term):
         )
 
     @classmethod
+    def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:
+        """Some Stribeck speeds, where the friction has one; none for a joint that stands still."""
+        if "speed" not in cls.places:
+            return [({}, ())]
+        return [({"speed": share * speed}, ("speed",)) for share in TRIED_SHARES if speed > 0.0]
+
+    @classmethod
     @abstractmethod
     def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
         """Fields where the table states nothing, without their numbers."""
@@ -180,6 +191,9 @@ class Stribeck(_PassiveDevice):
     )
     sources = (DE_WIT_1995, ARMSTRONG_1994)
     places: ClassVar[Places] = {"excess": ("biasprm[4]",), "speed": ("biasprm[5]",)}
+    words = "Stribeck friction of {}"
+    size = "excess"
+    beside = "frictionloss"
 
     @classmethod
     def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:
@@ -290,6 +304,9 @@ class AsymmetricFriction(_PassiveDevice):
     )
     sources = (ARMSTRONG_1994,)
     places: ClassVar[Places] = {"offset": ("biasprm[0]",)}
+    words = "friction of {} that differs by direction"
+    size = "offset"
+    beside = "frictionloss"
 
     @classmethod
     def _defaults(cls, at: JointSizes, model: Any) -> dict[str, TermQuantity]:

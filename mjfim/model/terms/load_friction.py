@@ -113,6 +113,16 @@ class LoadDependentFriction(Term):
         ),
     )
     sources = (DUCLAUSAUD_2025, GARCIA_2002)
+    words = "friction that grows with the torque of {}"
+    size = "coefficient"
+    beside = "frictionloss"
+    # Its contacts would slow down all simulations of the others.
+    alone = True
+    words = "friction that grows with the torque of {}"
+    size = "coefficient"
+    beside = "frictionloss"
+    # Its contacts would slow down all simulations of the others.
+    alone = True
 
     motors: tuple[str, ...]
     joint: str

@@ -25,6 +25,10 @@ NEGLIGIBLE = 1e-6
 ELEMENT_KEYS = ("joint", "actuator", "body")
 
 
+# Values of some fields of a term, and the names of those that a fit estimates.
+Shape = tuple[dict[str, float], tuple[str, ...]]
+
+
 @dataclass(frozen=True, kw_only=True)
 class FieldDescription:
     """A field of a kind of term, in words.
@@ -90,6 +94,11 @@ class Term(ABC):
         fields: Its fields.
         sources: Publications that describe it.
         is_written_as_a_whole: Whether some number of the model depends on several fields.
+        words: What a model lacks, with `{}` for the element; empty where no test looks for it.
+        size: Field that is zero, or hardly anything, without the term.
+        beside: Field of the joint that has to act there as well; empty for none.
+        alone: Whether other terms are tested without it, which it would disturb.
+        screened: Whether simulations with some sizes look for it in place of a linear test.
         name: Name of the term, and of the elements that it adds.
         quantities: Its fields, resolved against the model, by name.
     """
@@ -102,6 +111,11 @@ class Term(ABC):
     fields: ClassVar[tuple[FieldDescription, ...]]
     sources: ClassVar[tuple[str, ...]]
     is_written_as_a_whole: ClassVar[bool] = False
+    words: ClassVar[str] = ""
+    size: ClassVar[str] = ""
+    beside: ClassVar[str] = ""
+    alone: ClassVar[bool] = False
+    screened: ClassVar[bool] = False
 
     name: str
     quantities: tuple[tuple[str, TermQuantity], ...]
@@ -119,6 +133,21 @@ class Term(ABC):
         Raises:
             ExperimentError: The table does not fit the model; the message is a clause.
         """
+
+    @classmethod
+    def shapes(cls, model: Any, element: str, speed: float) -> list[Shape]:
+        """Values of other fields with which a test looks for the term at an element.
+
+        Args:
+            model: The stated model without terms.
+            element: Name of the element.
+            speed: Typical speed of its joint [m/s or rad/s].
+
+        Returns:
+            Values of some fields, and the names of those that a fit estimates besides the size;
+            none where the term has no effect.
+        """
+        return [({}, ())]
 
     @abstractmethod
     def edit(self, spec: Any) -> None:

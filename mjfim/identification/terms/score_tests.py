@@ -1,0 +1,489 @@
+"""Tests of physical terms that a model may lack.
+
+Most candidates (`mjfim/identification/terms/candidates.py`) have score tests. Each of their numbers
+has a column of sensitivities at the estimate. With the score g and the information I of the numbers
+of a term, both after the parameters are eliminated, the term would reduce the sum of squared
+residuals by `g' I^-1 g`, which is chi-squared distributed where the model is complete, and its
+estimated size is `-I^-1 g`. The columns are those of an extended model that has many of them.
+
+Terms that change the coordinates of the model, such as an elastic joint, have no such test. They
+are screened by simulations with some of their values.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array
+from mjfim.identification.fit_problem import FitProblem
+from mjfim.identification.terms.candidates import Candidate, candidates_of
+from mjfim.identification.terms.extended import (
+    extended_problem,
+    part_of_data,
+    with_stated_residuals,
+)
+from mjfim.optimize.levenberg_marquardt import UnknownValues
+from mjfim.records.terms import Term, TermNumber, TermTestData
+from mjfim.records.trajectory import Recording
+
+# Probability, over all candidates, that one is reported although the model is complete.
+SIGNIFICANCE = 1e-3
+
+# Smallest share of the sum of squared residuals that a reported term explains.
+MIN_EXPLAINED_SHARE = 2e-3
+
+# Largest number of numbers that one linearisation tests; more of them are tested in groups.
+MAX_TESTED = 100
+
+# Largest number of terms that an estimate names.
+MAX_NAMED_TERMS = 4
+
+# Terms whose significances differ by less than this share explain the residuals equally well. They
+# keep the order of the candidates, which rounding errors cannot change.
+EQUAL_SIGNIFICANCE = 1e-3
+
+# Smallest share of a term's information that remains after the parameters are eliminated. With
+# less, the term is not identifiable separately from the parameters.
+MIN_REMAINING_SHARE = 1e-8
+
+# Eigenvalues of the scaled information of the parameters below this share of the largest one count
+# as zero.
+INVERSE_TOLERANCE = 1e-12
+
+# Smallest column norm in a denominator.
+SMALLEST_NORM = 1e-300
+
+# Largest number of samples that a linearisation by parameters and candidates simulates, over all of
+# its differences. With more data, a part of every recording is enough for the tests.
+MAX_SIMULATED = 400_000
+
+# Fewest joints at which terms of one kind are tested together. With fewer, single terms are tried.
+FEWEST_JOINTS = 3
+
+# Samples of the motion from which the speeds of the joints are taken.
+SPEED_SAMPLES = 2000
+
+# Factor between successive values of a screened term, and the largest number of them.
+VALUE_FACTOR = 3.0
+MAX_VALUES = 6
+
+# Smallest reduction of the sum of squared residuals that counts, in squares of standard deviations.
+# It does not depend on the number of joints: with white residuals, chance exceeds it with less than
+# 1e-3 for all values of both terms at up to 140 joints.
+MIN_REDUCTION = 25.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TermTests:
+    """Result of the tests of all terms that a model may lack.
+
+    Attributes:
+        terms: The significant terms, most significant first.
+        data: The data on which they were tested; None before a test.
+    """
+
+    terms: tuple[Term, ...] = ()
+    data: TermTestData | None = None
+
+    @property
+    def named(self) -> tuple[Term, ...]:
+        """The terms that an estimate names: at most `MAX_NAMED_TERMS`, most significant first.
+
+        A term at several joints stands for those of its single joints after it.
+        """
+        return _without_members(self.terms)[:MAX_NAMED_TERMS]
+
+    def without(self, keys: Collection[str]) -> TermTests:
+        """The tests without the terms that have some keys (`Term.key`)."""
+        return replace(self, terms=tuple(term for term in self.terms if term.key not in keys))
+
+    @property
+    def remark(self) -> str:
+        """Sentences about what was not tested, each with a space before it; empty for none."""
+        if self.data is None:
+            return ""
+        about_data = "" if self.data.is_complete else str(self.data)
+        sentences = (about_data, self.data.untested_sentence, self.data.impossible_sentence)
+        return "".join(f" {sentence}" for sentence in sentences if sentence)
+
+
+def find_missing_terms(
+    problem: FitProblem, recordings: Sequence[Recording], at: UnknownValues
+) -> TermTests:
+    """Terms that would explain significant residuals.
+
+    Args:
+        problem: The least-squares problem of the estimate.
+        recordings: Its recordings.
+        at: Its solution.
+
+    Returns:
+        The significant terms that a selection may try, the most significant one first.
+    """
+    speeds = _typical_speeds(problem, at)
+    candidates, impossible = candidates_of(problem.system, speeds)
+    linear = [candidate for candidate in candidates if not candidate.screened]
+    apart = dict.fromkeys(["", *(candidate.alone for candidate in linear)])
+    groups = [
+        group
+        for kind in apart
+        for group in in_groups([each for each in linear if each.alone == kind])
+    ]
+    largest = max((sum(len(each.tested) for each in group) for group in groups), default=0)
+    columns = problem.layout.column_count + problem.simulation.private_count + largest
+    part = part_of_data(problem, MAX_SIMULATED / columns)
+    at = part.unknowns(at)
+    search = _TermSearch(
+        problem=part.problem,
+        recordings=recordings,
+        at=at,
+        squares=2.0 * part.problem.cost(at),
+        count=sum(len(group) for group in groups),
+    )
+    found, untested = search.by_score(groups)
+    screened = (search.screened(candidate) for candidate in candidates if candidate.screened)
+    found += [term for term in screened if term is not None]
+    return TermTests(
+        terms=first_terms(_by_significance(found)),
+        data=TermTestData(
+            share=part.share,
+            recordings=part.recording_count,
+            count=len(problem.recordings),
+            untested=tuple(dict.fromkeys(untested)),
+            impossible=tuple(impossible),
+        ),
+    )
+
+
+def first_terms(ordered: Sequence[Term]) -> tuple[Term, ...]:
+    """Select the terms that a selection tries or an estimate names from all significant ones.
+
+    Args:
+        ordered: All of them, most significant first.
+
+    Returns:
+        The first ones, and the first of those that no earlier one at several joints contains.
+    """
+    first = (*ordered[:MAX_NAMED_TERMS], *_without_members(ordered)[:MAX_NAMED_TERMS])
+    keys = {term.key for term in first}
+    return tuple(term for term in ordered if term.key in keys)
+
+
+def _without_members(ordered: Sequence[Term]) -> tuple[Term, ...]:
+    """The terms in their order, without those that an earlier one at several joints contains."""
+    kept: list[Term] = []
+    for term in ordered:
+        if not any(earlier.contains(term) for earlier in kept):
+            kept.append(term)
+    return tuple(kept)
+
+
+def _by_significance(terms: Sequence[Term]) -> list[Term]:
+    """Terms that explain enough, most significant first; equal ones in their given order."""
+    left = [term for term in terms if term.share > MIN_EXPLAINED_SHARE]
+    ordered = []
+    while left:
+        least = (1.0 - EQUAL_SIGNIFICANCE) * max(term.sigmas for term in left)
+        ordered += [term for term in left if term.sigmas >= least]
+        left = [term for term in left if term.sigmas < least]
+    return ordered
+
+
+def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Divide candidates into groups that are linearised one after the other.
+
+    Args:
+        candidates: The candidates.
+
+    Returns:
+        Groups of at most `MAX_TESTED` numbers, in the order of the candidates. Terms of joints are
+        together as far as possible, so that those of one kind can be tested together.
+    """
+    groups: list[list[Candidate]] = []
+    is_divided = sum(len(candidate.tested) for candidate in candidates) > MAX_TESTED
+    size, is_of_joint = MAX_TESTED, False
+    for candidate in candidates:
+        size += len(candidate.tested)
+        begins = is_divided and bool(candidate.joint) and not is_of_joint
+        if size > MAX_TESTED or begins:
+            groups.append([])
+            size = len(candidate.tested)
+        groups[-1].append(candidate)
+        is_of_joint = bool(candidate.joint)
+    return groups
+
+
+def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:
+    """(nv,) root mean square of the speeds along the first recording [m/s or rad/s]."""
+    first = problem.segments[0].recording
+    motion = problem.simulation.motion(at, first, SPEED_SAMPLES)
+    if motion is None:
+        return np.zeros(problem.system.space.nv)
+    return np.asarray(np.sqrt(np.mean(motion.qvel**2, axis=0)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Linearisation:
+    """Normal equations of parameters and candidates, columns scaled to length 1.
+
+    Attributes:
+        H: (m, m) information.
+        g: (m,) gradient.
+        norms: (m,) lengths of the columns.
+        columns: Columns of the tested numbers of each candidate.
+        others: Columns of the parameters.
+        inverse: Pseudo-inverse of their information.
+    """
+
+    H: Array
+    g: Array
+    norms: Array
+    columns: list[list[int]]
+    others: np.ndarray
+    inverse: Array
+
+    def tested(self, columns: Sequence[int]) -> tuple[Array, float] | None:
+        """Score test of some columns; None where the parameters may stand for one of them.
+
+        Returns:
+            Estimated changes of the numbers, and the reduction of the sum of squares.
+        """
+        H, others, tested = self.H, self.others, np.array(columns)
+
+        # Information and score after the parameters are eliminated.
+        response = self.inverse @ H[np.ix_(others, tested)]
+        information = H[np.ix_(tested, tested)] - H[np.ix_(tested, others)] @ response
+        score = self.g[tested] - self.g[others] @ response
+        least = MIN_REMAINING_SHARE * np.diag(H)[tested]
+        if not (np.diag(information) > least).all():
+            return None
+        step = -np.linalg.pinv(information, rcond=INVERSE_TOLERANCE, hermitian=True) @ score
+        return step / self.norms[tested], float(-score @ step)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _TermSearch:
+    """Tests at the solution of a problem.
+
+    Attributes:
+        problem: The least-squares problem.
+        recordings: Its recordings.
+        at: Its solution.
+        count: Number of candidates with score tests.
+        squares: Sum of squared residuals at the solution.
+    """
+
+    problem: FitProblem
+    recordings: Sequence[Recording]
+    at: UnknownValues
+    count: int
+    squares: float
+
+    def by_score(self, groups: Sequence[Sequence[Candidate]]) -> tuple[list[Term], list[str]]:
+        """Terms whose score tests are significant, and descriptions of those without a test.
+
+        Of variants of one term, the most significant one stands for it. Terms of one kind at
+        several joints are tested together as well.
+        """
+        found: dict[str, Term] = {}
+        of_joints: list[Term] = []
+        untested: list[str] = []
+        parts = (self._linearised(group) for group in groups)
+        for candidates, linearisation in itertools.chain.from_iterable(parts):
+            if linearisation is None:
+                untested += [candidate.description for candidate in candidates]
+                continue
+            members: dict[str, int] = {}
+            for index, candidate in enumerate(candidates):
+                term = self._term(linearisation, candidates, [index])
+                path = candidate.tested[0].path
+                if term is not None and (path not in found or term.sigmas > found[path].sigmas):
+                    found[path], members[path] = term, index
+            ordered = sorted(members, key=lambda path: -found[path].sigmas)
+            kinds: dict[str, list[int]] = {}
+            for index in (members[path] for path in ordered):
+                kinds.setdefault(candidates[index].kind, []).append(index)
+            for kind, of_kind in kinds.items():
+                together = self._term(linearisation, candidates, of_kind) if kind else None
+                of_joints += [together] if together is not None and together.joints else []
+        return [*found.values(), *of_joints], untested
+
+    def _linearised(
+        self, candidates: Sequence[Candidate]
+    ) -> Iterator[tuple[Sequence[Candidate], _Linearisation | None]]:
+        """Linearise by a group of candidates, and by parts of it where one of them prevents it."""
+        linearisation = self._linearise(candidates)
+        if linearisation is not None or len(candidates) <= 1:
+            yield candidates, linearisation
+            return
+        middle = len(candidates) // 2
+        yield from self._linearised(candidates[:middle])
+        yield from self._linearised(candidates[middle:])
+
+    def _linearise(self, candidates: Sequence[Candidate]) -> _Linearisation | None:
+        """Linearise by parameters and candidates; None where the extended model diverges."""
+        parameters: dict[str, Any] = {}
+        tables: dict[str, Any] = {}
+        for i, candidate in enumerate(candidates):
+            # Variants of one term have the same name, but here each has its own.
+            for name, table in candidate.tables.items():
+                tables[f"?{i}{name}"] = table
+            for k, number in enumerate(candidate.tested):
+                target = re.sub("^term/", f"term/?{i}", number.path)
+                parameters[f"?{i}.{k}"] = {
+                    "target": target,
+                    "guess": number.begin,
+                    "scale": number.size,
+                }
+        extended = extended_problem(self.problem, self.recordings, self.at, parameters, tables)
+        if extended is None:
+            return None
+        wider, begin = extended
+        shifted = with_stated_residuals(self.problem, self.at, wider, begin)
+        condensed = None if shifted is None else shifted.condense(begin)
+        if condensed is None:
+            return None
+
+        names = wider.system.parameters.names
+        column_of = {names[j]: i for i, j in enumerate(wider.layout.parameter_of_column.tolist())}
+        columns = [
+            [column_of[f"?{i}.{k}"] for k in range(len(candidate.tested))]
+            for i, candidate in enumerate(candidates)
+        ]
+        tested = [column for of_candidate in columns for column in of_candidate]
+        rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
+        norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
+        J = rows[:, :-1] / norms
+        H = J.T @ J
+        # The parameters are eliminated by the pseudo-inverse of their information.
+        others = np.setdiff1d(np.arange(len(H)), tested)
+        about_others = H[np.ix_(others, others)]
+        inverse = np.linalg.pinv(about_others, rcond=INVERSE_TOLERANCE, hermitian=True)
+        return _Linearisation(
+            H=H, g=J.T @ rows[:, -1], norms=norms, columns=columns, others=others, inverse=inverse
+        )
+
+    def _term(
+        self,
+        linearisation: _Linearisation,
+        candidates: Sequence[Candidate],
+        indices: Sequence[int],
+    ) -> Term | None:
+        """Score test of one candidate, or of several of one kind; None if it is not significant.
+
+        Of several, those are left out that would have a value that makes no sense.
+        """
+        left = list(indices)
+        fewest = 1 if len(left) == 1 else FEWEST_JOINTS
+        while len({candidates[i].joint for i in left}) >= fewest:
+            columns = [column for i in left for column in linearisation.columns[i]]
+            found = linearisation.tested(columns)
+            if found is None:
+                return None
+            values, explained = found
+            changes = iter(values.tolist())
+            numbers: list[TermNumber] = []
+            possible = []
+            for i in left:
+                own = [(number, next(changes)) for number in candidates[i].tested]
+                if not any(n.positive and n.value + change < 0.0 for n, change in own):
+                    possible.append(i)
+                for number, change in own:
+                    numbers.append(
+                        TermNumber(
+                            path=number.path,
+                            value=change,
+                            unit=number.unit,
+                            scale=abs(change) or number.size,
+                            is_size=True,
+                        )
+                    )
+                numbers += candidates[i].further
+            if possible == left:
+                break
+            left = possible
+        else:
+            return None
+
+        sigmas = equivalent_sigmas(explained, len(columns))
+        is_unlikely = sigmas > -scipy.special.ndtri(0.5 * SIGNIFICANCE / self.count)
+        if not (is_unlikely and MIN_EXPLAINED_SHARE < explained / self.squares < 1.0):
+            return None
+        members = [candidates[i] for i in left]
+        # Two drivers may act on the same joint.
+        joints = tuple(dict.fromkeys(member.joint for member in members))
+        is_single = len(members) == 1
+        words = (
+            members[0].description if is_single else f"{members[0].kind} at {len(joints)} joints"
+        )
+        return Term(
+            description=words,
+            numbers=tuple(numbers),
+            tables={name: table for each in members for name, table in each.tables.items()},
+            sigmas=sigmas,
+            share=explained / self.squares,
+            joints=() if is_single else joints,
+            source=members[0].source,
+        )
+
+    def screened(self, candidate: Candidate) -> Term | None:
+        """A term with its best value; None where no value is better than none."""
+        (tested,) = candidate.tested
+        extended = extended_problem(
+            self.problem, self.recordings, self.at, {"?": {"target": tested.path}}, candidate.tables
+        )
+        if extended is None:
+            return None
+        wider, begin = extended
+        place = wider.system.parameters.names.index("?")
+        best, least = 0.0, self.squares
+        for k in range(MAX_VALUES):
+            theta = np.array(begin.theta)
+            theta[place] = tested.begin * VALUE_FACTOR**k
+            cost = 2.0 * wider.cost(replace(begin, theta=theta))
+            if cost < least:
+                best, least = float(theta[place]), cost
+            elif best > 0.0:
+                break
+        reduction = self.squares - least
+        if not best or reduction < MIN_REDUCTION:
+            return None
+        number = TermNumber(
+            path=tested.path, value=best, unit=tested.unit, scale=best, is_size=True
+        )
+        return Term(
+            description=candidate.description,
+            numbers=(number, *candidate.further),
+            tables=candidate.tables,
+            sigmas=float(np.sqrt(reduction)),
+            share=reduction / self.squares,
+            source=candidate.source,
+        )
+
+
+def equivalent_sigmas(explained: float, count: int) -> float:
+    """Deviation of a normal variable that is as improbable as a chi-squared value.
+
+    Args:
+        explained: The chi-squared value.
+        count: Its degrees of freedom.
+    """
+    if count == 1:
+        return float(np.sqrt(max(explained, 0.0)))
+    with np.errstate(divide="ignore"):
+        log_probability = np.log(scipy.special.chdtrc(count, max(explained, 0.0)))
+
+    # Far out, the probability is below the smallest number. Then its expansion is exact enough
+    # (Abramowitz and Stegun, Handbook of Mathematical Functions, 1964, 6.5.32).
+    if not np.isfinite(log_probability):
+        half, shape = 0.5 * explained, 0.5 * count
+        log_probability = (shape - 1.0) * np.log(half) - half - scipy.special.gammaln(shape)
+        log_probability += np.log1p((shape - 1.0) / half)
+    return float(-scipy.special.ndtri_exp(log_probability - np.log(2.0)))
