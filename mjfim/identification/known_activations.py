@@ -17,7 +17,7 @@ import scipy
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording
-from mjfim.identification.steady_bristles import bristles_of
+from mjfim.identification.bristles import bristles_of
 from mjfim.model.terms.extension import FILTERS
 
 

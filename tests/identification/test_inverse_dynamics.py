@@ -391,21 +391,8 @@ def test_stribeck_friction_is_found_without_a_first_value(kind: str, tmp_path: P
     # The guess has no excess, so that the rows do not depend on the Stribeck speed there.
     assert system.parameters.guess[2] == 0.0
     fit = inverse_dynamics(experiment, [log])
-    damping, coulomb_friction, excess, speed = fit.theta
-    assert damping == pytest.approx(0.3, rel=0.1)
-    assert coulomb_friction == pytest.approx(0.5, rel=0.1)
-    assert 0.5 < excess / 0.4 < 2.0
-    assert 0.5 < speed / 0.15 < 2.0
-
-    # The accuracy of the others contains that the Stribeck speed is hardly known.
-    error = np.abs(fit.theta - true)[:3]
-    assert (error < 3.0 * fit.std[:3]).all()
-    assert (error > 0.01 * fit.std[:3]).all()
-
-    # The Stribeck speed is chosen from a few values, and its accuracy is not stated.
-    assert "speed" in fit.undetermined
-    assert "speed" not in fit.absent
-    assert np.isinf(fit.std[3])
+    np.testing.assert_allclose(fit.theta, true, rtol=0.02)
+    assert (np.abs(fit.theta - true) < 5.0 * fit.std).all()
 
 
 def stribeck_servo(folder: Path, **of_friction: dict[str, Any]) -> tuple[Experiment, Recording]:
@@ -455,7 +442,5 @@ def test_stated_bounds_priors_and_factors_of_stribeck_friction_hold(
     factor = 0.01 if "targets" in of_friction.get("speed", {}) else 1.0
     assert fit.theta[0] == pytest.approx(0.4, rel=0.2)
     assert factor * fit.theta[1] == pytest.approx(0.15, rel=0.2)
-
-    # Only a speed that is chosen from a few values has no stated accuracy.
-    assert np.isinf(fit.std[1]) == (not of_friction)
+    assert np.isfinite(fit.std).all()
     assert fit.std[1] > 0.0

@@ -10,7 +10,7 @@ import pytest
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.identification.aligned_recording import align
-from mjfim.identification.measured_motion import MeasuredMotion, measured_motion
+from mjfim.identification.inverse_dynamics.motion import MeasuredMotion, measured_motion
 from mjfim.records.trajectory import Recording
 from tests.support.numerics import Array, body_task, cart_task
 

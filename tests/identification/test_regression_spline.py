@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjfim.identification.regression_spline import Readings, RegressionSpline, fit_splines
+from mjfim.identification.inverse_dynamics.spline import Readings, RegressionSpline, fit_spline
 from tests.support.numerics import Array
 
 RATE, SECONDS = 200.0, 10.0
@@ -20,14 +20,11 @@ def curve(t: Array, derivative: int = 0) -> Array:
     return total
 
 
-def readings(
-    t: Array, sigma: float, derivative: int = 0, seed: int = 0, curves: int = 1
-) -> Readings:
+def readings(t: Array, sigma: float, derivative: int = 0, seed: int = 0) -> Readings:
     """Noisy readings of the curve or of its slope."""
-    noise = np.random.default_rng(seed).standard_normal((len(t), curves))
-    values = curve(t, derivative)[:, None] + sigma * noise
-    sizes = np.full(curves, sigma or 1.0)
-    return Readings(t=t, values=values, sigma=sizes, derivative=derivative)
+    noise = np.random.default_rng(seed).standard_normal(len(t))
+    values = curve(t, derivative) + sigma * noise
+    return Readings(t=t, values=values, sigma=sigma or 1.0, derivative=derivative)
 
 
 def grid() -> Array:
@@ -42,7 +39,7 @@ def inner_error(spline: RegressionSpline, derivative: int) -> float:
 
 
 def test_values_without_noise_are_followed() -> None:
-    spline = fit_splines([readings(grid(), 1e-9)], np.zeros(1))[0]
+    spline = fit_spline([readings(grid(), 1e-9)])
     assert inner_error(spline, 0) < 1e-8
     assert inner_error(spline, 2) < 1e-4
 
@@ -53,8 +50,8 @@ def test_noise_is_averaged_and_its_size_found(sigma: float) -> None:
     inner = np.linspace(0.5, SECONDS - 0.5, 300)
     squares, splines = [], []
     for seed in range(8):
-        noisy = fit_splines([readings(t, sigma, seed=seed)], np.zeros(1))[0]
-        exact = fit_splines([readings(t, 0.0)], np.zeros(1), spacing=noisy.spacing)[0]
+        noisy = fit_spline([readings(t, sigma, seed=seed)])
+        exact = fit_spline([readings(t, 0.0)], spacing=noisy.spacing)
         squares.append(np.mean((noisy.at(inner, 1) - exact.at(inner, 1)) ** 2))
         splines.append(noisy)
     assert inner_error(splines[0], 0) < 0.5 * sigma
@@ -69,17 +66,17 @@ def test_velocities_improve_velocities() -> None:
     t = grid()
     positions = readings(t, 1e-2)
     velocities = readings(t, 2e-2, derivative=1, seed=1)
-    alone = fit_splines([positions], np.zeros(1))[0]
-    both = fit_splines([positions, velocities], np.zeros(1))[0]
+    alone = fit_spline([positions])
+    both = fit_spline([positions, velocities])
     assert inner_error(both, 1) < 0.5 * inner_error(alone, 1)
 
 
 def test_velocities_alone_begin_at_the_anchor() -> None:
     t = grid()
-    anchors = curve(t[:1])
-    spline = fit_splines([readings(t, 1e-9, derivative=1)], anchors)[0]
+    anchor = float(curve(t[:1])[0])
+    spline = fit_spline([readings(t, 1e-9, derivative=1)], anchor)
     assert inner_error(spline, 0) < 1e-6
-    moved = fit_splines([readings(t, 1e-9, derivative=1)], anchors + 2.0)[0]
+    moved = fit_spline([readings(t, 1e-9, derivative=1)], anchor + 2.0)
     np.testing.assert_allclose(moved.at(t) - spline.at(t), 2.0, atol=1e-9)
 
 
@@ -91,20 +88,10 @@ def test_irregular_times_gaps_and_outliers() -> None:
     values = np.array(given.values)
     values[::200] += 5.0
     spoiled = Readings(t=t, values=values, sigma=given.sigma, derivative=0)
-    spline = fit_splines([spoiled], np.zeros(1))[0]
+    spline = fit_spline([spoiled])
     inner = np.concatenate([np.linspace(0.5, 2.5, 100), np.linspace(4.0, 9.5, 100)])
     assert np.abs(spline.at(inner) - curve(inner)).max() < 3e-3
     assert np.isfinite(spline.at(np.linspace(3.0, 3.4, 50))).all()
-
-
-def test_curves_together_are_those_of_curves_alone() -> None:
-    t = grid()
-    together = readings(t, 1e-2, curves=3)
-    found = fit_splines([together], np.zeros(3))
-    for k, spline in enumerate(found):
-        alone = fit_splines([together.of_curve(k)], np.zeros(1))[0]
-        assert spline.spacing == alone.spacing
-        np.testing.assert_allclose(spline.coefficients, alone.coefficients, rtol=1e-9, atol=1e-12)
 
 
 def test_units_do_not_matter() -> None:
@@ -113,6 +100,6 @@ def test_units_do_not_matter() -> None:
     other = Readings(
         t=factor * t, values=given.values / factor, sigma=given.sigma / factor, derivative=0
     )
-    spline = fit_splines([given], np.zeros(1))[0]
-    scaled = fit_splines([other], np.zeros(1))[0]
+    spline = fit_spline([given])
+    scaled = fit_spline([other])
     np.testing.assert_allclose(factor * scaled.at(factor * t), spline.at(t), rtol=1e-9, atol=1e-9)

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.experiment.system import System
 from mjfim.model.servos import actuator_gear
 from mjfim.model.sizes import BRISTLE_STIFFNESS_COLUMN, bristle_actuators
 
@@ -84,48 +83,4 @@ def bristles_of(model: Any) -> tuple[Bristle, ...]:
                     dof=int(model.jnt_dofadr[joint]),
                 )
             )
-    return tuple(found)
-
-
-@dataclass(frozen=True, kw_only=True)
-class StribeckParameters:
-    """Unknowns of the Stribeck effect of one joint.
-
-    Attributes:
-        dof: Degree of freedom of the joint.
-        excess: Index of the parameter that is the excess of the static friction.
-        speed: Index of the parameter that is the Stribeck speed.
-    """
-
-    dof: int
-    excess: int
-    speed: int
-
-
-def stribeck_parameters(system: System) -> tuple[StribeckParameters, ...]:
-    """Physical terms whose excess and Stribeck speed are both unknown.
-
-    Only parameters count that are the numbers themselves, where the excess may be zero, and where
-    no prior says what the speed is.
-
-    Args:
-        system: The system.
-    """
-    parameters = system.parameters.parameters
-    place: dict[str, int] = {}
-    for j, parameter in enumerate(parameters):
-        target = parameter.targets[0]
-        if len(parameter.targets) == 1 and (target.scale, target.offset) == (1.0, 0.0):
-            place[target.path] = j
-
-    found = []
-    for name in system.source.terms:
-        excess, speed = (place.get(f"term/{name}:{field}") for field in ("excess", "speed"))
-        if excess is None or speed is None:
-            continue
-        lower, upper = parameters[excess].bounds
-        if lower <= 0.0 <= upper and parameters[speed].prior is None:
-            joint = system.experiment.terms[name].joint
-            dof = int(system.model.joint(joint).dofadr[0])
-            found.append(StribeckParameters(dof=dof, excess=excess, speed=speed))
     return tuple(found)

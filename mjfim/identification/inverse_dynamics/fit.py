@@ -21,10 +21,9 @@ from mjfim.errors import ExperimentError, MjfimError, RecordingError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of
-from mjfim.identification.equation_search import EquationSearch, FoundEquations
-from mjfim.identification.known_controls import require_known_forces
-from mjfim.identification.measured_forces import measured_forces
-from mjfim.identification.motion_equations import MotionEquations
+from mjfim.identification.inverse_dynamics.equations import MotionEquations
+from mjfim.identification.inverse_dynamics.forces import measured_forces
+from mjfim.identification.inverse_dynamics.search import EquationSearch, FoundEquations
 from mjfim.identification.residual_tests import whiteness_of
 from mjfim.parallel import one_blas_thread
 from mjfim.records.inverse_dynamics import EquationFit, InverseDynamicsFit
@@ -98,7 +97,6 @@ def fit_equations(
         RecordingError: A degree of freedom was not measured, or too little can be used.
     """
     forces, laws = measured_forces(system, recordings), system.laws
-    require_known_forces(system, recordings, forces)
     system = system.without_laws()
 
     begun, steps = time.perf_counter(), system.plant.engine_steps
@@ -138,7 +136,7 @@ def try_fit_equations(
 
 def _require_rows(search: EquationSearch, recordings: Sequence[AlignedRecording]) -> None:
     """Raise RecordingError where the equations have too few rows."""
-    rows, count = int(search.equations.counts.sum()), len(search.active)
+    rows, count = len(search.of_row), len(search.active)
     if not count:
         raise RecordingError(
             f"{recordings[0].name}: the equation of motion contains none of the parameters; "
@@ -175,7 +173,7 @@ def _record(
     return InverseDynamicsFit(
         parameters=parameters.names,
         units=tuple(parameter.unit for parameter in parameters.parameters),
-        theta=search.coordinates.theta(found.linearisation.x),
+        theta=search.coordinates.theta(found.x),
         std=std,
         covariance=accuracy.covariance,
         start=search.coordinates.theta(search.start),
@@ -205,7 +203,7 @@ def _equation_fits(
     search: EquationSearch, found: FoundEquations, shown: int
 ) -> Iterator[EquationFit]:
     """The fits of all equations that have rows, with the series of one recording."""
-    equations, rows = search.equations, found.linearisation.rows
+    equations, rows = search.equations, found.rows
     recording, times = equations.recording_of_row, equations.times
     for i, equation in enumerate(equations.equations):
         own = np.flatnonzero(search.of_row == i)

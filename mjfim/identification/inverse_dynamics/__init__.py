@@ -1,0 +1,9 @@
+"""Fit of parameters to the equation of motion along measured motions (inverse dynamics)."""
+
+from mjfim.identification.inverse_dynamics.fit import (
+    fit_equations,
+    inverse_dynamics,
+    try_fit_equations,
+)
+
+__all__ = ["fit_equations", "inverse_dynamics", "try_fit_equations"]

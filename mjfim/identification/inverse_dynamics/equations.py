@@ -1,0 +1,454 @@
+"""The equation of motion along measured motions, as rows of a least-squares problem.
+
+Each row is the average of an equation over a window of Hann, which passes what the splines of the
+motion follow and hardly any noise of the accelerations above it. The equations are those of the
+degrees of freedom, with measured forces in place of modelled ones where there are any, and the laws
+of the actuators whose forces are measured. Points at which unknown forces act, of contacts and of
+joint limits, do not count, nor do those far from any reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy
+
+from mjfim.arrays import Array
+from mjfim.experiment.system import System
+from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.identification.bristles import bristles_of
+from mjfim.identification.inverse_dynamics.forces import MeasuredForce
+from mjfim.identification.inverse_dynamics.motion import MeasuredMotion, measured_motion
+from mjfim.model.control_laws import ControlLaws
+from mjfim.model.coordinates import dof_names
+from mjfim.model.sizes import translations
+from mjfim.model.targets import ModelField
+from mjfim.model.variants import RELAXED, Relaxation
+from mjfim.plant.equation_of_motion import EquationOfMotion, EquationTerms, MotionPoints
+from mjfim.plant.equation_of_motion import activations as simulated_activations
+
+# Points at which all equations of all recordings are evaluated, at most.
+MOST_POINTS = 20_000
+
+# Length of a window over the distance of the knots of the splines. Shorter windows give friction
+# that is a little better and inertias that are worse.
+WINDOW_PER_SPACING = 6.0
+
+# Number of averages per length of the window. Their noise is correlated.
+PER_WINDOW = 4
+
+# Largest share of the weight of a window on points that do not count.
+MOST_UNUSABLE = 0.02
+
+# Accelerations that contribute less than this share of the largest contribution to an equation do
+# not lengthen its window.
+LEAST_CONTRIBUTION = 0.1
+
+# Longest window, as a share of a recording.
+LONGEST_WINDOW = 0.1
+
+# Speed below which the sign of dry friction is not sure: in standard deviations of the noise, and
+# at least this share of the largest speed.
+UNSURE_SIGMAS = 3.0
+SLOW_SHARE = 0.02
+
+# Largest share of a window on such speeds; larger ones are tried in turn where too few windows
+# remain.
+SLOW_SHARES = (0.1, 0.3, 1.0)
+FEWEST_WINDOWS = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Equation:
+    """One of the equations.
+
+    Attributes:
+        name: Name of the degree of freedom, or of the law.
+        unit: Unit of its forces; empty for laws.
+        dof: Degree of freedom; -1 for the law of a measured force.
+        force: Index of the measured force; -1 for a degree of freedom.
+    """
+
+    name: str
+    unit: str = ""
+    dof: int = -1
+    force: int = -1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Windows:
+    """Averages of a series of n points.
+
+    Attributes:
+        weights: (k, n) their weights.
+        t: (k,) middles of the windows [s].
+        length: Length of a window [s].
+    """
+
+    weights: scipy.sparse.csr_array
+    t: Array
+    length: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rows:
+    """Averages of all equations along all recordings, at one value of the parameters.
+
+    The rows of one recording follow each other, and within it those of one equation.
+
+    Attributes:
+        explained: (R,) forces that the model needs or predicts [N or N m].
+        measured: (R,) forces that act in the model or are measured [N or N m].
+        inertial: (R,) the inertial part of the needed forces [N or N m].
+    """
+
+    explained: Array
+    measured: Array
+    inertial: Array
+
+    @property
+    def residual(self) -> Array:
+        """(R,) explained minus measured forces [N or N m]."""
+        return self.explained - self.measured
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordedEquations:
+    """The equations along one recording.
+
+    Attributes:
+        motion: The measured motion.
+        forces: (n, f) measured forces.
+        has_force: (f,) True for those that the recording holds.
+        moments: (n, f, nv) forces on the degrees of freedom per measured force.
+        windows: Windows of each equation.
+    """
+
+    motion: MeasuredMotion
+    forces: Array
+    has_force: np.ndarray
+    moments: Array
+    windows: tuple[Windows, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EquationModel:
+    """A system whose equation of motion is evaluated along motions.
+
+    Attributes:
+        system: The system, without control laws.
+        laws: The control laws whose inputs a recording holds; None without any.
+        friction_speeds: (nv,) speeds below which the sign of dry friction is not sure.
+    """
+
+    system: System
+    laws: ControlLaws | None
+    friction_speeds: Array
+
+    @cached_property
+    def equation(self) -> EquationOfMotion:
+        """The equation of motion of the plant."""
+        simulator = self.system.plant.simulator.with_substeps(1)
+        return EquationOfMotion(simulator=simulator, friction_speeds=self.friction_speeds)
+
+    def points(
+        self, models: Sequence[Any], motion: MeasuredMotion, thetas: Array
+    ) -> list[MotionPoints]:
+        """Points of a motion for each compiled model, of parameters (k, p)."""
+        points = []
+        acts = self._activations(models, motion)
+        delays = thetas @ self.system.parameters.delay_derivative
+        for act, delay in zip(acts, delays.tolist(), strict=True):
+            points.append(
+                MotionPoints(
+                    states=np.concatenate([motion.qpos, motion.qvel, act], axis=1),
+                    acceleration=motion.qacc,
+                    ctrl=self._stated(motion.control(delay)),
+                )
+            )
+        return points
+
+    def _stated(self, inputs: Array) -> Array:
+        """(n, nu) controls that are inputs themselves, zero for those of laws; inputs: (n, w)."""
+        if self.laws is None:
+            return inputs
+        columns, controls = self.laws.direct
+        found = np.zeros((len(inputs), self.system.model.nu))
+        found[:, controls] = inputs[:, columns]
+        return found
+
+    def _activations(self, models: Sequence[Any], motion: MeasuredMotion) -> list[Array]:
+        """(n, na) activations along a motion for each model.
+
+        The joints are held in the simulation, so that bristles follow from the measured velocity.
+        """
+        plant, recording = self.system.plant, motion.recording
+        if not self.system.space.na:
+            return [np.zeros((len(motion.t), 0)) for _ in models]
+        first = models[0]
+        are_alike = all(np.array_equal(m.actuator_dynprm, first.actuator_dynprm) for m in models)
+        simulated = simulated_activations(
+            plant.simulator,
+            models[:1] if are_alike else models,
+            self.system.nominal_initial_state,
+            self._stated(recording.ctrl),
+        )
+        samples = recording.dt * np.arange(simulated.shape[1])
+        directions = self.equation.directions(motion.qvel)
+        found = []
+        for k, model in enumerate(models):
+            columns = simulated[0 if are_alike else k].T
+            act = np.stack([np.interp(motion.t, samples, column) for column in columns], axis=1)
+            for bristle in bristles_of(model):
+                speed = bristle.speed(model, motion.qvel)
+                direction = np.sign(speed) * np.abs(directions[:, bristle.dof])
+                act[:, bristle.address] = bristle.deflection(model, speed, direction)
+            found.append(act)
+        return found
+
+    @property
+    def has_friction(self) -> np.ndarray:
+        """(nv,) True for degrees of freedom on which dry friction may act."""
+        model: Any = self.system.model
+        found = np.asarray(model.dof_frictionloss > 0.0)
+        found[[bristle.dof for bristle in bristles_of(model)]] = True
+        for parameter in self.system.parameters.parameters:
+            for target in parameter.targets:
+                field = target.field
+                if isinstance(field, ModelField) and field.array == "dof_frictionloss":
+                    found[list(field.rows)] = True
+        return found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionEquations:
+    """The equations along all recordings as functions of the parameters.
+
+    Attributes:
+        model: The system without contacts and limits.
+        forces: The measured forces.
+        equations: The equations: of the degrees of freedom, and laws of measured forces.
+        recorded: The equations along each recording.
+    """
+
+    model: EquationModel
+    forces: tuple[MeasuredForce, ...]
+    equations: tuple[Equation, ...]
+    recorded: tuple[RecordedEquations, ...]
+
+    @staticmethod
+    def of(
+        system: System,
+        recordings: Sequence[AlignedRecording],
+        theta: Array,
+        *,
+        forces: tuple[MeasuredForce, ...],
+        laws: ControlLaws | None,
+    ) -> MotionEquations:
+        """The equations along recordings.
+
+        Args:
+            system: The system without control laws.
+            recordings: The recordings.
+            theta: (p,) parameters at which windows are chosen.
+            forces: The measured forces.
+            laws: The control laws of the recordings; None without any.
+        """
+        durations = np.array([float(recording.t[-1]) for recording in recordings])
+        shares = MOST_POINTS * durations / durations.sum()
+        motions = [
+            measured_motion(system, recording, theta, max(int(share), 2))
+            for recording, share in zip(recordings, shares, strict=True)
+        ]
+        sigma = np.max([motion.speed_sigma for motion in motions], axis=0)
+        fastest = np.max([np.abs(motion.qvel).max(axis=0) for motion in motions], axis=0)
+        slow = np.asarray(np.maximum(UNSURE_SIGMAS * sigma, SLOW_SHARE * fastest))
+        relaxed = system.with_variant(RELAXED, Relaxation(constraints=True))
+        model = EquationModel(system=relaxed, laws=laws, friction_speeds=slow)
+        # Contacts and stops act in the stated model.
+        stated = EquationModel(system=system, laws=laws, friction_speeds=slow)
+        equations = tuple(_equations(system, forces))
+        recorded = []
+        for motion in motions:
+            compiled = system.plant.model(theta)
+            (points,) = stated.points([compiled], motion, theta[None])
+            constrained = stated.equation.constrained(compiled, points)
+            recorded.append(_recorded(model, forces, equations, motion, theta, constrained))
+        return MotionEquations(
+            model=model, forces=forces, equations=equations, recorded=tuple(recorded)
+        )
+
+    # ---- rows
+
+    def _of_rows(self, values: Sequence[Sequence[float]]) -> np.ndarray:
+        """(R,) a number for each row, from one for each recording and equation."""
+        counts = [[len(windows.t) for windows in each.windows] for each in self.recorded]
+        return np.repeat(np.array(values).ravel(), np.array(counts).ravel())
+
+    @cached_property
+    def equation_of_row(self) -> np.ndarray:
+        """(R,) index of the equation of each row."""
+        return self._of_rows([range(len(self.equations)) for _ in self.recorded])
+
+    @cached_property
+    def recording_of_row(self) -> np.ndarray:
+        """(R,) index of the recording of each row."""
+        return self._of_rows([[k] * len(self.equations) for k in range(len(self.recorded))])
+
+    @property
+    def times(self) -> Array:
+        """(R,) time of each row [s]."""
+        return np.concatenate([windows.t for each in self.recorded for windows in each.windows])
+
+    @property
+    def usual_speeds(self) -> Array:
+        """(nv,) root mean square of the measured speeds [m/s or rad/s]."""
+        qvel = np.concatenate([each.motion.qvel for each in self.recorded])
+        return np.asarray(np.sqrt(np.mean(qvel**2, axis=0)))
+
+    def cutoff(self, equation: int) -> float:
+        """Frequency up to which an equation is used, the lowest of all recordings [Hz]."""
+        return 1.0 / max(each.windows[equation].length for each in self.recorded)
+
+    def rows(self, thetas: Array) -> list[Rows]:
+        """Rows at several values of the parameters.
+
+        Args:
+            thetas: (k, p) parameters.
+
+        Returns:
+            The rows; NaN where a model does not compile.
+        """
+        models, compiled = self.model.system.plant.try_models(thetas)
+        found: list[list[Array]] = [[] for _ in thetas]
+        for each in self.recorded:
+            points = self.model.points(models, each.motion, thetas)
+            for parts, model, of_model in zip(found, models, points, strict=True):
+                parts.append(self._averaged(each, self.model.equation.terms(model, of_model)))
+        rows = []
+        for parts, is_compiled in zip(found, compiled, strict=True):
+            values = np.concatenate(parts, axis=1)
+            explained, measured, inertial = values if is_compiled else np.full_like(values, np.nan)
+            rows.append(Rows(explained=explained, measured=measured, inertial=inertial))
+        return rows
+
+    def _averaged(self, each: RecordedEquations, terms: EquationTerms) -> Array:
+        """(3, r) explained, measured and inertial forces along one recording."""
+        measured = np.array(terms.actuation)
+        modelled = np.zeros_like(each.forces)
+        for place, force in enumerate(self.forces):
+            values = each.forces[:, place]
+            if force.is_of_joint:
+                modelled[:, place] = terms.actuation[:, force.dof]
+            else:
+                modelled[:, place] = terms.actuator_force[:, force.actuator]
+            if each.has_force[place] and force.is_of_joint:
+                measured[:, force.dof] = values
+            elif each.has_force[place]:
+                error = values - modelled[:, place]
+                measured += error[:, None] * each.moments[:, place]
+
+        parts = []
+        nothing = np.zeros(len(measured))
+        for equation, windows in zip(self.equations, each.windows, strict=True):
+            dof, place = equation.dof, equation.force
+            if dof >= 0:
+                series = [terms.needed[:, dof], measured[:, dof], terms.inertial[:, dof]]
+            else:
+                series = [modelled[:, place], each.forces[:, place], nothing]
+            parts.append(np.stack([windows.weights @ values for values in series]))
+        return np.concatenate(parts, axis=1)
+
+
+def _equations(system: System, forces: Sequence[MeasuredForce]) -> Iterator[Equation]:
+    """Equations of all degrees of freedom, and laws of the actuators whose force is measured."""
+    is_translation = translations(system.model)
+    for dof, name in enumerate(dof_names(system.model)):
+        yield Equation(name=name, unit="N" if is_translation[dof] else "N m", dof=dof)
+    for place, force in enumerate(forces):
+        if force.is_modelled:
+            yield Equation(name=f"law of {force.name}", force=place)
+
+
+def _recorded(
+    of: EquationModel,
+    forces: Sequence[MeasuredForce],
+    equations: Sequence[Equation],
+    motion: MeasuredMotion,
+    theta: Array,
+    constrained: np.ndarray,
+) -> RecordedEquations:
+    """The equations along one recording, with windows that suit its motion."""
+    model = of.system.plant.model(theta)
+    (points,) = of.points([model], motion, theta[None])
+
+    # A degree of freedom needs the measured forces that act on it, and the accelerations that
+    # matter determine the length of its windows.
+    usable = motion.usable & ~constrained
+    coupling = of.equation.coupling(model, points)
+    matters = coupling >= LEAST_CONTRIBUTION * coupling.max(axis=1, keepdims=True)
+    spacing = np.where(matters, motion.spacing, 0.0).max(axis=1)
+    count = len(motion.t)
+    measured = np.zeros((count, len(forces)))
+    near = np.zeros((count, len(forces)), dtype=bool)
+    moments = np.zeros((count, len(forces), model.nv))
+    touched = np.zeros((len(forces), model.nv), dtype=bool)
+    for place, force in enumerate(forces):
+        if force.is_of_joint:
+            touched[place, force.dof] = True
+        else:
+            moments[:, place] = of.equation.moments(model, points, [force.actuator])[:, 0]
+            touched[place] = moments[:, place].any(axis=0)
+        values = motion.recording.y[:, force.output]
+        if np.isfinite(values).any():
+            measured[:, place], near[:, place] = motion.smoothed(values)
+            usable[:, touched[place]] &= near[:, place : place + 1]
+    slow = (np.abs(motion.qvel) < of.friction_speeds) & of.has_friction
+
+    windows = []
+    for equation in equations:
+        dof, place = equation.dof, equation.force
+        if dof >= 0:
+            found = _windows(motion, spacing[dof], usable[:, dof], slow[:, dof])
+        else:
+            known = near[:, place] & motion.usable[:, touched[place]].all(axis=1)
+            finest = motion.spacing[touched[place]].max(initial=0.0)
+            found = _windows(motion, finest, known, np.zeros(count, dtype=bool))
+        windows.append(found)
+    return RecordedEquations(
+        motion=motion,
+        forces=measured,
+        has_force=np.asarray(near.any(axis=0)),
+        moments=moments,
+        windows=tuple(windows),
+    )
+
+
+def _windows(
+    motion: MeasuredMotion, spacing: float, usable: np.ndarray, slow: np.ndarray
+) -> Windows:
+    """Windows of an equation, most of which are not at rest where that is possible."""
+    length = WINDOW_PER_SPACING * max(spacing, motion.step)
+    length = min(length, LONGEST_WINDOW * float(motion.t[-1]))
+    half = max(round(0.5 * length / motion.step), 1) - 1
+    window = np.hanning(2 * half + 3)[1:-1]
+    stride = max(round(length / motion.step / PER_WINDOW), 1)
+    centres = np.arange(half, len(motion.t) - half, stride)
+    columns = centres[:, None] + np.arange(-half, half + 1)
+    values = np.broadcast_to(window / window.sum(), columns.shape)
+    ends = len(window) * np.arange(len(centres) + 1)
+    shape = (len(centres), len(motion.t))
+    weights = scipy.sparse.csr_array((values.ravel(), columns.ravel(), ends), shape)
+
+    possible = weights @ (~usable).astype(np.float64) <= MOST_UNUSABLE
+    resting = weights @ slow.astype(np.float64)
+    kept = possible
+    for share in SLOW_SHARES:
+        kept = possible & (resting <= share)
+        if kept.sum() >= FEWEST_WINDOWS * possible.sum():
+            break
+    return Windows(weights=weights[kept], t=motion.t[centres[kept]], length=length)
