@@ -94,7 +94,7 @@ def with_stated_residuals(
     if stated is None or extended is None:
         return None
     recordings = tuple(
-        replace(recording, y=recording.y + np.nan_to_num(after - before), file=None)
+        replace(recording, y=recording.y + np.nan_to_num(after - before))
         for recording, before, after in zip(wider.recordings, stated, extended, strict=True)
     )
     return replace(wider, simulation=replace(wider.simulation, recordings=recordings))
