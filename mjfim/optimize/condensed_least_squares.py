@@ -468,7 +468,9 @@ class Condensed:
         if not is_known.any():
             return 1.0
 
-        ratio = float(np.sqrt(np.min(sandwich[is_known] / formal[is_known])))
+        # Rounding may leave a variance below zero.
+        least = float(np.min(sandwich[is_known] / formal[is_known]))
+        ratio = float(np.sqrt(max(least, 0.0)))
         return min(ratio, MAX_TRUE_DEVIATION) if ratio > MIN_TRUE_DEVIATION else 1.0
 
     @property
