@@ -28,7 +28,6 @@ from mjfim.identification.segment_simulation import (
     SegmentSimulation,
 )
 from mjfim.identification.segments import (
-    Segment,
     free_segments,
     has_free_starts,
     recorded_release,
@@ -41,8 +40,7 @@ from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.plant.noise import Noise
-from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
-from mjfim.records.trajectory import Recording, Trajectory
+from mjfim.records.trajectory import Recording
 
 T = TypeVar("T")
 
@@ -74,32 +72,26 @@ CALIBRATION_SAMPLES = 1000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FitProblem:
+class FitProblem(SegmentSimulation):
     """Residuals of recordings as functions of the unknowns; a `levenberg_marquardt.Problem`.
 
     Every segment has private unknowns: the deviations of its initial state, or its whole initial
     state where that is measured. All other parameters are common unknowns.
 
     Attributes:
-        simulation: Simulation of the segments.
         masks: (M, ny) for every recording, True for the measured values that count.
         noise: Noise of the outputs.
         loss: Loss of a whitened residual.
         pins: Combinations that no recording determines, and their values.
         with_priors: Whether priors of the parameters count.
-        difference_step: Relative step of the two-sided differences of a linearisation.
-        central: True for two-sided differences; None for two-sided ones unless there is much data.
         workers: Does the work on batches of segments; None for this process.
     """
 
-    simulation: SegmentSimulation
     masks: tuple[np.ndarray, ...]
     noise: Noise
     loss: RobustLoss
     pins: Pins
     with_priors: bool
-    difference_step: float = SENSITIVITY_STEP
-    central: bool | None = None
     workers: ProblemWorkers | None = None
 
     @classmethod
@@ -160,15 +152,12 @@ class FitProblem:
             bounded=not data_only,
             held=settings.hold,
         )
-        simulation = SegmentSimulation(
+        return cls(
             system=system,
             recordings=aligned,
             segments=segments,
             layout=layout,
             start_directions=directions,
-        )
-        return cls(
-            simulation=simulation,
             masks=masks,
             noise=system.noise,
             loss=RobustLoss(kind=settings.loss, scale=settings.loss_scale),
@@ -188,12 +177,11 @@ class FitProblem:
 
     def unbounded(self) -> FitProblem:
         """This problem without bounds."""
-        return replace(self, simulation=self.simulation.with_layout(self.layout.unbounded()))
+        return replace(self, layout=self.layout.unbounded())
 
     def with_shared_held(self) -> FitProblem:
         """This problem with all shared parameters held, so that it needs no pins."""
-        simulation = self.simulation.with_layout(self.layout.without_shared())
-        return replace(self, simulation=simulation, pins=self.pins.released())
+        return replace(self, layout=self.layout.without_shared(), pins=self.pins.released())
 
     def with_noise(self, noise: Noise) -> FitProblem:
         """This problem with other noise.
@@ -222,22 +210,12 @@ class FitProblem:
         return replace(self, difference_step=factor * self.difference_step, central=True)
 
     def of_segments(self, indices: np.ndarray) -> FitProblem:
-        """The problem of some segments only; only their rows count.
-
-        Args:
-            indices: Indices of the segments.
-
-        Returns:
-            The problem.
-        """
-        simulation = self.simulation.of_segments(indices)
-
+        """The problem of some segments only; only their rows count."""
+        segments = tuple(self.segments[i] for i in indices)
         masks = tuple(np.zeros_like(mask) for mask in self.masks)
-        for segment in simulation.segments:
-            rows = segment.rows
-            masks[segment.recording][rows] = self.masks[segment.recording][rows]
-
-        return replace(self, simulation=simulation, masks=masks)
+        for segment in segments:
+            masks[segment.recording][segment.rows] = self.masks[segment.recording][segment.rows]
+        return replace(self, segments=segments, masks=masks)
 
     def of_first_parts(self, share: float) -> FitProblem:
         """The problem of the first part of every segment only.
@@ -254,7 +232,7 @@ class FitProblem:
         for segment in self.segments:
             recording = self.recordings[segment.recording]
             segments.append(segment.first_part(recording.t, recording.dt, share))
-        return replace(self, simulation=replace(self.simulation, segments=tuple(segments)))
+        return replace(self, segments=tuple(segments))
 
     def cut(self, length: float) -> FitProblem | None:
         """This problem over segments of a length [s] with free initial states.
@@ -272,15 +250,14 @@ class FitProblem:
         except RecordingError:
             return None
         count = len(self.recordings)
-        simulation = replace(
-            self.simulation,
+        return replace(
+            self,
             segments=segments,
             layout=UnknownLayout.of(parameters, count, free_starts=True, bounded=True, held=held),
             start_directions=directions,
+            masks=tuple(np.array(recording.measured) for recording in self.recordings),
+            pins=Pins.none(parameters),
         )
-        masks = tuple(np.array(recording.measured) for recording in self.recordings)
-        pins = Pins.none(parameters)
-        return replace(self, simulation=simulation, masks=masks, pins=pins)
 
     def from_known_states(
         self, at: UnknownValues, unknown: Sequence[int] = ()
@@ -289,8 +266,15 @@ class FitProblem:
 
         See `SegmentSimulation.from_known_states`.
         """
-        simulation, known = self.simulation.from_known_states(at, unknown)
-        return replace(self, simulation=simulation), known
+        known = replace(self, start_directions=self.start_directions[:, list(unknown)])
+        if not self.layout.free_starts:
+            return known, at
+        segments = tuple(
+            replace(segment, start=self._initial_state(at, i))
+            for i, segment in enumerate(self.segments)
+        )
+        private = np.zeros((len(segments), len(unknown)))
+        return replace(known, segments=segments), replace(at, private=private)
 
     def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
         """This problem with some measured values only.
@@ -319,31 +303,6 @@ class FitProblem:
     # ---- sizes
 
     @property
-    def system(self) -> System:
-        """The system, its difference steps calibrated along the longest recording."""
-        return self.simulation.system
-
-    @property
-    def recordings(self) -> tuple[AlignedRecording, ...]:
-        """The recordings on the sample grid."""
-        return self.simulation.recordings
-
-    @property
-    def segments(self) -> tuple[Segment, ...]:
-        """The segments."""
-        return self.simulation.segments
-
-    @property
-    def layout(self) -> UnknownLayout:
-        """Layout of the unknowns."""
-        return self.simulation.layout
-
-    @property
-    def sample_count(self) -> int:
-        """Number of samples of all segments together."""
-        return self.simulation.sample_count
-
-    @property
     def row_count(self) -> int:
         """Number of rows of all recordings."""
         return sum(len(recording.t) for recording in self.recordings)
@@ -356,7 +315,7 @@ class FitProblem:
     @property
     def unknown_count(self) -> int:
         """Number of all unknowns."""
-        return self.layout.column_count + len(self.segments) * self.simulation.private_count
+        return self.layout.column_count + len(self.segments) * self.private_count
 
     @property
     def segments_with_values(self) -> np.ndarray:
@@ -376,12 +335,12 @@ class FitProblem:
     @cached_property
     def whitened(self) -> WhitenedRows:
         """Comparison of simulated rows with the measured values that count."""
-        return WhitenedRows(simulation=self.simulation, masks=self.masks, noise=self.noise)
+        return WhitenedRows(problem=self, masks=self.masks, noise=self.noise)
 
     @cached_property
     def prior_rows(self) -> PriorRows:
         """Rows of priors and pins."""
-        return PriorRows(simulation=self.simulation, pins=self.pins, with_priors=self.with_priors)
+        return PriorRows(problem=self, pins=self.pins, with_priors=self.with_priors)
 
     @property
     def curved_rows(self) -> Callable[[UnknownValues, Array], Array | None] | None:
@@ -409,7 +368,7 @@ class FitProblem:
         Returns:
             The unknowns.
         """
-        return self.layout.begin(theta, len(self.segments), self.simulation.private_count)
+        return self.layout.begin(theta, len(self.segments), self.private_count)
 
     def common_values(self, at: UnknownValues) -> Array:
         """Values of the common unknowns.
@@ -466,21 +425,6 @@ class FitProblem:
             for part in found:
                 outputs[self.segments[part.segment].recording][part.rows] = part.y
         return outputs
-
-    def motion(
-        self, at: UnknownValues, recording: int, max_samples: int | None = None
-    ) -> Trajectory | None:
-        """The fitted motion of one recording.
-
-        Args:
-            at: The unknowns.
-            recording: Index of the recording.
-            max_samples: Number of samples after which the motion ends, if it lasts longer.
-
-        Returns:
-            The motion; None where it diverges.
-        """
-        return self.simulation.motion(at, recording, max_samples)
 
     def errors_at(self, at: UnknownValues) -> list[Array] | None:
         """Predicted minus measured values of every output; None where a simulation diverges."""
@@ -572,7 +516,7 @@ class FitProblem:
         Returns:
             The linearisation; None where a perturbed simulation diverges.
         """
-        m = self.simulation.private_count + self.layout.column_count + 1
+        m = self.private_count + self.layout.column_count + 1
         blocks = np.zeros((self.blocks.count, m, m))
 
         batches = self.batches(derivatives=True)
@@ -600,7 +544,7 @@ class FitProblem:
             The rows of its segments; None where a simulation diverges.
         """
         predicted = []
-        for rows in self.simulation.rows_of_batch(at, batch):
+        for rows in self.rows_of_batch(at, batch):
             if rows is None:
                 return None
             predicted.append(rows)
@@ -619,7 +563,7 @@ class FitProblem:
             Index of a segment and loss of some of its rows; None where a simulation diverges.
         """
         losses = []
-        for rows in self.simulation.rows_of_batch(at, batch):
+        for rows in self.rows_of_batch(at, batch):
             if rows is None:
                 return None
             losses.append((rows.segment, self.loss.value(self.whitened.residual(rows))))
@@ -635,10 +579,10 @@ class FitProblem:
         Returns:
             (m, m) triangle of each block by its index; None where a perturbed simulation diverges.
         """
-        m = self.simulation.private_count + self.layout.column_count + 1
+        m = self.private_count + self.layout.column_count + 1
         empty = np.zeros((m, m))
         blocks: dict[int, Array] = {}
-        for rows in self.simulation.rows_of_batch(at, batch):
+        for rows in self.rows_of_batch(at, batch):
             if rows is None:
                 return None
 
@@ -653,31 +597,6 @@ class FitProblem:
                 joined = np.concatenate([blocks.get(index, empty), weighted[first:last]])
                 blocks[index] = triangle(joined)
         return blocks
-
-    def batches(
-        self,
-        *,
-        derivatives: bool,
-        central: bool | None = None,
-        wanted: np.ndarray | None = None,
-    ) -> Iterator[SegmentBatch]:
-        """All segments in batches, differentiated with the steps of this problem.
-
-        Args:
-            derivatives: Whether to compute derivatives.
-            central: True for two-sided differences; default: those of this problem.
-            wanted: (p,) True for the parameters by which to differentiate; default: those that have
-                common columns.
-
-        Returns:
-            The batches.
-        """
-        return self.simulation.batches(
-            derivatives=derivatives,
-            central=self.central if central is None else central,
-            step=self.difference_step,
-            wanted=wanted,
-        )
 
     def of_batches(
         self, work: BatchWork[T], batches: Iterable[SegmentBatch], at: UnknownValues
@@ -734,8 +653,8 @@ def have_same_initial_states(problem: FitProblem, other: FitProblem) -> bool:
         other: The other one.
     """
     begins, others = ([segment.begin for segment in each.segments] for each in (problem, other))
-    width = problem.simulation.private_count
-    return begins == others and width == other.simulation.private_count
+    width = problem.private_count
+    return begins == others and width == other.private_count
 
 
 def _calibrated_along(

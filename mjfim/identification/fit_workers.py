@@ -109,8 +109,7 @@ def _with_parts(
     problem: FitProblem, system: System | None, recordings: tuple[AlignedRecording, ...]
 ) -> FitProblem:
     """A problem of this process alone, with another system and other recordings."""
-    simulation = replace(problem.simulation, system=cast(System, system), recordings=recordings)
-    return replace(problem, simulation=simulation, workers=None)
+    return replace(problem, system=cast(System, system), recordings=recordings, workers=None)
 
 
 class FitWorkers:

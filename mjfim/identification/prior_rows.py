@@ -23,12 +23,12 @@ class PriorRows:
     """Rows of priors and pins on the unknowns of a simulation.
 
     Attributes:
-        simulation: Simulation of the segments.
+        problem: Simulation of the segments.
         pins: Combinations that no recording determines, and their values.
         with_priors: Whether priors of the parameters count.
     """
 
-    simulation: SegmentSimulation
+    problem: SegmentSimulation
     pins: Pins
     with_priors: bool
 
@@ -41,7 +41,7 @@ class PriorRows:
         Returns:
             (l, c+1) rows `[J, r]`.
         """
-        layout = self.simulation.layout
+        layout = self.problem.layout
         rows = np.zeros((0, layout.column_count + 1))
         if self.with_priors:
             rows = self.of_parameters(at)
@@ -61,7 +61,7 @@ class PriorRows:
         Returns:
             (l, c+1) rows `[J, r]`: the stated priors, then those from the model's inertias.
         """
-        layout = self.simulation.layout
+        layout = self.problem.layout
         rows = [layout.prior_rows(at)]
         is_own = np.zeros(len(layout.parameters), dtype=bool)
         is_own[layout.per_recording] = True
@@ -84,7 +84,7 @@ class PriorRows:
         Returns:
             (l, c+1) rows `[J, r]`; None where a body is not physical at the end.
         """
-        layout = self.simulation.layout
+        layout = self.problem.layout
         theta = np.array(at.theta)
         own = np.array(at.per_recording)
         count = len(layout.shared)
@@ -112,7 +112,7 @@ class PriorRows:
 
     def _cad_rows(self, prior: CadPrior, at: UnknownValues, recording: int) -> Array:
         """(l, c+1) rows of the priors on inertias, with the values of one recording."""
-        layout = self.simulation.layout
+        layout = self.problem.layout
         found = prior.rows(layout.theta_of_recording(at, recording))
         columns = layout.to_columns(found[:, :-1], recording)
         return np.column_stack([columns, found[:, -1]])
@@ -120,7 +120,7 @@ class PriorRows:
     @cached_property
     def _cad(self) -> CadPrior:
         """Priors from the model's inertias."""
-        return CadPrior.of(self.simulation.system.parameters)
+        return CadPrior.of(self.problem.system.parameters)
 
     def private(self, at: UnknownValues) -> Array:
         """Rows on the private unknowns of every segment.
@@ -131,17 +131,17 @@ class PriorRows:
         Returns:
             (P, k, m) rows `[J_private, J_common, r]`.
         """
-        system = self.simulation.system
-        layout = self.simulation.layout
-        n = self.simulation.private_count
+        system = self.problem.system
+        layout = self.problem.layout
+        n = self.problem.private_count
         m = n + layout.column_count + 1
-        count = len(self.simulation.segments)
+        count = len(self.problem.segments)
         diagonal = np.arange(n)
 
         # A weak prior on a free initial state, for components that no output determines.
         if layout.free_starts:
             rows = np.zeros((count, n, m))
-            sizes = np.abs(self.simulation.start_directions).T @ system.plant.sizes.state
+            sizes = np.abs(self.problem.start_directions).T @ system.plant.sizes.state
             sigma = FREE_START_SIGMA * sizes
             rows[:, diagonal, diagonal] = 1.0 / sigma
             rows[:, :, -1] = at.private / sigma
@@ -168,4 +168,4 @@ class PriorRows:
     @cached_property
     def _pins_involve_private(self) -> bool:
         """True where pins involve private unknowns."""
-        return bool(self.pins.rows[:, self.simulation.layout.private].any())
+        return bool(self.pins.rows[:, self.problem.layout.private].any())

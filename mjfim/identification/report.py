@@ -365,7 +365,7 @@ def _clipped_shares(result: FitResult) -> dict[str, float]:
     """Share of the samples at which limits of control laws act, by actuator."""
     unknowns = result.solution.unknowns
     at = replace(unknowns, private=unknowns.private[result.subset])
-    return result.problem.of_segments(result.subset).simulation.clipped_shares(at)
+    return result.problem.of_segments(result.subset).clipped_shares(at)
 
 
 def _covering(interval: Array, result: FitResult) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -96,6 +96,8 @@ class SegmentSimulation:
         layout: Which parameters are common, and which are private.
         start_directions: (nx, n) directions of the initial state along which the private unknowns
             move it.
+        difference_step: Relative step of the two-sided differences of a linearisation.
+        central: True for two-sided differences; None for two-sided ones unless there is much data.
     """
 
     system: System
@@ -103,53 +105,8 @@ class SegmentSimulation:
     segments: tuple[Segment, ...]
     layout: UnknownLayout
     start_directions: Array
-
-    def with_layout(self, layout: UnknownLayout) -> SegmentSimulation:
-        """This simulation with another layout of the unknowns.
-
-        Args:
-            layout: The other layout.
-
-        Returns:
-            The simulation.
-        """
-        return replace(self, layout=layout)
-
-    def of_segments(self, indices: np.ndarray) -> SegmentSimulation:
-        """The simulation of some segments only.
-
-        Args:
-            indices: Indices of the segments.
-
-        Returns:
-            The simulation.
-        """
-        return replace(self, segments=tuple(self.segments[i] for i in indices))
-
-    def from_known_states(
-        self, at: UnknownValues, unknown: Sequence[int] = ()
-    ) -> tuple[SegmentSimulation, UnknownValues]:
-        """This simulation with initial states most of whose components are no unknowns.
-
-        Args:
-            at: Unknowns with the initial states.
-            unknown: Columns of `start_directions` that remain private unknowns. There are none
-                where initial states are stated.
-
-        Returns:
-            The simulation, and its unknowns. Only `batches` and `rows_of_batch` may be used where
-            initial states are stated, because their deviations stay in the unknowns.
-        """
-        known = replace(self, start_directions=self.start_directions[:, list(unknown)])
-        if not self.layout.free_starts:
-            return known, at
-
-        segments = tuple(
-            replace(segment, start=self._initial_state(at, i))
-            for i, segment in enumerate(self.segments)
-        )
-        private = np.zeros((len(segments), len(unknown)))
-        return replace(known, segments=segments), replace(at, private=private)
+    difference_step: float = SENSITIVITY_STEP
+    central: bool | None = None
 
     @cached_property
     def sample_count(self) -> int:
@@ -263,15 +220,16 @@ class SegmentSimulation:
         *,
         derivatives: bool,
         central: bool | None = None,
-        step: float = SENSITIVITY_STEP,
+        step: float | None = None,
         wanted: np.ndarray | None = None,
     ) -> Iterator[SegmentBatch]:
         """Divide all segments into batches that fit into memory; every segment is in one of them.
 
         Args:
             derivatives: Whether to compute derivatives.
-            central: True for two-sided differences; default: two-sided unless there is much data.
-            step: Relative step of two-sided differences.
+            central: True for two-sided differences; default: as this simulation states, and
+                two-sided unless there is much data where it does not.
+            step: Relative step of two-sided differences; default: the stated one.
             wanted: (p,) True for the parameters by which to differentiate; default: those that have
                 common columns.
 
@@ -283,8 +241,10 @@ class SegmentSimulation:
 
         # Two-sided differences are more accurate; with much data they take too long.
         directions = int(wanted.sum()) + self.private_count
+        central = self.central if central is None else central
         if central is None:
             central = self.affords_two_sided(directions)
+        step = self.difference_step if step is None else step
         if not central:
             step = ONE_SIDED_STEP_FACTOR * step
 

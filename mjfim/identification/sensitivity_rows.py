@@ -46,7 +46,7 @@ def sensitivity_rows(
     if wanted is None:
         wanted = np.ones(len(problem.system.parameters), dtype=bool)
     condensed = _condensed_sensitivity(problem, at, with_error, wanted)
-    n = problem.simulation.private_count if problem.layout.free_starts else 0
+    n = problem.private_count if problem.layout.free_starts else 0
 
     found = []
     for segment in sorted(condensed):
@@ -73,9 +73,7 @@ def _condensed_sensitivity(
     if with_error:
         work = sensitivities_of_batch
     batches = list(
-        problem.simulation.batches(
-            derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted
-        )
+        problem.batches(derivatives=True, central=with_error, step=SENSITIVITY_STEP, wanted=wanted)
     )
     condensed: dict[int, Array] = {}
     results = problem.of_batches(work, batches, at)
@@ -109,8 +107,8 @@ def sensitivities_of_batch(
         diverges.
     """
     longer = replace(batch, step=COARSER_STEP_FACTOR * batch.step)
-    coarse = problem.simulation.rows_of_batch(at, longer)
-    return _condensed_batch(problem, problem.simulation.rows_of_batch(at, batch), coarse)
+    coarse = problem.rows_of_batch(at, longer)
+    return _condensed_batch(problem, problem.rows_of_batch(at, batch), coarse)
 
 
 def sensitivities_without_error(
@@ -120,7 +118,7 @@ def sensitivities_without_error(
 
     Its change with a longer step is not computed, and zero.
     """
-    return _condensed_batch(problem, problem.simulation.rows_of_batch(at, batch), ())
+    return _condensed_batch(problem, problem.rows_of_batch(at, batch), ())
 
 
 def _condensed_batch(

@@ -57,12 +57,12 @@ class WhitenedRows:
     """Comparison of simulated rows with the measured values that count.
 
     Attributes:
-        simulation: Simulation of the segments.
+        problem: Simulation of the segments.
         masks: (M, ny) for every recording, True for the measured values that count.
         noise: Noise of the outputs.
     """
 
-    simulation: SegmentSimulation
+    problem: SegmentSimulation
     masks: tuple[np.ndarray, ...]
     noise: Noise
 
@@ -76,8 +76,8 @@ class WhitenedRows:
             (n,) residuals of the values that count, row by row [standard deviations].
         """
         mask = self._mask_of(rows)
-        segment = self.simulation.segments[rows.segment]
-        measured = self.simulation.recordings[segment.recording].y[rows.rows]
+        segment = self.problem.segments[rows.segment]
+        measured = self.problem.recordings[segment.recording].y[rows.rows]
 
         # Values that do not count may be NaN.
         residual = np.where(mask, rows.y - measured, 0.0)
@@ -90,9 +90,9 @@ class WhitenedRows:
             rows: Predictions with derivatives.
         """
         mask = self._mask_of(rows)
-        segment = self.simulation.segments[rows.segment]
+        segment = self.problem.segments[rows.segment]
         common, private = rows.jacobians
-        columns = self.simulation.layout.to_columns(common, segment.recording)
+        columns = self.problem.layout.to_columns(common, segment.recording)
         G = np.concatenate([private, columns], axis=2)
 
         return LinearisedRows(
@@ -112,11 +112,11 @@ class WhitenedRows:
         """
         common, private = rows.jacobians
         G = common
-        if self.simulation.layout.free_starts:
+        if self.problem.layout.free_starts:
             G = np.concatenate([private, common], axis=2)
         return self.noise.whiten_present(G, self._mask_of(rows))
 
     def _mask_of(self, rows: SegmentRows) -> np.ndarray:
         """(k, ny) True for the values of k rows that count."""
-        recording = self.simulation.segments[rows.segment].recording
+        recording = self.problem.segments[rows.segment].recording
         return np.asarray(self.masks[recording][rows.rows])

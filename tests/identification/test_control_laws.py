@@ -163,8 +163,8 @@ def test_derivatives_agree_with_differences_of_a_plain_loop(of_a_fit: bool) -> N
         found = predicted[1]
     else:
         problem = FitProblem.of(system, [exact(system, inputs)])
-        batch = next(problem.simulation.batches(derivatives=True))
-        (rows,) = problem.simulation.rows_of_batch(problem.begin(guess), batch)
+        batch = next(problem.batches(derivatives=True))
+        (rows,) = problem.rows_of_batch(problem.begin(guess), batch)
         assert rows is not None
         found = rows.jacobians[0]
     size = np.abs(expected).max(axis=(0, 1))
@@ -205,8 +205,7 @@ def test_segments_know_the_integral_of_the_law(off: int, tolerance: float) -> No
 
     def error(recording: AlignedRecording) -> float:
         """Largest error of the prediction from the true states at the begins."""
-        simulation = replace(problem.simulation, segments=segments, recordings=(recording,))
-        known = replace(problem, simulation=simulation)
+        known = replace(problem, segments=segments, recordings=(recording,))
         predicted = known.predict(known.begin(system.parameters.true))
         assert predicted is not None
         return float(np.abs(predicted[0] - log.y).max())
@@ -481,7 +480,7 @@ def test_a_law_acts_on_a_motor_with_a_lag() -> None:
     )
     log = recorded(experiment, 500, 8)
     problem = FitProblem.of(System.resolve(experiment.replace(fit={"segments": 0.25})), [log])
-    assert problem.simulation.private_count == 5
+    assert problem.private_count == 5
 
     found = least_squares(problem, problem.system.parameters.guess)
 

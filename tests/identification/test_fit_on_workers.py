@@ -145,8 +145,8 @@ def test_a_request_to_stop_takes_effect_after_the_pass_that_runs(
     begin = problem.begin(1.05 * problem.system.parameters.guess)
     stop = StopToken()
     # The first pass for the cost and the first linearisation are complete by then.
-    passes = len(list(problem.simulation.batches(derivatives=False)))
-    passes += len(list(problem.simulation.batches(derivatives=True)))
+    passes = len(list(problem.batches(derivatives=False)))
+    passes += len(list(problem.batches(derivatives=True)))
     with StoppingThreads(stop, passes + 1) as threads:
         divided = problem.on_workers(FitWorkers(threads))
         found = minimise(divided, begin, SearchSettings(), Budget(stop=stop))

@@ -84,7 +84,7 @@ def test_a_model_with_more_states_begins_at_its_own_initial_states(tmp_path: Pat
     recording = recorded(System.resolve(plain), motor_torque(2.0, 100.0), 0)
     fitted = fit_task(searched(FitTask.resolve(plain, [recording])))
     task = FitTask.resolve(richer, [recording])
-    widths = [each.simulation.private_count for each in (fitted.problem, task.problem())]
+    widths = [each.private_count for each in (fitted.problem, task.problem())]
     assert widths == [2, 4]
     again = refit_task(searched(task), fitted, other_start=np.array([0.01, 0.01]))
     assert again.solution.unknowns.private.shape == (len(fitted.problem.segments), 4)

@@ -75,7 +75,7 @@ def test_activations_of_terms_are_no_unknowns_of_segments(tmp_path: Path, kind: 
     system = System.resolve(experiment.replace(parameters=true))
     recording = log_of(system, 3, duration=3.0)
     problem = FitProblem.of(system, [recording])
-    assert problem.simulation.private_count == 2
+    assert problem.private_count == 2
     assert len(problem.segments) == 6
 
     known = KnownActivations.of(system)

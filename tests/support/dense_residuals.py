@@ -37,15 +37,12 @@ def dense_residuals(problem: FitProblem, at: UnknownValues) -> Residuals | None:
     Returns:
         Residuals with their derivatives; None where a perturbed simulation diverges.
     """
-    n = problem.simulation.private_count
+    n = problem.private_count
     residuals = []
     jacobians = []
 
-    simulation = problem.simulation
-    for batch in simulation.batches(
-        derivatives=True, central=problem.central, step=problem.difference_step
-    ):
-        for rows in simulation.rows_of_batch(at, batch):
+    for batch in problem.batches(derivatives=True):
+        for rows in problem.rows_of_batch(at, batch):
             if rows is None:
                 return None
             found = problem.whitened.linearised(rows)

@@ -63,7 +63,7 @@ def extended_problem(
     wider = FitProblem.of(extended, recordings)
     wider = replace(
         wider,
-        simulation=replace(wider.simulation, segments=_extended_segments(problem, wider)),
+        segments=_extended_segments(problem, wider),
         masks=problem.masks,
         noise=problem.noise,
         difference_step=problem.difference_step,
@@ -97,7 +97,7 @@ def with_stated_residuals(
         replace(recording, y=recording.y + np.nan_to_num(after - before))
         for recording, before, after in zip(wider.recordings, stated, extended, strict=True)
     )
-    return replace(wider, simulation=replace(wider.simulation, recordings=recordings))
+    return replace(wider, recordings=recordings)
 
 
 def _extended_segments(problem: FitProblem, wider: FitProblem) -> tuple[Segment, ...]:
@@ -141,7 +141,7 @@ def _private_names(problem: FitProblem) -> list[str]:
     if not problem.layout.free_starts:
         return [problem.system.parameters.names[i] for i in problem.layout.private]
     names = np.array(tangent_names(problem.system.model))
-    directions = problem.simulation.start_directions
+    directions = problem.start_directions
     return [str(names[np.flatnonzero(column)[0]]) for column in directions.T]
 
 

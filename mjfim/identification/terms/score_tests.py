@@ -137,7 +137,7 @@ def find_missing_terms(
         for group in in_groups([each for each in linear if each.alone == kind])
     ]
     largest = max((sum(len(each.tested) for each in group) for group in groups), default=0)
-    columns = problem.layout.column_count + problem.simulation.private_count + largest
+    columns = problem.layout.column_count + problem.private_count + largest
     part = part_of_data(problem, MAX_SIMULATED / columns)
     at = part.unknowns(at)
     search = _TermSearch(
@@ -223,7 +223,7 @@ def in_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
 def _typical_speeds(problem: FitProblem, at: UnknownValues) -> Array:
     """(nv,) root mean square of the speeds along the first recording [m/s or rad/s]."""
     first = problem.segments[0].recording
-    motion = problem.simulation.motion(at, first, SPEED_SAMPLES)
+    motion = problem.motion(at, first, SPEED_SAMPLES)
     if motion is None:
         return np.zeros(problem.system.space.nv)
     return np.asarray(np.sqrt(np.mean(motion.qvel**2, axis=0)))
