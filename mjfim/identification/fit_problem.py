@@ -469,30 +469,10 @@ class FitProblem(SegmentSimulation):
         for losses in self.of_batches(FitProblem.losses_of_batch, batches, at):
             if losses is None:
                 return np.inf
-            for _, loss in losses:
+            for loss in losses:
                 total += loss
 
         return 0.5 * total + self.prior_cost(at)
-
-    def segment_losses(self, at: UnknownValues) -> Array:
-        """Loss of the residuals of every segment.
-
-        Args:
-            at: The unknowns.
-
-        Returns:
-            (P,) losses; infinite in all segments of a batch in which a simulation diverges.
-        """
-        total = np.zeros(len(self.segments))
-        batches = list(self.batches(derivatives=False))
-        found = self.of_batches(FitProblem.losses_of_batch, batches, at)
-        for batch, losses in zip(batches, found, strict=True):
-            if losses is None:
-                total[list(batch.segments)] = np.inf
-                continue
-            for segment, loss in losses:
-                total[segment] += loss
-        return total
 
     def prior_cost(self, at: UnknownValues) -> float:
         """Half of the sum of the squared priors and pins.
@@ -550,23 +530,13 @@ class FitProblem(SegmentSimulation):
             predicted.append(rows)
         return predicted
 
-    def losses_of_batch(
-        self, at: UnknownValues, batch: SegmentBatch
-    ) -> list[tuple[int, float]] | None:
-        """Loss of the residuals of a batch, which the cost adds in this order.
-
-        Args:
-            at: The unknowns.
-            batch: The batch.
-
-        Returns:
-            Index of a segment and loss of some of its rows; None where a simulation diverges.
-        """
+    def losses_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> list[float] | None:
+        """Losses of the rows of a batch, which the cost adds in this order; None as above."""
         losses = []
         for rows in self.rows_of_batch(at, batch):
             if rows is None:
                 return None
-            losses.append((rows.segment, self.loss.value(self.whitened.residual(rows))))
+            losses.append(self.loss.value(self.whitened.residual(rows)))
         return losses
 
     def blocks_of_batch(self, at: UnknownValues, batch: SegmentBatch) -> dict[int, Array] | None:

@@ -21,7 +21,6 @@ from mjfim.identification.left_out_parts import SEARCH, LeftOutPart, with_initia
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import (
     WEAK_DAMPING,
-    SearchSettings,
     Solution,
     UnknownValues,
     minimise,
@@ -51,65 +50,26 @@ ENOUGH_SHARE = 0.7
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PredictedEnd:
-    """End of a step.
-
-    Attributes:
-        unknowns: Unknowns of all segments. Initial states of segments in the part are those that
-            fit the part best at the new theta.
-        decrease: Decrease of the cost of the other data that the linearisation predicts.
-    """
-
-    unknowns: UnknownValues
-    decrease: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class LeaveOutStep:
     """Step of a fit to the fit without one part of the data.
 
     Attributes:
-        part: The part.
-        begin: Unknowns of all segments at the fit to all data.
-        ends: Ends of steps with more and more damping.
-        cost: Cost of the other data at the begin; None where it has to be simulated.
-        cost_at_guess: Cost of the other data at the guess; None where it has to be simulated.
+        part: The part that is left out.
+        begin: Unknowns of the fit.
+        ends: Unknowns at the end of steps with more and more damping, and the decrease of the cost
+            that the linearisation predicts for each.
     """
 
     part: LeftOutPart
     begin: UnknownValues
-    ends: tuple[PredictedEnd, ...]
-    cost: float | None = None
-    cost_at_guess: float | None = None
+    ends: tuple[tuple[UnknownValues, float], ...]
 
 
 def leave_out_steps(
     problem: FitProblem, solution: Solution, parts: Sequence[LeftOutPart]
 ) -> list[LeaveOutStep]:
-    """Make the steps of a fit to the fits without each of some parts of the data.
-
-    Args:
-        problem: Problem of all data.
-        solution: Its solution, with the linearisation there.
-        parts: Parts that are left out in turn.
-
-    Returns:
-        The steps, in the order of the parts.
-    """
-    guess = problem.begin(problem.system.parameters.guess)
-    losses = _SegmentLosses.simulated(problem, solution.unknowns)
-    losses_at_guess = _SegmentLosses.simulated(problem, guess)
-
-    steps = []
-    for part in parts:
-        step = _step_without(problem, solution, part)
-        others = _other_segments(problem, part)
-        if others is not None:
-            step = replace(
-                step, cost=losses.cost_of(others), cost_at_guess=losses_at_guess.cost_of(others)
-            )
-        steps.append(step)
-    return steps
+    """Make the steps of a fit to the fits without each of some parts of the data."""
+    return [_step_without(problem, solution, part) for part in parts]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -145,53 +105,43 @@ def fit_to_others(problem: FitProblem, step: LeaveOutStep, budget: Budget) -> Ot
 
     others = others.of_segments(segments)
     begin = _of_segments(step.begin, segments)
-    cost = others.cost(begin) if step.cost is None else step.cost
+    cost = others.cost(begin)
 
     # The data that are left out may have led the estimate to a minimum that the others lack. The
     # fit to the others then begins at the guess.
     guess = others.begin(problem.system.parameters.guess)
-    cost_at_guess = others.cost(guess) if step.cost_at_guess is None else step.cost_at_guess
+    cost_at_guess = others.cost(guess)
 
     # A step is the fit if it lowers the cost nearly as far as the linearisation predicts.
     starts = [(cost, begin), (cost_at_guess, guess)]
-    for predicted in step.ends:
-        if predicted.decrease < ENOUGH_SHARE * step.ends[0].decrease:
+    most = step.ends[0][1]
+    for unknowns, decrease in step.ends:
+        if decrease < ENOUGH_SHARE * most:
             break
-        end = _of_segments(predicted.unknowns, segments)
+        end = _of_segments(unknowns, segments)
         cost_at_end = others.cost(end)
         if budget.exhausted is not None:
             return None
-        missed = cost_at_end - (cost - predicted.decrease)
-        allowed = max(ALLOWED_SHARE * predicted.decrease, SEARCH.rough_share * cost)
+        missed = cost_at_end - (cost - decrease)
+        allowed = max(ALLOWED_SHARE * decrease, SEARCH.rough_share * cost)
         if missed <= allowed and cost_at_end <= cost_at_guess:
             has_states = not len(problem.layout.per_recording)
-            return OtherFit(unknowns=predicted.unknowns, has_initial_states=has_states)
+            return OtherFit(unknowns=unknowns, has_initial_states=has_states)
         starts.append((cost_at_end, end))
 
     least, at = min(starts, key=lambda start: start[0])
     settings = replace(SEARCH, lengthens=problem.loss.kind != "linear")
     if at is not guess:
-        share = ALLOWED_SHARE * step.ends[0].decrease / max(least, SMALLEST_COST)
-        settings = _as_near_as_a_step(settings, share)
+        # The search ends as near to the fit as a step that counts as the fit.
+        share = ALLOWED_SHARE * most / max(least, SMALLEST_COST)
+        near = min(max(settings.rough_share, share), LARGEST_ROUGH_SHARE)
+        settings = replace(settings, rough_share=near, stagnant_share=SLOW_SHARE * near)
     found = minimise(others, at, settings, budget)
     if found is None or budget.exhausted is not None:
         return None
     return OtherFit(
         unknowns=replace(found.unknowns, private=step.begin.private), has_initial_states=False
     )
-
-
-def _as_near_as_a_step(settings: SearchSettings, share: float) -> SearchSettings:
-    """Settings of a search that ends as near to the fit as a step that counts as the fit.
-
-    It also ends where its iterations bring little of what such a step may miss.
-
-    Args:
-        settings: Settings of a search that goes on for longer.
-        share: What a step may miss, as a share of the cost.
-    """
-    near = min(max(settings.rough_share, share), LARGEST_ROUGH_SHARE)
-    return replace(settings, rough_share=near, stagnant_share=SLOW_SHARE * near)
 
 
 def predicted_part(
@@ -218,7 +168,7 @@ def _of_segments(at: UnknownValues, segments: np.ndarray) -> UnknownValues:
 
 
 def _step_without(problem: FitProblem, solution: Solution, part: LeftOutPart) -> LeaveOutStep:
-    """Step to the fit without a part, whose costs are not known yet."""
+    """Step to the fit without a part."""
     at = solution.unknowns
     condensed = solution.condensed
     masks = part.masks(problem)
@@ -236,7 +186,7 @@ def _step_without(problem: FitProblem, solution: Solution, part: LeftOutPart) ->
         step = others.step(damping, condensed.column_norms, lower, upper)
         end = problem.moved(at, step, 1.0)
         unknowns = _with_states_of_part(at, end, condensed, step.common, is_left_out)
-        ends.append(PredictedEnd(unknowns=unknowns, decrease=step.predicted_decrease))
+        ends.append((unknowns, step.predicted_decrease))
     return LeaveOutStep(part=part, begin=at, ends=tuple(ends))
 
 
@@ -255,37 +205,3 @@ def _with_states_of_part(
     private = np.array(end.private)
     private[part] = begin.private[part] + condensed.private_step(common)[part]
     return replace(end, private=private)
-
-
-def _other_segments(problem: FitProblem, part: LeftOutPart) -> np.ndarray | None:
-    """Indices of the segments outside of a part; None where a segment is partly inside."""
-    masks = part.masks(problem)
-    inside = problem.masked(masks).segments_with_values
-    others = problem.masked([~mask for mask in masks]).segments_with_values
-    return None if np.isin(inside, others).any() else others
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _SegmentLosses:
-    """Losses of every segment at some unknowns.
-
-    Attributes:
-        problem: Problem of all segments.
-        at: The unknowns.
-        losses: (P,) losses; infinite where the simulation diverges.
-    """
-
-    problem: FitProblem
-    at: UnknownValues
-    losses: Array
-
-    @classmethod
-    def simulated(cls, problem: FitProblem, at: UnknownValues) -> _SegmentLosses:
-        """Simulate all segments."""
-        return cls(problem=problem, at=at, losses=problem.segment_losses(at))
-
-    def cost_of(self, segments: np.ndarray) -> float:
-        """Cost of some segments, with the priors."""
-        part = self.problem.of_segments(segments)
-        priors = part.prior_cost(_of_segments(self.at, segments))
-        return 0.5 * float(self.losses[segments].sum()) + priors

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, listed, unknown
+from mjfim.errors import ExperimentError, RecordingError, listed, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.fit_problem import FitProblem
-from mjfim.identification.same_data import refuse_same_data
 from mjfim.records.trajectory import Recording
 
 # Method of the search. `least_squares` is Levenberg-Marquardt inside the bounds; `newton` is the
 # paper's Newton-Raphson iteration without bounds.
 Method = Literal["least_squares", "newton"]
+
+# Largest difference of two clocks that count as the same [mean sample periods]. Copies of a log in
+# other formats have rounded times.
+CLOCK_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -159,6 +163,35 @@ def with_length(task: FitTask, length: float | Literal["whole"] | None) -> FitTa
     settings = task.settings.model_copy(update={"segments": length})
     experiment = system.experiment.model_copy(update={"fit": settings})
     return replace(task, system=replace(system, experiment=experiment), settings=settings)
+
+
+def refuse_same_data(fitted: Sequence[Recording], held_out: Sequence[Recording]) -> None:
+    """Raise RecordingError where a recording occurs twice, whatever its name is."""
+    for (i, one), (j, other) in combinations(enumerate([*fitted, *held_out]), 2):
+        if not _same_data(one, other):
+            continue
+        consequence = "it would count twice; give it once"
+        if i < len(fitted) <= j:
+            consequence = "a fitted recording says nothing about predictions; hold out another one"
+        fault = f"{other.name} holds the same data as {one.name}"
+        if one.name == other.name:
+            fault = f"{one.name} is given twice"
+        raise RecordingError(f"{fault}: {consequence}")
+
+
+def _same_data(one: Recording, other: Recording) -> bool:
+    """Whether two recordings have equal values at the same times since their begin."""
+    if one.outputs != other.outputs or len(one.t) != len(other.t) or not len(one.t):
+        return False
+    # The first rows show most differences without a look at all others.
+    for rows in (slice(0, 1), slice(None)):
+        if not np.array_equal(one.y[rows], other.y[rows], equal_nan=True):
+            return False
+    if not np.array_equal(one.ctrl, other.ctrl, equal_nan=True):
+        return False
+    difference = (one.t - one.t[0]) - (other.t - other.t[0])
+    period = (one.t[-1] - one.t[0]) / len(one.t)
+    return bool(np.abs(difference).max() <= CLOCK_TOLERANCE * period)
 
 
 def _require_held(system: System, names: Sequence[str]) -> None:

@@ -11,17 +11,15 @@ import mjfim
 from mjfim.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification import leave_out_fits
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.identification.leave_out_fits import (
-    PredictedEnd,
     fit_to_others,
     leave_out_steps,
     predicted_part,
 )
-from mjfim.identification.left_out_parts import SEARCH, left_out_parts
-from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution, UnknownValues
+from mjfim.identification.left_out_parts import left_out_parts
+from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution
 from tests.support.paths import ROOT
 
 TIGHT = SearchSettings(tolerance=1e-6)
@@ -85,7 +83,7 @@ def test_a_step_that_misses_the_predicted_decrease_is_followed_by_a_search() -> 
     # A wrong linearisation is noticed by the simulation of the others.
     begin = step.begin
     away = replace(begin, theta=begin.theta * 1.05)
-    ends = tuple(replace(end, unknowns=away) for end in step.ends)
+    ends = tuple((away, decrease) for _, decrease in step.ends)
     found = fit_to_others(problem, replace(step, ends=ends), Budget())
     assert found is not None and not found.has_initial_states
     sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
@@ -96,13 +94,13 @@ def test_a_damped_step_is_enough_where_the_one_without_damping_goes_too_far() ->
     problem, solution = fitted({}, 2)
     (step, _) = leave_out_steps(problem, solution, list(left_out_parts(problem)))
     begin, (first, second, *_) = step.begin, step.ends
-    away = replace(first, unknowns=replace(begin, theta=begin.theta * 1.05))
+    away = (replace(begin, theta=begin.theta * 1.05), first[1])
     found = fit_to_others(problem, replace(step, ends=(away, second)), Budget())
     assert found is not None and found.has_initial_states
-    np.testing.assert_array_equal(found.unknowns.theta, second.unknowns.theta)
+    np.testing.assert_array_equal(found.unknowns.theta, second[0].theta)
 
     # A step that promises much less is none: the search goes on.
-    little = replace(second, decrease=0.5 * first.decrease)
+    little = (second[0], 0.5 * first[1])
     found = fit_to_others(problem, replace(step, ends=(away, little)), Budget())
     assert found is not None and not found.has_initial_states
 
@@ -118,50 +116,11 @@ def test_the_search_begins_at_the_guess_where_the_others_cost_less_there() -> No
     assert problem_there is not None
     spoilt = replace(spoilt, condensed=problem_there)
     (step, _) = leave_out_steps(problem, spoilt, list(left_out_parts(problem)))
-    assert step.cost_at_guess is not None and step.cost is not None
-    assert step.cost_at_guess < step.cost
     found = fit_to_others(problem, step, Budget())
     good = leave_out_steps(problem, solution, list(left_out_parts(problem)))[0]
     sigma = np.sqrt(np.diag(np.linalg.inv(solution.condensed.information())))
     assert found is not None
-    assert np.linalg.norm((found.unknowns.theta - good.ends[0].unknowns.theta) / sigma) < 0.3
-
-
-@pytest.mark.parametrize(
-    ("decrease", "begins_at_guess", "expected"),
-    [
-        pytest.param(0.02, False, 2e-3, id="a tenth of what the step promises"),
-        pytest.param(1e-4, False, SEARCH.rough_share, id="no nearer than a search that ends"),
-        pytest.param(0.9, False, 5e-3, id="a linearisation that does not hold"),
-        pytest.param(0.02, True, SEARCH.rough_share, id="from the guess"),
-    ],
-)
-def test_a_search_goes_on_until_it_is_as_near_as_a_step_that_counts(
-    monkeypatch: pytest.MonkeyPatch, decrease: float, begins_at_guess: bool, expected: float
-) -> None:
-    problem, solution = fitted({}, 2)
-    (step, _) = leave_out_steps(problem, solution, list(left_out_parts(problem)))
-    asked: list[SearchSettings] = []
-
-    def kept(
-        others: FitProblem, begin: UnknownValues, settings: SearchSettings, budget: Budget
-    ) -> None:
-        """Keep the settings."""
-        asked.append(settings)
-
-    monkeypatch.setattr(leave_out_fits, "minimise", kept)
-
-    # The ends of the step are too far away, so that a search begins at the fit or at the guess.
-    assert step.cost is not None
-    away = replace(step.begin, theta=step.begin.theta * 1.05)
-    ends = (PredictedEnd(unknowns=away, decrease=decrease * step.cost),)
-    guessed = 0.5 * step.cost if begins_at_guess else 2.0 * step.cost
-    fit_to_others(problem, replace(step, ends=ends, cost_at_guess=guessed), Budget())
-    (settings,) = asked
-    assert settings.rough_share == pytest.approx(expected)
-    slow = 0.0 if begins_at_guess else 0.25 * settings.rough_share
-    assert settings.stagnant_share == pytest.approx(slow)
-    assert not settings.lengthens
+    assert np.linalg.norm((found.unknowns.theta - good.ends[0][0].theta) / sigma) < 0.3
 
 
 def test_nothing_is_left_of_a_problem_with_one_part_only() -> None:
