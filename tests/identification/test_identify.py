@@ -26,7 +26,7 @@ from mjfim.identification.identify import identify, identify_system, least_squar
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution, UnknownValues
 from mjfim.output.summaries.verdicts import verdict_of
-from mjfim.records.events import FitEvent
+from mjfim.records.events import FitEvent, stages_observed_by
 from mjfim.records.trajectory import Recording
 from mjfim.studies.campaign import identify_all
 from tests.support.dense_residuals import dense_residuals
@@ -333,16 +333,19 @@ def test_an_interruption_between_starts_keeps_the_earlier_ones(
 ) -> None:
     """Results of earlier starts count; there is no search from a later start."""
     several = DesignTask.resolve(task.experiment.replace(fit={"starts": 6}))
-    seen: list[str] = []
+    searched: list[int] = []
 
-    def show(event: FitEvent) -> None:
-        seen.append(event.phase)
-        if event.phase.startswith("start 3"):
-            signal.raise_signal(signal.SIGINT)
+    def show(stage: str, number: int, count: int) -> None:
+        """Press Ctrl-C after the second random start."""
+        if stage == "searching from random starts":
+            searched.append(number)
+            if number == 2:
+                signal.raise_signal(signal.SIGINT)
 
-    found = identify_system(several.system, [recording], callback=show)
+    with stages_observed_by(show):
+        found = identify_system(several.system, [recording])
     assert found.interrupted
-    assert not any(phase.startswith("start 4") or phase == "all data" for phase in seen)
+    assert searched == [1, 2]
     np.testing.assert_allclose(found.theta, estimate.theta, rtol=1e-3)
 
 
