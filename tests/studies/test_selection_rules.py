@@ -210,7 +210,7 @@ def searched(
     return SimpleNamespace(
         problem=SimpleNamespace(
             segments=(SimpleNamespace(begin=begin),),
-            simulation=SimpleNamespace(private_count=width),
+            private_count=width,
         ),
         task=SimpleNamespace(
             noise_is_stated=stated,
