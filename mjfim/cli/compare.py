@@ -33,7 +33,7 @@ from mjfim.cli.executors import (
 )
 from mjfim.errors import NoResultError
 from mjfim.output.picture_format import PictureFormat
-from mjfim.studies.baselines.titles import TITLES
+from mjfim.studies.baseline_titles import TITLES
 
 
 @verb
@@ -41,10 +41,6 @@ def compare(
     experiment: ExperimentFile,
     output: Folder,
     seconds: Annotated[float, typer.Option(min=0.0, help="Time of each method in seconds.")] = 60.0,
-    steps: Annotated[
-        float | None,
-        typer.Option(min=1.0, help="MuJoCo steps of each method; default: not limited."),
-    ] = None,
     methods: Annotated[
         str | None,
         typer.Option(
@@ -75,14 +71,13 @@ def compare(
     chosen = (
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
     )
-    baselines = chosen_methods(task, chosen)
+    baselines = chosen_methods(task.system, chosen)
     names = comparison_files(baselines)
     claim_folder(output, pictures.files(names), input_files(task.experiment), force=force)
     with started_if_stated(place, MAX_PARTS) as workers, progress("comparing") as show:
         result = compare_task(
             task,
             seconds=seconds,
-            steps=steps,
             seed=seed,
             methods=chosen,
             callback=show,

@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError
-from mjfim.excitation.control_search import ControlSearch, choose
-from mjfim.excitation.controls_within_limits import keeps_limits, limited_cost_of
-from mjfim.excitation.design_report import DesignReport
+from mjfim.errors import ExperimentError, SimulationDivergedError, listed
+from mjfim.excitation.climb import Candidate
+from mjfim.excitation.design_report import DesignReport, Ending
 from mjfim.excitation.designable import identifiability_along, require_designable
-from mjfim.excitation.initial_controls import initial_controls_of
-from mjfim.excitation.left_starts import starts_without_time
+from mjfim.excitation.evaluation import point_at_stated_rate
+from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.levels import DescentLevel, require_coarse_factor
 from mjfim.excitation.objective import DesignPoint
-from mjfim.excitation.release_search import ReleaseSearch
-from mjfim.excitation.release_space import ReleaseSpace
-from mjfim.excitation.run_result import RunResult, consume
-from mjfim.excitation.sample_workers import SampleWorkers
-from mjfim.excitation.short_budget import allows_few_evaluations
+from mjfim.excitation.release import design_release
+from mjfim.excitation.search import Search, candidate_of
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import require_feasible_start
 from mjfim.experiment.schema import Experiment
 from mjfim.information.identifiability import Identifiability
-from mjfim.parallel import ExecutorLike, Workers, one_blas_thread
+from mjfim.parallel import ExecutorLike, LostWorkError, Workers, one_blas_thread
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.design import Design
-from mjfim.records.events import DesignCallback, shown_progress
+from mjfim.records.design import Design, Status
+from mjfim.records.events import DesignCallback, DesignEvent, shown_progress
+
+T = TypeVar("T")
 
 
 def design(
@@ -110,26 +110,17 @@ def design_task(
 
     Args:
         task: The task.
-        callback: Called with a `DesignEvent` for every iterate.
-        initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's.
-        executor: Runs several starts side by side.
-        budget: Time of the design and the token that stops it; default: `[descent] seconds`.
-        identifiability: What can be identified, as `designable` finds it, where that is known.
-
-    Returns:
-        The design.
+        callback: Called after every iterate.
+        initial_control: (N, nu) control with which the search begins [u-unit].
+        executor: Workers of the search.
+        budget: Ends the search; None for the time of the experiment.
+        identifiability: What can be identified; None where it is to be found.
     """
     budget = design_budget(task) if budget is None else budget
-
     # All parts of the design use the same processes, also those that replace killed ones.
     executor = None if executor is None else Workers.of(executor)
     if task.release is not None:
-        return _design_release(task, task.release, budget, callback, executor)
-
-    # Samples of a robust design are independent of each other, as starts are.
-    if executor is not None and task.samples_of_parameters is not None:
-        task = replace(task, sample_evaluation=SampleWorkers(executor, budget))
-
+        return design_release(task, budget, callback, executor)
     _require_controls(task)
     require_feasible_start(task)
     require_coarse_factor(task)
@@ -142,95 +133,120 @@ def design_task(
     if initial_control is not None:
         initial_control = _checked_control(task, initial_control)
     starts = list(initial_controls_of(task, initial_control))
-    begin = _point_of_given(task, first, initial_control)
+    begin = first
+    if initial_control is not None:
+        begin = task.problem.point(
+            task.plant.simulate(task.theta, initial_control), CENTRAL_DIFFERENCES
+        )
     if identifiability is None:
         identifiability = identifiability_along(task, begin)
         require_designable(task, identifiability)
-
     stage = DescentLevel(task, identifiability.basis)
     first, begin = stage.problem.reevaluated(first), stage.problem.reevaluated(begin)
 
-    # Under hard limits, the design has to beat the initial control, scaled until it keeps them.
-    limited = limited_cost_of(stage, first)
-    outside = None if limited is None else limited.outside_start(task.control, budget)
-
-    search = ControlSearch(
+    search = Search(
         stage=stage,
         first=first,
         executor=executor,
         budget=budget,
-        limited=limited,
-        outside=outside,
-        is_brief=allows_few_evaluations(budget, evaluation_seconds),
         evaluation_seconds=evaluation_seconds,
     )
-    results = consume(search.run(starts), callback)
+    steps_before = task.plant.engine_steps - steps_before
+    results = consume(search.run([candidate_of(start) for start in starts]), callback)
     interrupted = budget.stop.requested
-
-    # Steps on other plants, also those of workers, are counted by the runs.
-    begins = [first] if initial_control is None else [first, begin]
-    choice = choose(search, begins, results, interrupted)
-    steps = task.plant.engine_steps - steps_before + sum(result.steps for result in results)
+    winner, point = _chosen(search, results, [first, begin])
+    steps = steps_before + search.steps
+    begun_names = {result.name for result in results}
     report = DesignReport(
         stage=stage,
         identifiability=identifiability,
         initial=first,
-        final=choice.point,
-        scaled_start=None if outside is None else outside.record,
-        remarks=() if interrupted else starts_without_time(task, starts, results),
+        final=point,
+        scaled_start=search.scaled_start,
+        remarks=() if interrupted else _without_time(task, starts, begun_names),
     )
-    return report.design(choice.best, choice.results, budget.seconds_used, steps, interrupted)
-
-
-def _design_release(
-    task: DesignTask,
-    space: ReleaseSpace,
-    budget: Budget,
-    callback: DesignCallback | None,
-    executor: ExecutorLike | None,
-) -> Design:
-    """Design the initial state of a motion whose control is given. See `design`."""
-    require_feasible_start(task)
-    require_coarse_factor(task)
-    steps_before = task.plant.engine_steps
-
-    first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    identifiability = identifiability_along(task, first)
-    require_designable(task, identifiability)
-    stage = DescentLevel(task, identifiability.basis)
-    first = stage.problem.reevaluated(first)
-
-    search = ReleaseSearch(stage, space, budget, callback, executor)
-    found = search.run()
-    interrupted = budget.stop.requested
-
-    # The stated release stays where no better one within the limits was found.
-    chosen, played = found.point, task
-    if first.cost < chosen.cost and keeps_limits(limited_cost_of(stage), first):
-        chosen = first
-    elif chosen.trajectory is not None:
-        played = task.released_as(chosen.trajectory.state[0])
-
-    best = RunResult(
-        name=found.found_by,
-        control=task.control,
-        cost=chosen.cost,
-        status=found.status,
-        slope=np.nan,
-        history=found.history,
-        point=chosen,
+    ending = Ending(
+        name=winner.name,
+        status=winner.ended,
+        slope=winner.slope,
+        history=winner.history,
+        starts=tuple(result.start_result for result in results),
     )
-    report = DesignReport(
-        stage=stage,
-        identifiability=identifiability,
-        initial=first,
-        final=chosen,
-        played=played,
-        remarks=tuple(space.edges(found.best.shares)),
+    return report.design(ending, budget.seconds_used, steps, interrupted)
+
+
+def _chosen(
+    search: Search, results: Sequence[Candidate], begins: Sequence[DesignPoint]
+) -> tuple[Candidate, DesignPoint]:
+    """Choose the best candidate, and the point of the design.
+
+    The beginning counts where no candidate is better, if it keeps the limits. Where nothing keeps
+    them, the candidate that came nearest to an optimum is shown.
+
+    Args:
+        search: The search.
+        results: The candidates that were begun.
+        begins: The initial control and the one with which the search began.
+    """
+    is_limited, interrupted = search.grounds.is_limited, search.budget.stop.requested
+    nothing = Candidate(
+        name="initial control", control=search.stage.task.control, status=Status.INTERRUPTED
     )
-    steps = task.plant.engine_steps - steps_before
-    made = report.design(best, (), budget.seconds_used, steps, interrupted)
-    return replace(made, starts=found.starts)
+    best = min(results, key=lambda result: (result.cost, result.rank), default=nothing)
+    point: DesignPoint | None = best.point
+    if is_limited:
+        shown = best.over_horizon if best.best is None else best.best
+        point = point_at_stated_rate(search.stage, shown) if results else None
+    cost = np.inf if point is None or best.best is None else point.cost
+    cheaper = [begin for begin in begins if begin.cost <= cost and search.keeps_limits(begin)]
+    if cheaper:
+        begin = min(cheaper, key=lambda each: each.cost)
+        status = Status.BEST_SEEN if best.ended is Status.INFEASIBLE else best.ended
+        return replace(best, status=status, best=search.stage.task.control), begin
+    if point is not None and point.trajectory is not None:
+        return best, point
+
+    if not interrupted:
+        if results and all(result.status is Status.LOST for result in results):
+            fault = "" if search.executor is None else Workers.of(search.executor).probable_fault
+            raise LostWorkError(
+                f"the worker of every start was lost several times, so there is no design: {fault}"
+            )
+        raise SimulationDivergedError("the simulation diverges from every start")
+    return best, begins[0]
+
+
+def _without_time(
+    task: DesignTask, starts: Sequence[InitialControl], begun: Collection[str]
+) -> tuple[str, ...]:
+    """Say which initial controls were left out, because the time was too short for them."""
+    left = [start.name for start in starts if start.name not in begun]
+    seconds = task.experiment.descent.seconds
+    if not left or not begun or seconds is None:
+        return ()
+    return (
+        f"{len(left)} of {len(starts)} initial controls were left out ({listed(left)}), because "
+        f"{seconds:g} s are too short to optimise from all of them; for more of them, raise "
+        "descent.seconds or use more workers",
+    )
+
+
+def consume(
+    events: Generator[DesignEvent, None, T], callback: Callable[[DesignEvent], None] | None
+) -> T:
+    """Run a search to its end, with a callback for every event; return its result."""
+    try:
+        while True:
+            try:
+                event = next(events)
+            except StopIteration as end:
+                result: T = end.value
+                return result
+            if callback is not None:
+                callback(event)
+    finally:
+        # A callback that raises an error ends the search, with all moves in other processes.
+        events.close()
 
 
 def _require_controls(task: DesignTask) -> None:
@@ -257,13 +273,3 @@ def _checked_control(task: DesignTask, control: Array) -> Array:
         )
 
     return control
-
-
-def _point_of_given(
-    task: DesignTask, first: DesignPoint, initial_control: Array | None
-) -> DesignPoint:
-    """Evaluate the control with which the search begins; the initial control without another."""
-    if initial_control is None:
-        return first
-    trajectory = task.plant.simulate(task.theta, initial_control)
-    return task.problem.point(trajectory, CENTRAL_DIFFERENCES)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mjfim.excitation.evaluation import design_warnings, evaluate_point
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint
-from mjfim.excitation.run_result import RunResult
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import Verification, verify
 from mjfim.excitation.violations import all_violations_of
@@ -20,11 +18,32 @@ from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.design import (
     Design,
     Evaluation,
+    HistoryRow,
     ScaledStart,
+    StartResult,
     Status,
     improvement_per_iteration,
     without_motions,
 )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ending:
+    """How the search for a design has ended.
+
+    Attributes:
+        name: Name of the initial control from which the design was found.
+        status: Outcome of its descent.
+        slope: Slope of the cost at the last iterate.
+        history: Iterates.
+        starts: Result of every initial control.
+    """
+
+    name: str
+    status: Status
+    slope: float
+    history: tuple[HistoryRow, ...]
+    starts: tuple[StartResult, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,8 +70,7 @@ class DesignReport:
 
     def design(
         self,
-        best: RunResult,
-        results: Sequence[RunResult],
+        best: Ending,
         seconds: float,
         steps: int,
         interrupted: bool,
@@ -88,7 +106,6 @@ class DesignReport:
         warnings = (*design_warnings(final, found, task, clamped, rough), *self.remarks)
         return self._record(
             best=best,
-            results=results,
             seconds=seconds,
             steps=steps,
             status=status,
@@ -101,8 +118,7 @@ class DesignReport:
     def _record(
         self,
         *,
-        best: RunResult,
-        results: Sequence[RunResult],
+        best: Ending,
         seconds: float,
         steps: int,
         status: Status,
@@ -140,7 +156,7 @@ class DesignReport:
             scaled_start=self.scaled_start,
             warnings=warnings,
             found_by=best.name,
-            starts=tuple(result.start_result for result in results),
+            starts=best.starts,
             nuisance=tuple(p.name for p in parameters.parameters if p.nuisance),
             combinations=tuple(str(group) for group in self.identifiability.groups_along_all),
             combined=combined,

@@ -15,11 +15,16 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.constraint_kinds import ConstraintValues, EndStateConstraint
-from mjfim.excitation.controls_within_limits import LimitedCost
+from mjfim.excitation.inside import InsideControl, LimitedCost
+from mjfim.parallel.budget import Budget
 
 # Singular values of the reachable ends, relative to the largest one, below which they count as
 # zero: no control of reasonable size reaches these directions.
 LEAST_REACH = 1e-6
+
+# Shares of a control that are tried, and the largest number of corrections of each.
+SHARES = (1.0, 0.98, 0.94, 0.85, 0.72, 0.55, 0.35)
+CORRECTIONS = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,3 +106,40 @@ class EndCorrection:
 def _has_tolerance(end: EndStateConstraint) -> NDArray[np.bool_]:
     """(nx,) True for each component of the last state that has a tolerance."""
     return np.isfinite(end.bounds.upper)
+
+
+def with_corrected_end(cost: LimitedCost, control: Array, budget: Budget) -> InsideControl | None:
+    """Find a large share of a control that keeps all limits, when its end is corrected.
+
+    Args:
+        cost: The cost within the limits.
+        control: (N, nu) control, whose motion misses its target by little [u-unit].
+        budget: A request to stop ends the search.
+
+    Returns:
+        The control; None where the motion does not miss its target, or no share helps.
+    """
+    centre = cost.level.task.centre
+    correction: EndCorrection | None = None
+    for share in SHARES:
+        candidate = np.asarray(centre + share * (control - centre))
+        for corrections_left in reversed(range(1 + CORRECTIONS)):
+            values = cost.values(candidate)
+            if values is None or budget.stop.requested:
+                break
+            if cost.constraints.is_feasible(values):
+                point = cost.point(candidate) if cost.keeps(candidate) else None
+                if point is not None and np.isfinite(point.cost):
+                    deviation = candidate - centre
+                    return InsideControl(about=centre, deviation=deviation, point=point)
+                break
+            margins = cost.constraints.margins(values)
+            misses = any(each < 0.0 for kind, each in margins.items() if kind.startswith("end_"))
+            if not (misses and corrections_left):
+                break
+            # The change of the control hardly depends on its size, so that it is computed once.
+            correction = correction or EndCorrection.along(cost, values)
+            if correction is None:
+                return None
+            candidate = correction.corrected(candidate, values)
+    return None

@@ -8,11 +8,10 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, listed
-from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.levels import DescentLevel, regulator_for
 from mjfim.excitation.limits import unsupported_ranges
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, Verification
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import (
     ExperimentError,
     SimulationDivergedError,
@@ -21,6 +20,7 @@ from mjfim.excitation.task_parts import require_controls
 from mjfim.experiment.schema import Experiment
 from mjfim.information.marginal import shared
 from mjfim.parallel import ExecutorLike, Workers
+from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.events import DesignCallback, shown_progress

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
+from mjfim.optimize.projection_operator import Regulator
 from mjfim.plant.lumped_parameters import LumpedParameters
 from mjfim.records.trajectory import Trajectory
 
@@ -20,6 +21,14 @@ AUTO_COARSE_FACTOR = 4
 
 # Smallest number of samples of a coarse level.
 MIN_COARSE_SAMPLES = 50
+
+# Factors by which the samples and the timestep of several coarse levels are longer, where each
+# sample is one engine step; the coarsest level first.
+SAMPLE_FACTORS = (8, 4, 2)
+
+# Growth of a small deviation along the trajectory above which the projection uses feedback. It is
+# measured in the best units of the state, see `amplification_in_best_units`.
+FEEDBACK_THRESHOLD = 10.0
 
 # Largest relative change of the initial cost that a coarse level without hard limits may cause.
 MAX_COARSE_CHANGE = 0.05
@@ -281,3 +290,65 @@ def similar_level(
     size = fine.task.problem.size(first)
     similar = has_similar_cost(coarse, first, size, MAX_CONSTRAINED_COARSE_CHANGE)
     return coarse if similar else None
+
+
+def coarser_levels(
+    fine: DescentLevel, evaluated: DesignPoint | None = None
+) -> tuple[DescentLevel, ...]:
+    """Make several coarser levels where each sample is one engine step.
+
+    With more engine steps in a sample, one level with a longer timestep is enough (`easier_level`).
+
+    Args:
+        fine: The stated level, on the plant without clamps.
+        evaluated: The initial control on the unmodified plant; None where it is not known.
+
+    Returns:
+        The levels on which the initial control costs nearly as much, the coarsest first; none with
+        a stated `descent.coarse`.
+    """
+    task = fine.task
+    if task.experiment.descent.coarse != "auto" or task.system.grid.substeps > 1:
+        return ()
+
+    first = first_point(fine, evaluated)
+    if first is None:
+        return ()
+
+    # Dry friction is smooth in the motion as well.
+    stated = task.system.variant
+    smooth = replace(stated, smoothed=bool(stated.smoothing_speeds))
+    variants = [replace(smooth, sample_factor=factor) for factor in _sample_factors(task)]
+    levels = [similar_level(fine, first, partial(task.with_variant, each)) for each in variants]
+    return tuple(level for level in levels if level is not None)
+
+
+def _sample_factors(task: DesignTask) -> list[int]:
+    """Factors of the samples that divide the horizon and leave enough samples."""
+    N = task.samples
+    return [k for k in SAMPLE_FACTORS if N % k == 0 and MIN_COARSE_SAMPLES * k <= N]
+
+
+def regulator_for(task: DesignTask) -> Regulator:
+    """Make the regulator of the projection operator.
+
+    Args:
+        task: The task.
+
+    Returns:
+        A regulator with unit weights on state and control in units of their sizes, and without
+        feedback where deviations grow less than `FEEDBACK_THRESHOLD`.
+    """
+    nx = task.space.nx
+    state_sizes, control_sizes = task.sizes[:nx], task.sizes[nx:]
+
+    # The sum over samples is a mean over time, so that the weight of the last state has no unit.
+    share = 1.0 / task.samples
+    last = np.diag(state_sizes**-2.0)
+    return Regulator(
+        Q=last * share,
+        R=np.diag(control_sizes**-2.0) * share,
+        terminal=last,
+        feedback_threshold=FEEDBACK_THRESHOLD,
+        state_sizes=state_sizes,
+    )

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.robust import ParameterSamples
-from mjfim.experiment.system import System
 from mjfim.information.criteria import Criterion
 from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.lq import TangentCurve
@@ -124,53 +121,6 @@ DIVERGED = DesignPoint(
 )
 
 
-class SampleEvaluation(Protocol):
-    """Evaluates the further parameter samples of a robust design elsewhere."""
-
-    def points(
-        self,
-        system: System,
-        problem: DesignProblem,
-        thetas: Array,
-        ctrl: Array,
-        accuracy: DifferenceAccuracy,
-    ) -> tuple[DesignPoint, ...] | None:
-        """Evaluate a control at all samples.
-
-        Args:
-            system: System of the plant.
-            problem: The cost.
-            thetas: (S-1, p) the samples [theta-unit].
-            ctrl: (N, nu) the control [u-unit].
-            accuracy: Differences with which sensitivities are computed.
-
-        Returns:
-            Points with information and criterion, but without their motions; None where the
-            simulation diverges at a sample.
-        """
-
-    def slopes(
-        self,
-        system: System,
-        problem: DesignProblem,
-        thetas: Array,
-        ctrl: Array,
-        points: Sequence[DesignPoint],
-    ) -> list[Array]:
-        """Differentiate the criterion at all samples by the control.
-
-        Args:
-            system: System of the plant.
-            problem: The cost.
-            thetas: (S-1, p) the samples [theta-unit].
-            ctrl: (N, nu) the control [u-unit].
-            points: The samples, evaluated along this control.
-
-        Returns:
-            (N, nu) derivative at each sample.
-        """
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DesignProblem:
     """The cost J of a design, in the form that Algorithm 1 of the paper needs.
@@ -186,8 +136,6 @@ class DesignProblem:
         parameter_samples: Samples over which a robust design pools the criterion, theta first, or
             None. One control drives all samples, without feedback.
         lumped: Parameters whose sensitivities follow from those of the others, or None.
-        elsewhere: What evaluates the further samples, and the system of the plant; None for this
-            process.
     """
 
     plant: Plant
@@ -197,7 +145,6 @@ class DesignProblem:
     forward_differences_only: bool = False
     parameter_samples: ParameterSamples | None = None
     lumped: LumpedParameters | None = None
-    elsewhere: tuple[SampleEvaluation, System] | None = None
 
     def point(
         self,
@@ -220,25 +167,12 @@ class DesignProblem:
         if point.criterion is None:
             return DIVERGED
 
-        others = self._evaluated_samples(trajectory.ctrl, accuracy)
-        return DIVERGED if others is None else self._with_cost(replace(point, others=others))
-
-    def _evaluated_samples(
-        self, ctrl: Array, accuracy: DifferenceAccuracy
-    ) -> tuple[DesignPoint, ...] | None:
-        """Points of a control at the further parameter samples; None where one diverges."""
-        thetas = self._further_samples()
-        if self.elsewhere is not None and len(thetas):
-            evaluation, system = self.elsewhere
-            return evaluation.points(system, self, thetas, ctrl, accuracy)
-
         others = []
-        for theta in thetas:
-            other = self.sample_point(theta, ctrl, accuracy)
-            if other.trajectory is None:
-                return None
-            others.append(other)
-        return tuple(others)
+        for theta in self._further_samples():
+            others.append(self.sample_point(theta, trajectory.ctrl, accuracy))
+            if others[-1].trajectory is None:
+                return DIVERGED
+        return self._with_cost(replace(point, others=tuple(others)))
 
     def sample_point(self, theta: Array, ctrl: Array, accuracy: DifferenceAccuracy) -> DesignPoint:
         """Evaluate the criterion of a control at a further parameter sample.
@@ -412,21 +346,10 @@ class DesignProblem:
         weights = samples.weights(point.phi)
         a, b = weights[0] * a, weights[0] * b
 
-        for weight, slope in zip(weights[1:], self._slopes_of_samples(point), strict=True):
-            b += weight * slope
-        return a, b
-
-    def _slopes_of_samples(self, point: DesignPoint) -> list[Array]:
-        """(N, nu) derivatives of the criterion at the further samples by the control."""
         thetas = self._further_samples()
-        if self.elsewhere is not None and len(thetas):
-            evaluation, system = self.elsewhere
-            ctrl = _computed(point)[0].ctrl
-            return evaluation.slopes(system, self, thetas, ctrl, point.others)
-        return [
-            self.sample_slope(theta, other)
-            for theta, other in zip(thetas, point.others, strict=True)
-        ]
+        for weight, theta, other in zip(weights[1:], thetas, point.others, strict=True):
+            b += weight * self.sample_slope(theta, other)
+        return a, b
 
     def _criterion_gradient(
         self, theta: Array, point: DesignPoint, observations: SubstepObservations | None = None

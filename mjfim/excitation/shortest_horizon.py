@@ -14,7 +14,6 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, MjfimError, NoResultError
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.levels import AUTO_COARSE_FACTOR, MIN_COARSE_SAMPLES
@@ -30,6 +29,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
 from mjfim.parallel import ExecutorLike, Workers
+from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.recordings import formats
 from mjfim.records.base import SavedRecord
 from mjfim.records.campaign import missed_targets

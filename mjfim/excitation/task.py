@@ -14,7 +14,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.holding_control import holding_control, least_drift_control
 from mjfim.excitation.limits import Limit, limits_of
-from mjfim.excitation.objective import DesignProblem, RunningCost, SampleEvaluation
+from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.prior_information import information_of
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.robust import ParameterSamples
@@ -79,7 +79,6 @@ class DesignTask:
             None.
         release: Ranges of the initial state within which the release is designed, or None where
             the control is.
-        sample_evaluation: What evaluates the further parameter samples; None for this process.
     """
 
     system: System
@@ -94,7 +93,6 @@ class DesignTask:
     added_information: Array | None
     samples_of_parameters: ParameterSamples | None
     release: ReleaseSpace | None
-    sample_evaluation: SampleEvaluation | None = None
 
     @classmethod
     def resolve(
@@ -335,14 +333,12 @@ class DesignTask:
             R=self.control_weight,
             desired_control=self.control_about,
         )
-        evaluation = self.sample_evaluation
         return DesignProblem(
             plant=self.plant,
             theta=self.theta,
             information=self.information,
             running=running,
             parameter_samples=self.samples_of_parameters,
-            elsewhere=None if evaluation is None else (evaluation, self.system),
         )
 
     @property

@@ -123,7 +123,6 @@ class Comparison(ShownRecord):
         nuisance: Names of the nuisance parameters.
         rows: Result of each method.
         seconds: Time that each method had [s].
-        steps: MuJoCo steps that each method had; may be infinite.
         seed: Seed of the random numbers.
         weighted: True if J has further terms besides the criterion.
         interrupted: True if the user interrupted the comparison.
@@ -138,7 +137,6 @@ class Comparison(ShownRecord):
     nuisance: tuple[str, ...]
     rows: tuple[MethodResult, ...]
     seconds: float
-    steps: float
     seed: int
     weighted: bool
     interrupted: bool = False
@@ -230,7 +228,7 @@ class Comparison(ShownRecord):
         """The contents of the record in JSON."""
         return {
             **super().summary(),
-            "budget": {"seconds": self.seconds, "steps": self.steps},
+            "budget": {"seconds": self.seconds},
             "best": None if self.best is None else self.best.method,
             "beating": [row.method for row in self.beating],
         }

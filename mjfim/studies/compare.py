@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import (
     ExperimentError,
     NoResultError,
@@ -19,7 +19,7 @@ from mjfim.errors import (
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.designable import designable
 from mjfim.excitation.evaluation import point_at_stated_rate
-from mjfim.excitation.feasibility import shrink_until_feasible
+from mjfim.excitation.inside import InsideSearch, LimitedCost
 from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_controls
@@ -28,14 +28,14 @@ from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.information.identifiability import Identifiability
-from mjfim.parallel import ExecutorLike, Workers
+from mjfim.parallel import ExecutorLike, Workers, carry_out
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
+from mjfim.records.design import Status
 from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent, shown_progress
-from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
-from mjfim.studies.baselines.methods import METHODS, run_baseline
-from mjfim.studies.baselines.parts import PartsOfBaseline
-from mjfim.studies.baselines.titles import TITLES
+from mjfim.studies.baseline_titles import TITLES
+from mjfim.studies.baselines import METHODS, BaselineSearch, SearchResult, run_baseline
 
 # Name of the design for the user.
 DESIGN_TITLE = "mjfim's design"
@@ -43,23 +43,15 @@ DESIGN_TITLE = "mjfim's design"
 # Remark about a method that the user interrupted.
 INTERRUPTED_NOTE = "interrupted"
 
-# Share of its time after which a design is stopped. A design checks the time itself, but only after
-# each iterate.
-LATEST_END = 1.05
-
 # Largest number of iterations of the design. It is never reached, because the budget ends the
 # design.
 UNLIMITED_ITERATIONS = 100_000
-
-# Reports the progress of one method: the used share of its budget and the lowest J so far.
-Progress = Callable[[float, float], None]
 
 
 def compare(
     experiment: Experiment,
     *,
     seconds: float = 60.0,
-    steps: float | None = None,
     seed: int = 0,
     methods: Sequence[str] | None = None,
     executor: ExecutorLike | None = None,
@@ -68,7 +60,7 @@ def compare(
     stop: StopToken | None = None,
     progress: bool = True,
 ) -> Comparison:
-    """Run baselines and then the design, each until its time or its MuJoCo steps are used up.
+    """Run baselines and then the design, each until its time is used up.
 
     All methods search for a control under one set of limits and with one cost J. They are evaluated
     at every engine step of the user's model.
@@ -76,7 +68,6 @@ def compare(
     Args:
         experiment: Experiment for which controls are searched.
         seconds: Time of each method [s].
-        steps: MuJoCo steps of each method; None for time alone.
         seed: Seed of the baselines.
         methods: Keys of the baselines (`mjfim.studies.baselines.methods.METHODS`); None for all
             that are applicable.
@@ -97,7 +88,6 @@ def compare(
         return compare_task(
             task,
             seconds=seconds,
-            steps=steps,
             seed=seed,
             methods=methods,
             executor=executor,
@@ -110,7 +100,6 @@ def compare_task(
     task: DesignTask,
     *,
     seconds: float = 60.0,
-    steps: float | None = None,
     seed: int = 0,
     methods: Sequence[str] | None = None,
     executor: ExecutorLike | None = None,
@@ -118,17 +107,16 @@ def compare_task(
     stop: StopToken | None = None,
 ) -> Comparison:
     """Compare the design of a resolved task with baselines. See `compare`."""
-    if not (seconds > 0.0 and np.isfinite(seconds)) or not (steps is None or steps > 0.0):
-        raise ExperimentError("compare: seconds must be positive and finite, and steps positive")
+    if not (seconds > 0.0 and np.isfinite(seconds)):
+        raise ExperimentError("compare: seconds must be positive and finite")
 
-    chosen = (*chosen_methods(task, methods), DESIGN)
+    chosen = (*chosen_methods(task.system, methods), DESIGN)
     identifiability = _identifiability(task)
     evaluation = MethodEvaluation(task, identifiability.basis)
     search = BaselineSearch(
         experiment=task.experiment,
         method=DESIGN,
         seconds=seconds,
-        steps=np.inf if steps is None else float(steps),
         seed=seed,
         combinations=evaluation.stage.basis,
         added_information=task.added_information,
@@ -169,18 +157,17 @@ def compare_task(
         nuisance=tuple(parameter.name for parameter in p.parameters if parameter.nuisance),
         rows=tuple(rows),
         seconds=seconds,
-        steps=search.steps,
         seed=seed,
         weighted=bool(task.control_weight.any() or task.tracking.any()),
         interrupted=interrupted,
     )
 
 
-def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str, ...]:
+def chosen_methods(system: System, methods: Sequence[str] | None) -> tuple[str, ...]:
     """Choose the baselines that run.
 
     Args:
-        task: Task that is compared.
+        system: The system.
         methods: Keys that the user requests; None for all that are applicable.
 
     Returns:
@@ -190,20 +177,12 @@ def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str
         ExperimentError: No baseline is requested, a key is unknown, or its method is not
             applicable.
     """
-    require_controls(task.system, "compare")
+    require_controls(system, "compare")
     if methods is None:
-        return tuple(
-            key for key, baseline in METHODS.items() if task.is_limited or not baseline.needs_limits
-        )
-
+        return tuple(METHODS)
     for key in methods:
         if key not in METHODS and key != DESIGN:
             raise ExperimentError(f"methods: {unknown('method', key, [*METHODS, DESIGN])}")
-        if key in METHODS and METHODS[key].needs_limits and not task.is_limited:
-            raise ExperimentError(
-                f"methods: {key} needs hard limits; {task.experiment.source} enforces none"
-            )
-
     chosen = tuple(key for key in dict.fromkeys(methods) if key != DESIGN)
     if not chosen:
         raise ExperimentError(
@@ -227,17 +206,7 @@ def _identifiability(task: DesignTask) -> Identifiability:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _MethodRun:
-    """One method of a comparison.
-
-    Attributes:
-        search: The order.
-        index: Number of the method, from 0.
-        count: Number of methods.
-        callback: Called with the progress, or None.
-        executor: The method is divided among its workers; None for this process.
-        stop: Ends the method early.
-        identifiability: What can be identified; no method has to find it within its budget.
-    """
+    """One method of a comparison."""
 
     search: BaselineSearch
     index: int
@@ -246,6 +215,7 @@ class _MethodRun:
     executor: ExecutorLike | None
     stop: StopToken
     identifiability: Identifiability
+    begun: float = field(default_factory=time.monotonic)
 
     @property
     def title(self) -> str:
@@ -253,80 +223,75 @@ class _MethodRun:
         method = self.search.method
         return DESIGN_TITLE if method == DESIGN else TITLES[method]
 
-    def report(self, share: float, cost: float) -> None:
-        """Report the used share of the budget and the lowest J so far."""
+    def report(self, cost: float) -> None:
+        """Report the used share of the time and the lowest J so far."""
         if self.callback is None:
             return
-
         event = StudyEvent(
             study="compare",
             part=self.title,
             index=self.index,
             count=self.count,
-            share=min(share, 1.0),
+            share=min((time.monotonic() - self.begun) / self.search.seconds, 1.0),
             message=f"best J {cost:.5g}",
         )
         self.callback(event)
 
     def baseline(self, evaluation: MethodEvaluation) -> MethodResult | None:
         """Run a baseline and evaluate its control; None where it was stopped without one."""
+        result: SearchResult | None
         if self.executor is None:
-            result: SearchResult | None = run_baseline(
-                self.search, lambda used, best: self.report(used, best.cost), self.stop
-            )
+            result = run_baseline(self.search, self.report, self.stop)
         else:
-            result = self.divided_baseline(self.executor, evaluation.task.system)
-
+            result = self._divided(self.executor, evaluation.task.system)
         # An interrupted search is compared by its best control so far.
         interrupted = self.stop.requested
         if result is None or (interrupted and result.control is None):
             return None
-        note = INTERRUPTED_NOTE if interrupted else ""
-        return evaluation.result(self.search.method, self.title, result, note)
-
-    def divided_baseline(self, executor: ExecutorLike, system: System) -> SearchResult | None:
-        """Run a part of a baseline in every worker, each with its share of the steps.
-
-        Args:
-            executor: The executor of the workers.
-            system: The system, whose files the workers receive.
-
-        Returns:
-            The best result; None where no part has a result.
-        """
-        workers = Workers.of(executor)
-        count = workers.count
-        order = replace(
-            self.search,
-            experiment=for_workers(self.search.experiment, system.source),
-            steps=self.search.steps / count,
-            threads=1,
+        return evaluation.result(
+            self.search.method, self.title, result, INTERRUPTED_NOTE if interrupted else ""
         )
-        parts = [replace(order, part=(i, count)) for i in range(count)]
-        results = PartsOfBaseline(workers, parts, self.stop).results()
+
+    def _divided(self, executor: ExecutorLike, system: System) -> SearchResult | None:
+        """Run a part of a baseline in every worker; a part that is lost is left out."""
+        count = Workers.of(executor).count
+        experiment = for_workers(self.search.experiment, system.source)
+        parts = [
+            replace(self.search, experiment=experiment, threads=1, part=(i, count))
+            for i in range(count)
+        ]
+        budget = Budget(stop=self.stop)
+        outcomes = list(carry_out(executor, run_baseline, parts, budget))
+        results = [outcome.result for outcome in outcomes if not outcome.is_lost]
         if not results:
             return None
-
-        best = min(results, key=lambda result: (result.cost, -result.margin))
         return replace(
-            best,
+            min(results, key=lambda result: result.cost),
             seconds=max(result.seconds for result in results),
             steps=sum(result.steps for result in results),
         )
 
     def design(self, evaluation: MethodEvaluation) -> MethodResult | None:
-        """Design with the budget of the method, and evaluate the result.
+        """Design with the time of the method, and evaluate the result.
 
         Returns:
-            The result; None where the design ended without one.
+            The result; None where the design was stopped before it had one.
         """
+        best = np.inf
+
+        def watch(event: Event) -> None:
+            """Report an iterate."""
+            nonlocal best
+            if self.callback is not None:
+                self.callback(event)
+            if isinstance(event, DesignEvent):
+                best = best if event.row.margin < 0.0 else min(best, event.row.cost)
+                self.report(best)
+
         descent = self.search.experiment.descent
         iterations = max(descent.max_iterations, UNLIMITED_ITERATIONS)
         stated = self.search.experiment.replace(
             descent={"seconds": self.search.seconds, "max_iterations": iterations}
-        )
-        watch = DesignWatch(
-            search=self.search, progress=self.report, callback=self.callback, stop=self.stop
         )
         try:
             task = DesignTask.resolve(
@@ -338,11 +303,11 @@ class _MethodRun:
                 task,
                 callback=watch,
                 executor=self.executor,
-                budget=design_budget(task, watch.design_stop),
+                budget=design_budget(task, self.stop),
                 identifiability=self.identifiability,
             )
         except SimulationDivergedError:
-            nothing = SearchResult(seconds=watch.budget.seconds_used, steps=watch.steps)
+            nothing = SearchResult(seconds=time.monotonic() - self.begun)
             return evaluation.result(DESIGN, self.title, nothing)
         except NoResultError:
             return None
@@ -350,75 +315,14 @@ class _MethodRun:
         result = SearchResult(
             control=design.trajectory.ctrl,
             cost=design.final.cost,
-            margin=0.0,
             found_by=design.found_by,
             seconds=design.seconds,
             steps=design.steps,
         )
-
-        # A design that its budget ended needs no remark about its status.
+        # A design that its time ended needs no remark about its status.
         status = design.status.value.split(":")[0].split(";")[0]
-        note = "" if watch.budget_ended else status
-        return evaluation.result(DESIGN, self.title, result, note)
-
-
-@dataclass(eq=False, kw_only=True)
-class DesignWatch:
-    """Watches the iterates of a design and stops it when the budget of a method is used up.
-
-    Attributes:
-        search: The order with the budget.
-        progress: Called with every iterate.
-        callback: Called with every event, or None.
-        stop: Ends the design early.
-        cost: Lowest J of a feasible iterate.
-        budget_ended: True once the budget has ended the design.
-        design_stop: Token of the design.
-    """
-
-    search: BaselineSearch
-    progress: Progress
-    callback: Callback | None = None
-    stop: StopToken = field(default_factory=StopToken)
-    cost: float = np.inf
-    budget_ended: bool = False
-
-    def __post_init__(self) -> None:
-        self.budget = Budget(
-            seconds=LATEST_END * self.search.seconds, steps=self.search.steps, stop=self.stop
-        )
-        self.design_stop = StopToken(also=lambda: self.stop.requested)
-        self._last_steps = 0
-
-    @property
-    def steps(self) -> int:
-        """MuJoCo steps that the design has taken so far."""
-        return int(self.budget.steps)
-
-    def __call__(self, event: Event) -> None:
-        """Count the steps of an iterate, and stop the design when the budget is exhausted.
-
-        The number of steps in an event is counted from the beginning of the current task of the
-        design, so it becomes smaller with every new task.
-        """
-        if self.callback is not None:
-            self.callback(event)
-        if not isinstance(event, DesignEvent):
-            return
-
-        row = event.row
-        is_same_task = row.steps >= self._last_steps
-        self.budget.spend(steps=row.steps - (self._last_steps if is_same_task else 0))
-        self._last_steps = row.steps
-
-        if not row.margin < 0.0:
-            self.cost = min(self.cost, row.cost)
-        seconds = self.budget.seconds_used / self.search.seconds
-        self.progress(max(seconds, self.budget.steps / self.search.steps), self.cost)
-
-        if self.budget.exhausted and not self.stop.requested:
-            self.budget_ended = True
-            self.design_stop.request()
+        is_late = design.status is Status.MAX_ITERATIONS
+        return evaluation.result(DESIGN, self.title, result, "" if is_late else status)
 
 
 class MethodEvaluation:
@@ -455,30 +359,20 @@ class MethodEvaluation:
         if found.control is None:
             return nothing
 
-        if method == DESIGN or not np.isfinite(found.cost):
-            return self._evaluate(method, title, found, note) or nothing
+        evaluated = self._evaluate(method, title, found, note) or nothing
+        if method == DESIGN or evaluated.outcome is not MethodOutcome.OUTSIDE:
+            return evaluated
 
-        evaluated: list[MethodResult] = []
-        deviation = _largest_entry(found.control - self.task.centre)
-
-        def result_if_feasible(control: Array) -> MethodResult | None:
-            """Result of a control, or None where it violates a limit."""
-            factor = 1.0
-            if control is not found.control:
-                factor = _largest_entry(control - self.task.centre) / deviation
-
-            shrunk = "" if factor == 1.0 else f"shrunk to {100.0 * factor:.3g} %"
-            remark = ", ".join(filter(None, [note, shrunk]))
-            result = self._evaluate(method, title, replace(found, control=control), remark)
-            if result is None:
-                return None
-            evaluated.append(result)
-            return None if result.outcome is MethodOutcome.OUTSIDE else result
-
-        repaired = shrink_until_feasible(found.control, self.task.centre, result_if_feasible)
-        if repaired is not None:
-            return repaired
-        return evaluated[0] if evaluated else nothing
+        # A control that violates a limit of the unmodified model is made smaller.
+        centre = self.task.centre
+        relaxed = DescentLevel(self.task.relaxed(), self.stage.basis)
+        search = InsideSearch(LimitedCost(level=relaxed), 0)
+        inside = search.largest(centre, found.control - centre, Budget())
+        if inside is None:
+            return evaluated
+        remark = ", ".join(filter(None, [note, f"shrunk to {100.0 * inside.share:.3g} %"]))
+        smaller = replace(found, control=inside.control)
+        return self._evaluate(method, title, smaller, remark) or nothing
 
     def _evaluate(
         self, method: str, title: str, found: SearchResult, note: str
@@ -546,8 +440,3 @@ class MethodEvaluation:
             margins={},
             relative_margins={},
         )
-
-
-def _largest_entry(deviation: Array) -> float:
-    """Largest entry of a deviation from the centre: (N, nu) [unit of the actuator]."""
-    return float(np.abs(deviation).max())

@@ -14,9 +14,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, first_ones
+from mjfim.excitation.levels import regulator_for
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import regulator_for
 from mjfim.information.smoothness import roughness, visible_columns
 from mjfim.optimize.directions import LBFGS
 from mjfim.optimize.lq import LinearRecursion, TangentCurve

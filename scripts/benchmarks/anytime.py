@@ -33,7 +33,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.output.vocabulary import DESIGNED, OTHER
 from mjfim.parallel.budget import measured_by, stop_on_interrupt
 from mjfim.records.comparison import DESIGN
-from mjfim.studies.baselines.titles import TITLES
+from mjfim.studies.baseline_titles import TITLES
 from mjfim.studies.compare import compare_task
 from scripts.benchmarks import arms
 
@@ -44,7 +44,7 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "models"
 SECONDS = (2.0, 3.0, 5.0, 10.0)
 
 # Baselines that run without further wishes: the best ones of the whole list.
-METHODS = ("multisine", "fourier5", "fourier15", "splines", "fourier15-mjfim")
+METHODS = ("multisine", "fourier5", "fourier15", "splines")
 
 # Relative difference of two costs below which they count as equal.
 TIE = 1e-3
@@ -90,15 +90,14 @@ def run(case: str, experiment: Experiment, seconds: float, methods: list[str]) -
         case: Name of the experiment.
         experiment: The experiment.
         seconds: Budget of every method [s of the processor].
-        methods: Keys of the baselines; those that need limits are left out without limits.
+        methods: Keys of the baselines.
 
     Returns:
         What each method found, the design last.
     """
     task = DesignTask.resolve(experiment, threads=1)
-    wanted = [key for key in methods if task.is_limited or not key.endswith("-mjfim")]
     with measured_by(time.process_time):
-        found = compare_task(task, seconds=seconds, methods=wanted)
+        found = compare_task(task, seconds=seconds, methods=methods)
 
     return [
         Found(

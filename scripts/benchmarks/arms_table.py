@@ -29,7 +29,7 @@ from mjfim.records.comparison import Comparison, MethodResult
 from scripts.benchmarks import arms
 
 # Methods with five and with fifteen harmonics.
-FEW, MANY = ("fourier5", "fourier5-mjfim"), ("fourier15-mjfim",)
+FEW, MANY = ("fourier5",), ("fourier15",)
 
 # Frequency of the series that is one start of the design [Hz].
 FUNDAMENTAL = 0.2

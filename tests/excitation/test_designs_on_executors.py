@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.budget import Budget, StopToken
 from mjfim.excitation.design import design_task
 from mjfim.parallel import Workers
+from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Design, Status
 from mjfim.records.events import DesignEvent
 from tests.support.executors import KINDS, processes

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from mjfim.excitation.design import design_task
 from mjfim.excitation.extended_system import ExtendedDesignProblem, extend
-from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import direction_for
 from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
@@ -235,18 +230,3 @@ def test_an_expansion_without_psi_is_refused(tmp_path) -> None:
     assert plain.extended is None
     with pytest.raises(ValueError, match="extended"):
         extended_direction(plain, np.zeros((50, 1, 4)), np.eye(16), np.eye(1), np.eye(16))
-
-
-def test_the_experiment_chooses_the_extended_metric_and_it_lowers_the_cost(tmp_path: Path) -> None:
-    task = cart_task(
-        tmp_path, descent={"method": "metric", "psi_weight": 1e-4, "max_iterations": 3}
-    )
-    direction, problem = direction_for(DescentLevel(task, None))
-    assert isinstance(direction, ExtendedMetricDescent)
-    assert isinstance(problem, ExtendedDesignProblem)
-    assert direction.Q.shape == (16, 16)
-    assert np.count_nonzero(np.diag(direction.Q)[4:] == 1e-4 * task.dt) == 12
-    result = design_task(task)
-    costs = [row.cost for row in result.history]
-    assert len(costs) == 4
-    assert (np.diff(costs) < 0).all()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import Budget, StopToken
 from mjfim.errors import ExperimentError
-from mjfim.excitation import release_search, release_workers
 from mjfim.excitation.design import design_task
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task import DesignTask
@@ -22,6 +20,7 @@ from mjfim.experiment.system import System
 from mjfim.model.coordinates import tangent_components
 from mjfim.output.plots.convergence import convergence
 from mjfim.output.plots.design import trajectories
+from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status
 from mjfim.studies.monte_carlo import monte_carlo_system
 from tests.support.cli import run
@@ -83,55 +82,6 @@ def test_a_limit_of_the_velocity_holds_at_every_engine_step(tmp_path: Path) -> N
         mujoco.mj_step(model, data)
         fastest = max(fastest, abs(float(data.qvel[0])))
     assert 5.9 < fastest <= 6.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["threads", "pool"])
-def test_workers_find_the_release_of_one_process(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(release_search, "GRID_EXPONENT", 1)
-    monkeypatch.setattr(release_workers, "RELEASES_PER_ORDER", 2)
-    experiment = short(tmp_path, horizon=0.1, descent={"max_iterations": 6})
-    alone = mjfim.design(experiment, threads=1)
-
-    # Each slice of a local search ends after one release.
-    monkeypatch.setattr(release_workers, "SLICE_SECONDS", 0.0)
-    with ThreadPoolExecutor(2) if kind == "threads" else mjfim.Pool(2) as executor:
-        found = mjfim.design(experiment, threads=1, executor=executor)
-
-    assert found.final.cost == alone.final.cost
-    assert np.array_equal(found.trajectory.qpos, alone.trajectory.qpos)
-    assert [row.cost for row in found.history] == [row.cost for row in alone.history]
-    assert [(s.name, s.cost, s.status, s.iterations) for s in found.starts] == [
-        (s.name, s.cost, s.status, s.iterations) for s in alone.starts
-    ]
-
-
-def test_a_local_search_whose_worker_is_lost_is_called_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The search of the first release is lost after a slice, that of the second one at once."""
-    monkeypatch.setattr(release_search, "GRID_EXPONENT", 1)
-    monkeypatch.setattr(release_search, "LOCAL_SEARCHES", 2)
-    monkeypatch.setattr(release_workers, "SLICE_SECONDS", 0.0)
-    follow = release_workers._follow_in_worker
-    first: list[bytes] = []
-
-    def losing(order: release_workers._FollowOrder) -> Any:
-        """Run the first slice of the first search, and lose all others."""
-        first.append(order.start.shares.tobytes())
-        if len(first) > 1:
-            raise CancelledError
-        return follow(order)
-
-    monkeypatch.setattr(release_workers, "_follow_in_worker", losing)
-    experiment = short(tmp_path, horizon=0.1, descent={"starts": 2, "max_iterations": 6})
-    with ThreadPoolExecutor(1) as executor:
-        found = mjfim.design(experiment, threads=1, executor=executor)
-    assert [start.status for start in found.starts] == [Status.LOST, Status.LOST]
-    assert found.starts[0].iterations > 0
-    assert found.starts[1].iterations == 0
 
 
 @pytest.mark.slow

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,19 +12,13 @@ import pytest
 from scipy.stats import norm
 
 import mjfim
-from mjfim.budget import Budget, StopToken
 from mjfim.errors import ExperimentError
-from mjfim.excitation import sample_workers
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.robust import ParameterSamples
-from mjfim.excitation.sample_workers import SampleWorkers
 from mjfim.excitation.task import DesignTask
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import Parameter, ParameterSet
-from mjfim.parallel import dispatch
-from mjfim.parallel.kept import KeptPerThread
-from mjfim.plant.mixed_derivatives import FORWARD_DIFFERENCES
 from tests.support.numerics import CART_PARAMETERS, Array, body_task, cart_task
 
 KINDS = {
@@ -292,64 +285,3 @@ def test_workers_evaluate_the_samples_as_one_process_does(
     assert found.final.cost == alone.final.cost
     assert np.array_equal(found.trajectory.ctrl, alone.trajectory.ctrl)
     assert [row.cost for row in found.history] == [row.cost for row in alone.history]
-
-
-@pytest.mark.parametrize("kept", [1, 16])
-def test_the_count_of_engine_steps_does_not_depend_on_what_a_worker_keeps(
-    kept: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nor do orders count that this process carries out because their worker was lost."""
-    monkeypatch.setattr(sample_workers, "_worker_points", KeptPerThread(kept))
-    bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.5, 3.5)}}
-    task = cart_task(
-        tmp_path, parameters={**CART_PARAMETERS, **bounded}, robust={"samples": 2}, horizon=0.2
-    )
-
-    def counted(samples: SampleWorkers | None) -> int:
-        """Engine steps of a cost, of the same cost once more, and of its slope."""
-        made = DesignTask.resolve(task.experiment, threads=1)
-        problem = made.problem
-        thetas = made.samples_of_parameters.thetas
-        ctrl, accuracy = made.initial.ctrl, FORWARD_DIFFERENCES
-        before = made.plant.engine_steps
-        if samples is None:
-            for theta in [*thetas, *thetas]:
-                point = problem.sample_point(theta, ctrl, accuracy)
-            for theta in thetas:
-                problem.sample_slope(theta, point)
-            return made.plant.engine_steps - before
-        for _ in range(2):
-            points = samples.points(made.system, problem, thetas, ctrl, accuracy)
-            assert points is not None
-        samples.slopes(made.system, problem, thetas, ctrl, points)
-        return made.plant.engine_steps - before
-
-    stopped = StopToken()
-    stopped.request()
-    with ThreadPoolExecutor(1) as threads:
-        found = counted(SampleWorkers(threads, Budget()))
-        here = counted(SampleWorkers(threads, Budget(stop=stopped)))
-    assert found == here == counted(None)
-
-
-def test_a_cluster_that_does_not_answer_ends_a_robust_design(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(dispatch, "GRACE", 0.02)
-    monkeypatch.setattr(dispatch, "LONGEST_OVERTIME", 0.02)
-    monkeypatch.setattr(dispatch, "POLL_INTERVAL", 0.01)
-
-    class Empty(Executor):
-        """A Dask cluster without workers, on which nothing begins."""
-
-        _client = SimpleNamespace(nthreads=lambda: {})
-
-        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-            return Future()
-
-    bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.5, 3.5)}}
-    task = cart_task(
-        tmp_path, parameters={**CART_PARAMETERS, **bounded}, robust={"samples": 3}, horizon=0.1
-    )
-    with pytest.raises(ExperimentError, match="had no workers"):
-        design_task(task, executor=Empty(), budget=Budget(seconds=0.0))

@@ -12,14 +12,9 @@ from typing import Any
 
 import pytest
 
-from mjfim.budget import Budget, StopToken, measured_by
-from mjfim.excitation.controls_within_limits import LimitedCost
 from mjfim.excitation.design import design_task
-from mjfim.excitation.levels import DescentLevel
-from mjfim.excitation.multistart import Multistart
-from mjfim.excitation.objective import DesignProblem
-from mjfim.excitation.short_budget import allows_few_evaluations, enlarged
 from mjfim.excitation.task import DesignTask
+from mjfim.parallel.budget import Budget, StopToken, measured_by
 from mjfim.plant.batch import StepCount
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
@@ -184,61 +179,3 @@ def test_a_stop_during_the_descent_leaves_the_best_random_control(tmp_path: Path
     assert min(costs) < 0.3 * design.initial.cost
     assert design.final.cost == pytest.approx(min(costs), rel=1e-6)
     assert design.within_limits
-
-
-def test_iterations_alone_never_make_a_design_brief() -> None:
-    assert not allows_few_evaluations(Budget(iterations=1), 1e9)
-    assert allows_few_evaluations(Budget(seconds=10.0), 1.0)
-    assert not allows_few_evaluations(Budget(seconds=10.0), 0.1)
-
-
-def test_work_that_is_done_once_does_not_make_a_design_brief(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Workers that start, for example, belong to the first evaluation only."""
-
-    class Known(Exception):
-        """Ends a design when it is known whether its time allows few evaluations."""
-
-    seconds: list[float] = []
-    now = [0.0]
-    evaluate = DesignProblem.point
-
-    def timed(*args: Any, **keys: Any) -> Any:
-        """Evaluate in the next number of seconds, of which the last one remains."""
-        now[0] += seconds.pop(0) if len(seconds) > 1 else seconds[0]
-        return evaluate(*args, **keys)
-
-    def begun(search: Multistart) -> None:
-        """Tell whether the time allows few evaluations."""
-        raise Known(search.is_brief)
-
-    monkeypatch.setattr(DesignProblem, "point", timed)
-    monkeypatch.setattr(Multistart, "run", begun)
-    task = resting_arm(tmp_path, {"seconds": 100.0})
-    for later, is_brief in ((0.01, False), (2.0, True)):
-        seconds[:] = [10.0, later]
-        with measured_by(lambda: now[0]), pytest.raises(Known) as known:
-            design_task(task)
-        assert known.value.args == (is_brief,)
-
-
-@pytest.mark.parametrize(("seconds", "trials"), [(0.1, 1), (9.0, 3)])
-def test_a_single_larger_control_is_tried_where_trials_are_quick(
-    seconds: float, trials: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    limited = LimitedCost(level=DescentLevel(small_control(tmp_path, {}).relaxed(), None))
-    now, costs = [0.0], [3.0, 2.0, 4.0]
-
-    def timed(cost: LimitedCost, control: Any) -> float:
-        """Evaluate in some seconds."""
-        now[0] += seconds
-        return costs.pop(0)
-
-    monkeypatch.setattr(LimitedCost, "__call__", timed)
-    task = limited.level.task
-    with measured_by(lambda: now[0]):
-        larger = enlarged(limited, task.control, 5.0, Budget(seconds=100.0))
-    assert len(costs) == 3 - trials
-    factor = 1.25 ** min(trials, 2)
-    assert larger - task.centre == pytest.approx(factor * (task.control - task.centre))

@@ -256,7 +256,6 @@ def make_comparison(*rows: MethodResult, **changes: object) -> Comparison:
         nuisance=(),
         rows=rows,
         seconds=1.0,
-        steps=np.inf,
         seed=0,
         weighted=False,
     )

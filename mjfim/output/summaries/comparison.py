@@ -56,15 +56,12 @@ def describe_comparison(comparison: Comparison) -> Summary:
 
 
 def budget_in_words(comparison: Comparison) -> str:
-    """Return the time and the MuJoCo steps that each method had.
+    """Return the time that each method had.
 
     Args:
         comparison: The comparison.
     """
-    budget = f"{comparison.seconds:g} s"
-    if np.isfinite(comparison.steps):
-        budget += f" or {comparison.steps / 1e6:.3g} million MuJoCo steps"
-    return budget
+    return f"{comparison.seconds:g} s"
 
 
 def _method_table(comparison: Comparison) -> SummaryTable:

@@ -8,10 +8,6 @@ TITLES = {
     "multisine": "multisine (Schroeder)",
     "steps": "random steps",
     "fourier5": "Fourier 5",
-    "fourier5-D": "Fourier 5, on D",
     "fourier15": "Fourier 15",
     "splines": "B-splines",
-    "splines-D": "B-splines, on D",
-    "fourier5-mjfim": "Fourier 5, mjfim's optimiser",
-    "fourier15-mjfim": "Fourier 15, mjfim's optimiser",
 }

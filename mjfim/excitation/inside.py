@@ -1,0 +1,388 @@
+"""Controls that keep all hard limits, found without derivatives.
+
+A control is scaled about one that nearly holds the start, enlarged one actuator at a time, and
+changed at random. What keeps the limits is a simulation, first on the plant of the search and then
+on the unmodified model, so that these controls count where derivatives mislead, as with dry
+friction, and as a first result long before a descent has one.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import SimulationDivergedError
+from mjfim.excitation.bandwidth import bandwidth_basis
+from mjfim.excitation.constraint_kinds import ConstraintValues
+from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.evaluation import UNSTABLE_GROWTH, growth_along
+from mjfim.excitation.levels import DescentLevel, moved_alike
+from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.task import FADE_SHARE
+from mjfim.excitation.verification import verify
+from mjfim.parallel.budget import Budget
+from mjfim.records.design import ScaledStart
+
+# Shares of a control that are tried first; below the last one, each share is the same factor
+# smaller, to the least share at most. The largest share is then found to a ratio.
+SHARES = (1.0, 0.95)
+SHARE_STEP = 0.25
+LEAST_SHARE = 1e-6
+SHARE_RATIO = 1.05
+
+# A descent begins with this share of a control that is as large as the limits allow.
+BEGIN_SHARE = 0.95
+
+# Factors by which the deviation of a single actuator is enlarged while all limits hold.
+SINGLE_FACTORS = (2.0, 1.4)
+
+# Bandwidths of random controls, relative to the largest one that the control can have. Neighbours
+# differ much, because a search may end early.
+BANDWIDTHS = (0.6, 0.15, 1.0, 0.35, 0.06)
+CONTROLS_PER_BANDWIDTH = 2
+
+# Size of a random change relative to the control, at first and within bounds, and the factors by
+# which it changes after a success and after a failure. After four failures for one success the
+# size remains.
+FIRST_SIZE = 0.3
+SMALLEST_SIZE, LARGEST_SIZE = 0.03, 1.0
+AFTER_SUCCESS = 1.5
+AFTER_FAILURE = AFTER_SUCCESS**-0.25
+
+# Share of the changes that concern one actuator alone.
+SINGLE_SHARE = 0.5
+
+# Factor by which a control that amplifies disturbances too much is made smaller, and the number of
+# sizes that are tried.
+SMALLER = 0.6
+SMALLER_TRIALS = 3
+
+# Decrease of the cost that counts as progress (relative).
+LEAST_PROGRESS = 0.01
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LimitedCost:
+    """Cost of controls that keep all limits.
+
+    Attributes:
+        level: The stated level, on the plant without the clamps that limits make unreachable.
+        first: The initial control, evaluated on the unmodified plant; None where it is not known.
+    """
+
+    level: DescentLevel
+    first: DesignPoint | None = None
+
+    @cached_property
+    def constraints(self) -> ConstraintSet:
+        """The limits on the plant without clamps."""
+        return constraint_set_of(self.level.task)
+
+    def values(self, control: Array) -> ConstraintValues | None:
+        """Limited quantities along a control: (N, nu); None where the simulation diverges."""
+        task = self.level.task
+        observed = task.plant.observe(task.theta, control, self.constraints.observations)
+        if observed is None:
+            return None
+        return self.constraints.evaluate(*observed, slopes=False)
+
+    def nearly_keeps(self, control: Array) -> bool:
+        """Check the limits on the plant of the search only, which is much quicker."""
+        values = self.values(control)
+        return values is not None and self.constraints.is_feasible(values)
+
+    def keeps(self, control: Array) -> bool:
+        """Check the limits on the unmodified model as well."""
+        values = self.values(control)
+        if values is None or not self.constraints.is_feasible(values):
+            return False
+        return verify(self.level.task, values.trajectory).is_feasible
+
+    def point(self, control: Array) -> DesignPoint | None:
+        """Evaluate a control: (N, nu), inside limits or not; None where it diverges."""
+        values = self.values(control)
+        if values is None:
+            return None
+        known = None if self.first is None else moved_alike(self.first, values.trajectory)
+        point = self.level.problem.point(values.trajectory) if known is None else known
+        return None if point.trajectory is None else point
+
+    def __call__(self, control: Array) -> float:
+        """J of a control: (N, nu); infinite where it violates a limit."""
+        point = self.point(control) if self.keeps(control) else None
+        return np.inf if point is None else point.cost
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InsideControl:
+    """A control that keeps all limits.
+
+    Attributes:
+        about: (nu,) control from which it deviates [u-unit].
+        deviation: (N, nu) deviation [u-unit].
+        point: Its motion with its information and its cost.
+        share: Share of the deviation from which it was made by scaling.
+    """
+
+    about: Array
+    deviation: Array
+    point: DesignPoint
+    share: float = 1.0
+
+    @property
+    def control(self) -> Array:
+        """(N, nu) control [u-unit]."""
+        return np.asarray(self.about + self.deviation)
+
+    @property
+    def begin(self) -> Array:
+        """(N, nu) control with which a descent begins, some distance away from the limits."""
+        return np.asarray(self.about + BEGIN_SHARE * self.deviation)
+
+    @property
+    def cost(self) -> float:
+        """J of the control."""
+        return self.point.cost
+
+    @property
+    def record(self) -> ScaledStart:
+        """The control as an entry of the design."""
+        criterion = self.point.criterion
+        smallest = 0.0 if criterion is None else float(criterion.eigenvalues[0])
+        return ScaledStart(share=self.share, cost=self.cost, min_eigenvalue=smallest)
+
+
+def is_progress(before: float, after: float) -> bool:
+    """Check whether a cost is clearly lower than another one."""
+    return after < before - LEAST_PROGRESS * abs(before)
+
+
+def largest_share(keeps: Callable[[float], bool], budget: Budget) -> float | None:
+    """Find the largest share of a control that passes a test.
+
+    Args:
+        keeps: The test.
+        budget: A request to stop ends the search for a larger share.
+
+    Returns:
+        The share, up to a ratio of `SHARE_RATIO`; None where no share passes.
+    """
+    share, outside = 1.0, np.inf
+    smaller = iter(SHARES[1:])
+    while not keeps(share):
+        outside, share = share, next(smaller, SHARE_STEP * share)
+        if share < LEAST_SHARE:
+            return None
+
+    # Bisect between the share that passes and the next larger one that does not.
+    while SHARE_RATIO * share < outside < np.inf and not budget.stop.requested:
+        middle = float(np.sqrt(share * outside))
+        if keeps(middle):
+            share = middle
+        else:
+            outside = middle
+    return share
+
+
+def _keeps_share(
+    keeps: Callable[[Array], bool], about: Array, deviation: Array, share: float
+) -> bool:
+    """Check whether a share of a deviation passes a test of controls."""
+    return keeps(about + share * deviation)
+
+
+class InsideSearch:
+    """Search for controls that keep all limits, by scaling and by random changes.
+
+    Args:
+        cost: The cost within the limits.
+        seed: Seed of the random changes.
+    """
+
+    def __init__(self, cost: LimitedCost, seed: int) -> None:
+        self.cost = cost
+        self._rng = np.random.default_rng(seed)
+        # Bandwidths of random controls that have not been tried yet. None stands for the best
+        # control so far, as large as the limits allow.
+        self._untried: deque[float | None] = deque((None, *CONTROLS_PER_BANDWIDTH * BANDWIDTHS))
+
+    def scaled(self, control: Array, budget: Budget) -> InsideControl | None:
+        """Scale a control, (N, nu), about each control that nearly holds the start.
+
+        Returns:
+            The scaled control of lowest cost; None where no share keeps the limits.
+        """
+        found = [
+            self.largest(centre, self.fitted(control - centre), budget)
+            for centre in self.cost.level.task.centres
+        ]
+        return min((each for each in found if each), key=lambda each: each.cost, default=None)
+
+    def largest(self, about: Array, deviation: Array, budget: Budget) -> InsideControl | None:
+        """Find the largest share of a deviation, (N, nu), about (nu,), that keeps all limits.
+
+        The limits on the unmodified model are checked at the end, and at every share only where
+        that fails. A request to stop ends the search for a larger share.
+        """
+        for keeps in (self.cost.nearly_keeps, self.cost.keeps):
+            share = largest_share(partial(_keeps_share, keeps, about, deviation), budget)
+            if share is None:
+                return None
+            found = self._evaluated(about, share * deviation, share)
+            if found is not None:
+                return found
+        return None
+
+    def improvements(
+        self, best: InsideControl, budget: Budget, patience: float
+    ) -> Iterator[InsideControl]:
+        """Yield controls, each of which costs less than all before.
+
+        Random controls of all bandwidths come first, then random changes of the best control.
+
+        Args:
+            best: The best control so far.
+            budget: Ends the search.
+            patience: Number of changes without clear progress after which the search ends.
+        """
+        while self._untried and budget.exhausted is None:
+            bandwidth = self._untried.popleft()
+            proposed = self._proposed(best, bandwidth, budget)
+            found = self._repeatable(proposed, best)
+            if found is not None:
+                best = found
+                yield best
+
+        size, without_progress = FIRST_SIZE, 0
+        successes = np.ones(len(BANDWIDTHS))
+        while without_progress < patience and budget.exhausted is None:
+            # Bandwidths that have led to improvements are tried more often.
+            choice = int(self._rng.choice(len(BANDWIDTHS), p=successes / successes.sum()))
+            changed = self._changed(best, BANDWIDTHS[choice], size)
+            found = self._repeatable(self.largest(best.about, changed, budget), best)
+            if found is None:
+                size = max(size * AFTER_FAILURE, SMALLEST_SIZE)
+                without_progress += 1
+                continue
+
+            without_progress = 0 if is_progress(best.cost, found.cost) else without_progress + 1
+            size = min(size * AFTER_SUCCESS, LARGEST_SIZE)
+            successes[choice] += 1.0
+            best = found
+            yield best
+
+    def fitted(self, deviation: Array) -> Array:
+        """The nearest deviation, (N, nu), that has the bandwidth which the experiment allows."""
+        task = self.cost.level.task
+        basis = bandwidth_basis(task, task.stated_times)
+        if basis is None:
+            return deviation
+        return np.asarray(basis @ np.linalg.lstsq(basis, deviation)[0])
+
+    def _evaluated(self, about: Array, deviation: Array, share: float) -> InsideControl | None:
+        """A control with its cost; None where it violates a limit or tells nothing."""
+        control = about + deviation
+        point = self.cost.point(control) if self.cost.keeps(control) else None
+        if point is None or not np.isfinite(point.cost):
+            return None
+        return InsideControl(about=about, deviation=deviation, point=point, share=share)
+
+    def _proposed(
+        self, best: InsideControl, bandwidth: float | None, budget: Budget
+    ) -> InsideControl | None:
+        """A random control of a bandwidth, or the best one, as large as the limits allow."""
+        widths = self._widths
+        if bandwidth is None:
+            used = float((np.abs(best.deviation) / widths).max())
+            wanted = best.deviation / max(used, LEAST_SHARE)
+        else:
+            noise = self._noise(bandwidth)
+            wanted = self.fitted(widths * noise / np.abs(noise).max(axis=0))
+        found = self.largest(best.about, wanted, budget)
+        if found is None or (bandwidth is not None and found.cost >= best.cost):
+            return found
+        return self._enlarged(found, budget)
+
+    def _enlarged(self, inside: InsideControl, budget: Budget) -> InsideControl:
+        """Enlarge the deviation of one actuator after the other while all limits hold."""
+        actuators = inside.deviation.shape[1]
+        factors = np.ones(actuators)
+        for factor in SINGLE_FACTORS if actuators > 1 else ():
+            for i in range(actuators):
+                larger = np.array(factors)
+                larger[i] *= factor
+                if budget.exhausted is not None:
+                    break
+                if self.cost.nearly_keeps(inside.about + larger * inside.deviation):
+                    factors = larger
+        if (factors == 1.0).all():
+            return inside
+        found = self._evaluated(inside.about, factors * inside.deviation, inside.share)
+        return inside if found is None or found.cost >= inside.cost else found
+
+    def _changed(self, best: InsideControl, bandwidth: float, size: float) -> Array:
+        """(N, nu) deviation with a random change of all actuators, or of one of them."""
+        noise = self._noise(bandwidth)
+        actuators = noise.shape[1]
+        if actuators > 1 and self._rng.random() < SINGLE_SHARE:
+            noise[:, np.arange(actuators) != self._rng.integers(actuators)] = 0.0
+
+        # An actuator that rests gets a change in proportion to the others.
+        widths = self._widths
+        used = np.sqrt(((best.deviation / widths) ** 2).mean(axis=0))
+        used = widths * np.maximum(used, used.mean())
+        strength = np.sqrt((noise**2).mean(axis=0))
+        strength = np.where(strength > 0.0, strength, 1.0)
+        return np.asarray(best.deviation + self.fitted(size * used * noise / strength))
+
+    def _noise(self, bandwidth: float) -> Array:
+        """(N, nu) random curves that fade in, and fade out where the design ends at rest."""
+        task = self.cost.level.task
+        N, nu = task.control.shape
+        lines = max(round(bandwidth * (N // 2)), 1)
+        spectrum = np.zeros((N // 2 + 1, nu), dtype=np.complex128)
+        spectrum[1 : lines + 1].real = self._rng.standard_normal((lines, nu))
+        spectrum[1 : lines + 1].imag = self._rng.standard_normal((lines, nu))
+
+        # Even a motion that does not begin at rest must not jump at once.
+        begin = np.clip(np.arange(N)[:, None] / (FADE_SHARE * N), 0.0, 1.0)
+        return np.asarray(begin * task.fade(N) * np.fft.irfft(spectrum, n=N, axis=0))
+
+    def _repeatable(self, found: InsideControl | None, best: InsideControl) -> InsideControl | None:
+        """A control, or a smaller one of its form, that costs less and can be repeated.
+
+        A control that amplifies small disturbances much cannot be repeated on a robot, whatever
+        its information is.
+        """
+        for _ in range(SMALLER_TRIALS):
+            if found is None or found.cost >= best.cost:
+                return None
+            growth = self._growth(found.control)
+            if growth <= UNSTABLE_GROWTH or growth <= self._largest_growth:
+                return found
+            deviation, share = SMALLER * found.deviation, SMALLER * found.share
+            found = self._evaluated(found.about, deviation, share)
+        return None
+
+    @cached_property
+    def _largest_growth(self) -> float:
+        """Largest amplification of a small disturbance that a control may have."""
+        return max(UNSTABLE_GROWTH, self._growth(self.cost.level.task.control))
+
+    def _growth(self, control: Array) -> float:
+        """Amplification of a small disturbance along a control: (N, nu)."""
+        task = self.cost.level.task
+        try:
+            return growth_along(task, task.plant.simulate(task.theta, control))
+        except SimulationDivergedError:
+            return np.inf
+
+    @property
+    def _widths(self) -> Array:
+        """(nu,) half of the ranges of the controls [u-unit]."""
+        return self.cost.constraints.control.bounds.scale

@@ -1,0 +1,588 @@
+"""Anytime search for the best control.
+
+Candidates climb a ladder of rungs, from levels that are quick to the stated one, and a share of
+them goes on from each rung. Moves take a candidate and a time and yield a better one: a descent on
+a rung, scaling into the limits, and random changes. A candidate counts when it was seen on the
+stated plant; the best one so far is the result at any moment, the start included. On an executor
+each move is one task, which may be lost without harm to the others.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.excitation.climb import (
+    Candidate,
+    Climb,
+    Grounds,
+    Move,
+    Plan,
+    Rung,
+    move_in_worker,
+    row_of,
+)
+from mjfim.excitation.descent import Barrier
+from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.inside import InsideControl, InsideSearch, is_progress
+from mjfim.excitation.levels import DescentLevel, coarse_level, coarser_levels, easier_level
+from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.packing import for_workers
+from mjfim.information.smoothness import roughness
+from mjfim.parallel import (
+    ExecutorLike,
+    Workers,
+    carry_out,
+)
+from mjfim.parallel.budget import Budget
+from mjfim.parallel.shared_value import SharedValue
+from mjfim.plant.active_constraints import nothing_acts_along
+from mjfim.records.design import (
+    ScaledStart,
+    Status,
+    extended,
+)
+from mjfim.records.events import DesignEvent
+
+# One in this number of candidates goes on from a rung to the next one.
+HALVING_RATE = 4
+
+# Share of the time that is left, and of the iterations, for a rung below the stated one: with
+# several coarse levels, and with one.
+COARSE_SHARE = 0.4
+FIRST_SHARE = 0.5
+
+# Barrier weights with which coarse levels end, by their number. Iterations on the stated level are
+# so expensive that the levels before have to come near the optimum.
+LAST_WEIGHTS: dict[int, tuple[float, ...]] = {
+    1: (1e-3,),
+    2: (0.03, 3e-4),
+    3: (0.03, 3e-4, 1e-4),
+}
+
+# Barrier on the stated level after several coarse ones. With the optimum so close, only the barrier
+# keeps the cost above it.
+SHARP_BARRIER = Barrier(
+    first=1e-3, last=1e-5, relaxation=0.1, tolerance=1e-6, follows_curvature=True
+)
+
+# Barrier weights with which a single coarse level ends: with several candidates, and with few where
+# it differs by its timestep only; its minima are then close to those of the stated level.
+FIRST_LAST_WEIGHT = 0.01
+CLOSE_LAST_WEIGHT = 1e-3
+
+# The same, and its share of the time, where that allows few evaluations only on the stated level.
+BRIEF_LAST_WEIGHT = 0.03
+BRIEF_SHARE = 0.75
+
+# Number of evaluations for which there has to be time before a descent, and of iterations for which
+# a candidate should have time on the first rung.
+FEWEST_EVALUATIONS = 20.0
+ITERATIONS_OF_A_START = 50
+
+# Time of the iterations on a further rung below which it is not begun, in evaluations.
+FEWEST_ITERATIONS = 6.0
+
+# Shares of the time for random changes: where derivatives may mislead before a descent, where the
+# start is far outside the limits, between two descents, and at the end. The rest is for the report.
+PROBE_SHARE = 0.1
+OUTSIDE_SHARE = 0.4
+RANDOM_SHARE = 0.5
+CLOSING_SHARE = 0.95
+
+# Factor by which a control is enlarged where there is time for few evaluations only.
+ENLARGING = 1.25
+
+# Number of random changes without progress after which others moves follow.
+PATIENCE = 16
+
+
+@dataclass(kw_only=True, eq=False)
+class Search:
+    """Search for the best control of a design.
+
+    Attributes:
+        stage: The stated level on the unmodified plant.
+        first: The initial control, evaluated on it.
+        budget: Ends the search.
+        executor: Workers of the moves; None for this process.
+        evaluation_seconds: Time of one evaluation [s].
+        keeps_curves: Candidates remain sums of their curves on all rungs.
+    """
+
+    stage: DescentLevel
+    first: DesignPoint
+    budget: Budget
+    executor: ExecutorLike | None = None
+    evaluation_seconds: float = 0.0
+    keeps_curves: bool = False
+    remote_steps: int = field(default=0, init=False)
+    _cost_by_chance: float = field(default=np.inf, init=False)
+
+    @cached_property
+    def grounds(self) -> Grounds:
+        """The levels in this process."""
+        task = self.stage.task
+        task = task.relaxed() if task.is_limited else task
+        grounds = Grounds(task, self.stage.basis, self.first)
+        grounds.keep(self.stage)
+        return grounds
+
+    @cached_property
+    def inside(self) -> InsideSearch:
+        """Search without derivatives within the limits."""
+        return InsideSearch(self.grounds.cost, self.stage.task.experiment.descent.seed)
+
+    @cached_property
+    def scaled(self) -> InsideControl | None:
+        """The initial control as large as the limits allow; None where no share keeps them."""
+        return self.inside.scaled(self.stage.task.control, self.budget)
+
+    @property
+    def scaled_start(self) -> ScaledStart | None:
+        """The scaled initial control as an entry of the design; None where it keeps the limits."""
+        if not self.grounds.is_limited or self.keeps_limits(self.first) or self.scaled is None:
+            return None
+        return self.scaled.record
+
+    def keeps_limits(self, point: DesignPoint) -> bool:
+        """Check whether the motion of a point keeps the hard limits."""
+        if not self.grounds.is_limited:
+            return True
+        return point.trajectory is not None and self.grounds.cost.keeps(point.trajectory.ctrl)
+
+    @property
+    def steps(self) -> int:
+        """Engine steps since the search began, also those of workers."""
+        return self.grounds.steps + self.remote_steps
+
+    def run(self, candidates: Sequence[Candidate]) -> Generator[DesignEvent, None, list[Candidate]]:
+        """Yield every iterate; return the candidates that were begun.
+
+        Args:
+            candidates: Controls from which the search begins; the first one is begun always.
+        """
+        if not self.grounds.is_limited and not self.keeps_curves:
+            return (yield from self._moved(candidates, self._free_rungs, is_last=True))
+        if self.keeps_curves:
+            return (yield from self._run_inside(list(candidates)))
+
+        done: list[Candidate] = []
+        waiting = list(candidates)
+        if _is_bounded_by_weights(self.stage.task):
+            if not self._has_time and waiting[0].control is self.stage.task.control:
+                waiting[0] = self._enlarged(waiting[0])
+            free = [each for each in waiting if each.curves is None and each.repeats == 1]
+            climbed = yield from self._moved(free, self._free_rungs, is_last=True)
+            found = {each.name: each for each in climbed}
+            done = [self._seen(each) for each in climbed if not each.has_left]
+            left = {each.name for each in done}
+            waiting = [
+                replace(found.get(each.name, each), has_left=False)
+                for each in waiting
+                if each.name not in left
+            ]
+        if waiting:
+            is_rough = self._is_rough(waiting[0].control)
+            waiting[0] = yield from self._prepared(waiting[0], is_rough=is_rough)
+            if is_rough and not self._has_time:
+                return [*done, replace(waiting[0], status=Status.MAX_ITERATIONS)]
+            done += yield from self._run_inside(waiting)
+        return done
+
+    # ---- without derivatives
+
+    def _enlarged(self, first: Candidate) -> Candidate:
+        """The first candidate, enlarged while it keeps all limits and its cost falls."""
+        cost, centre = self.grounds.cost, self.grounds.stated.task.centre
+        control, least = first.over_horizon, self.first.cost
+        while self.budget.used < OUTSIDE_SHARE and self.budget.exhausted is None:
+            larger = np.asarray(centre + ENLARGING * (control - centre))
+            point = cost.point(larger) if cost.keeps(larger) else None
+            if point is None or not point.cost < least:
+                break
+            control, least = larger, point.cost
+            first = replace(first.improved(control, point), control=control, repeats=1)
+        return first
+
+    def _prepared(
+        self, first: Candidate, *, is_rough: bool
+    ) -> Generator[DesignEvent, None, Candidate]:
+        """The first candidate with the best control inside that is found before a descent.
+
+        Where the start is far outside the limits, and where derivatives may mislead, random
+        controls are tried.
+        """
+        best = self._inside_of(first)
+        if best is None:
+            return first
+        first = first.improved(best.control, best.point)
+        ground = self.grounds.ground(self.grounds.stated.task.system.variant, first)
+        is_outside = not ground.is_near(first.control)
+        share = 0.0
+        if is_rough:
+            share = PROBE_SHARE if self._has_time else CLOSING_SHARE
+        elif is_outside and self._has_time:
+            share = OUTSIDE_SHARE
+        if share:
+            first, best = yield from self._by_chance(first, best, share, PATIENCE)
+        return replace(first, control=best.begin) if is_outside else first
+
+    def _inside_of(self, candidate: Candidate) -> InsideControl | None:
+        """The best control inside that scaling finds: of a candidate, or of the initial control."""
+        centre = self.grounds.stated.task.centre
+        found = [self.scaled]
+        if candidate.control is not self.stage.task.control:
+            deviation = candidate.over_horizon - centre
+            found.append(self.inside.largest(centre, deviation, self.budget))
+        return min((each for each in found if each), key=lambda each: each.cost, default=None)
+
+    # ---- within limits
+
+    def _run_inside(
+        self, candidates: list[Candidate]
+    ) -> Generator[DesignEvent, None, list[Candidate]]:
+        """Let candidates climb within the limits, in batches while there is time."""
+        ladder = self._ladder(candidates)
+        done: list[Candidate] = []
+        waiting = self._affordable(candidates, ladder[0])
+        while waiting and (not done or self.budget.exhausted is None):
+            workers = 1 if self.executor is None else Workers.of(self.executor).count
+            size = max(HALVING_RATE, workers)
+            done += yield from self._climbed(waiting[:size], ladder)
+            waiting = waiting[size:]
+        return (yield from self._helped_by_chance(done, ladder))
+
+    def _climbed(
+        self, batch: list[Candidate], ladder: tuple[Rung, ...]
+    ) -> Generator[DesignEvent, None, list[Candidate]]:
+        """Let a batch climb the ladder; a share of it goes on from each rung."""
+        results: dict[str, Candidate] = {}
+        for number, rung in enumerate(ladder):
+            is_last = number == len(ladder) - 1
+            if number and not self._has_time_for(batch, rung):
+                break
+            batch = yield from self._moved(batch, (rung,), is_last=is_last)
+            results.update({each.name: each for each in batch})
+            if self.budget.exhausted is not None or is_last:
+                break
+            ranked = sorted(batch, key=lambda each: each.rank)
+            batch = ranked[: max(len(ranked) // HALVING_RATE, 1)]
+            chosen = {each.name for each in batch}
+            for each in ranked[len(batch) :]:
+                if each.best is not None and each.name not in chosen:
+                    results[each.name] = replace(each, status=Status.LEFT)
+        return list(results.values())
+
+    def _has_time_for(self, batch: list[Candidate], rung: Rung) -> bool:
+        """Whether some iterations of a rung fit into the time; without a result it is tried."""
+        if not any(each.best is not None for each in batch):
+            return True
+        level = self.grounds.ground(rung.variant, batch[0]).level
+        ratio = level.engine_steps / self.grounds.stated.engine_steps
+        return self.budget.seconds_left > FEWEST_ITERATIONS * ratio * self.evaluation_seconds
+
+    def _helped_by_chance(
+        self, done: list[Candidate], ladder: tuple[Rung, ...]
+    ) -> Generator[DesignEvent, None, list[Candidate]]:
+        """Change the best control at random where descents are held up, and descend from there."""
+        place = min(range(len(done)), key=lambda i: done[i].cost, default=None)
+        if place is None or self.keeps_curves:
+            return done
+        best = done[place]
+        is_useful = True
+        while best.best is not None and self.budget.exhausted is None:
+            is_beaten = best.cost >= self._cost_by_chance
+            if not (best.is_held_up or is_beaten) or best.iterations >= self._max_iterations:
+                break
+            before = best.cost
+            centre = self.grounds.stated.task.centre
+            inside = self.inside.largest(centre, best.best - centre, self.budget)
+            if inside is None:
+                break
+            share = RANDOM_SHARE if is_useful else CLOSING_SHARE
+            best, inside = yield from self._by_chance(best, inside, share, PATIENCE)
+            done[place] = best
+            has_gained = is_progress(before, best.cost)
+            if not is_useful and not has_gained:
+                break
+            is_useful = has_gained and self._has_time
+            if not is_useful:
+                continue
+            before = best.cost
+            begun = replace(best, control=inside.begin, is_held_up=False)
+            moved = yield from self._moved([begun], ladder[-1:], is_last=True)
+            if moved:
+                best = moved[0]
+                done[place] = best
+            is_useful = is_progress(before, best.cost)
+        return done
+
+    @property
+    def _has_time(self) -> bool:
+        """Whether the time that is left allows a descent."""
+        return self.budget.seconds_left > FEWEST_EVALUATIONS * self.evaluation_seconds
+
+    def _by_chance(
+        self,
+        candidate: Candidate,
+        inside: InsideControl,
+        share: float,
+        patience: float,
+    ) -> Generator[DesignEvent, None, tuple[Candidate, InsideControl]]:
+        """Improve a candidate by random changes of a control within the limits."""
+        budget = self.budget.share(share)
+        candidate = candidate.improved(inside.control, inside.point)
+        for found in self.inside.improvements(inside, budget, patience):
+            inside = found
+            candidate = candidate.improved(found.control, found.point)
+            values = self.grounds.cost.values(found.control)
+            margins = (
+                {} if values is None else self.grounds.cost.constraints.relative_margins(values)
+            )
+            row = row_of(
+                found.point,
+                iteration=candidate.iterations,
+                seconds=self.budget.seconds_used,
+                steps=self.steps,
+                rate=1.0 / self.stage.task.dt,
+                margins=margins,
+            )
+            candidate = replace(candidate, history=extended(candidate.history, [row]))
+            yield DesignEvent(start=candidate.name, row=row)
+        self._cost_by_chance = candidate.cost
+        return candidate, inside
+
+    def _seen(self, candidate: Candidate) -> Candidate:
+        """A candidate of a descent without a barrier, seen within the limits."""
+        climb = Climb(self.grounds, self._move(candidate, (), self.budget.seconds_left, True))
+        status = candidate.status
+        return replace(climb.judged(self.grounds.stated.task.system.variant), status=status)
+
+    # ---- rungs
+
+    @cached_property
+    def _free_rungs(self) -> tuple[Rung, ...]:
+        """The coarse and the stated level without a barrier."""
+        task = self.stage.task
+        coarse = coarse_level(task, self.first, self.stage.basis)
+        rungs = [Rung(variant=task.system.variant)]
+        if coarse is not None:
+            self.grounds.keep(DescentLevel(coarse, self.stage.basis))
+            rungs.insert(0, Rung(variant=coarse.system.variant))
+        return tuple(rungs)
+
+    def _ladder(self, candidates: Sequence[Candidate]) -> tuple[Rung, ...]:
+        """The rungs within the limits."""
+        stated = self.grounds.stated
+        variant = stated.task.system.variant
+        tolerance = stated.task.experiment.descent.tolerance
+        has_parts = any(each.repeats > 1 for each in candidates)
+        if not stated.task.is_limited:
+            return (Rung(variant=variant, barrier=Barrier(first=Barrier.last * 3.0)),)
+        levels = () if has_parts else coarser_levels(stated, self.first)
+        if levels:
+            weights = LAST_WEIGHTS[len(levels)]
+            first, rungs = Barrier().first, []
+            for level, last in zip(levels, weights, strict=True):
+                self.grounds.keep(level)
+                barrier = Barrier(first=first, last=last, follows_curvature=True)
+                rungs.append(
+                    Rung(variant=level.task.system.variant, barrier=barrier, share=COARSE_SHARE)
+                )
+                first = last
+            sharp = replace(SHARP_BARRIER, tolerance=max(SHARP_BARRIER.tolerance, tolerance))
+            return (*rungs, Rung(variant=variant, barrier=sharp))
+
+        usual = Barrier(tolerance=max(Barrier.tolerance, tolerance))
+        coarse = easier_level(stated, self.first)
+        is_free = all(each.curves is None and each.repeats == 1 for each in candidates)
+        if coarse is None and len(candidates) == 1 and (is_free or self.keeps_curves):
+            return (Rung(variant=variant, barrier=usual),)
+        level = coarse or stated
+        self.grounds.keep(level)
+        is_close = replace(level.task.system.variant, timestep_factor=1) == variant
+        is_few = len(candidates) < HALVING_RATE and is_close
+        last = CLOSE_LAST_WEIGHT if is_few else FIRST_LAST_WEIGHT
+        share = FIRST_SHARE
+        if not self._has_time and level.engine_steps < stated.engine_steps:
+            last, share = BRIEF_LAST_WEIGHT, BRIEF_SHARE
+        return (
+            Rung(
+                variant=level.task.system.variant,
+                barrier=replace(usual, last=last),
+                share=share,
+            ),
+            Rung(
+                variant=variant,
+                barrier=replace(usual, first=min(3.0 * last, FIRST_LAST_WEIGHT)),
+            ),
+        )
+
+    def _affordable(self, candidates: list[Candidate], rung: Rung) -> list[Candidate]:
+        """The first candidates, as many as can be optimised roughly in the time of a rung."""
+        seconds = rung.share * self.budget.seconds_left
+        if len(candidates) == 1 or np.isinf(seconds):
+            return candidates
+        # Measure an iteration without its line search. The first one builds models.
+        problem = self.grounds.ground(rung.variant, candidates[0]).level.problem
+        task = self.grounds.ground(rung.variant, candidates[0]).task
+        problem.expand(problem.point(task.initial))
+        begun = self.budget.seconds_used
+        problem.expand(problem.point(task.initial))
+        each = ITERATIONS_OF_A_START * (self.budget.seconds_used - begun)
+        workers = 1 if self.executor is None else Workers.of(self.executor).count
+        return candidates[: max(int(workers * seconds / max(each, 1e-9)), 1)]
+
+    @property
+    def _max_iterations(self) -> int:
+        """Largest number of iterations of one candidate."""
+        return self.stage.task.experiment.descent.max_iterations
+
+    def _is_rough(self, control: Array) -> bool:
+        """Check whether derivatives may mislead along the initial control."""
+        task = self.stage.task
+        if control is not task.control or self.first.trajectory is None:
+            return False
+        if self.grounds.stated.task.system.variant.smoothing_speeds:
+            return True
+        # Derivatives exist where nothing touches, rubs, stops or clamps.
+        model = task.system.model_at(task.theta)
+        if nothing_acts_along(model, self.first.trajectory, task.system.grid.substeps):
+            return False
+        found = roughness(
+            task.plant,
+            task.system.noise,
+            model,
+            task.theta,
+            self.first.trajectory,
+            self.first.sensitivity,
+        )
+        return found is not None
+
+    # ---- moves, here or on workers
+
+    def _move(
+        self, candidate: Candidate, rungs: tuple[Rung, ...], seconds: float, is_last: bool
+    ) -> Move:
+        """An order for a candidate."""
+        left = max(self._max_iterations - max(candidate.iterations - 1, 0), 1)
+        share = rungs[0].share if rungs else 1.0
+        return Move(
+            candidate=candidate,
+            rungs=rungs,
+            is_last=is_last,
+            iterations=int(np.ceil(share * left)),
+            seconds=seconds,
+            budget=self.budget,
+            keeps_curves=self.keeps_curves,
+        )
+
+    def _moved(
+        self, candidates: Sequence[Candidate], rungs: tuple[Rung, ...], *, is_last: bool
+    ) -> Generator[DesignEvent, None, list[Candidate]]:
+        """Let candidates climb some rungs; those without time are left out."""
+        share = rungs[0].share if len(rungs) == 1 else 1.0
+        if self.executor is not None and (len(candidates) > 1 or self.grounds.is_limited):
+            return (yield from self._moved_on_workers(candidates, rungs, share, is_last))
+
+        moved: list[Candidate] = []
+        end = self.budget.seconds_used + share * self.budget.seconds_left
+        for candidate in candidates:
+            if moved and self.budget.exhausted is not None:
+                break
+            # The last ones of a rung get at least half of their share, where others took longer.
+            seconds = end - self.budget.seconds_used
+            if len(rungs) == 1:
+                seconds /= len(candidates) - len(moved)
+            if rungs[0].barrier is None:
+                seconds = self.budget.seconds_left
+            climb = Climb(self.grounds, self._move(candidate, rungs, max(seconds, 0.0), is_last))
+            found = yield from climb.run()
+            moved.append(_named_stop(found, self.budget))
+        return moved
+
+    def _moved_on_workers(
+        self,
+        candidates: Sequence[Candidate],
+        rungs: tuple[Rung, ...],
+        share: float,
+        is_last: bool,
+    ) -> Generator[DesignEvent, None, list[Candidate]]:
+        """Let candidates climb some rungs on the workers of the executor."""
+        assert self.executor is not None
+        workers = Workers.of(self.executor)
+        turns = -(-len(candidates) // workers.count)
+        seconds = share * self.budget.seconds_left / turns
+        plan = self._plan(workers.threads_for(len(candidates)))
+        moves = [
+            replace(self._move(each, rungs, seconds, is_last), plan=plan) for each in candidates
+        ]
+        moved: list[Candidate] = []
+        for outcome in carry_out(self.executor, move_in_worker, moves, self.budget):
+            before = candidates[outcome.index]
+            if outcome.is_lost:
+                moved.append(replace(before, status=Status.LOST))
+                continue
+            found = outcome.result
+            self.remote_steps += found.steps - before.steps
+            for row in found.history[len(before.history) :]:
+                if self.budget.stop.requested:
+                    break
+                yield DesignEvent(start=found.name, row=row)
+            if rungs[-1].barrier is not None and not found.is_judged:
+                move = self._move(found, rungs, 0.0, is_last)
+                found = replace(
+                    Climb(self.grounds, move).judged(rungs[-1].variant), status=found.status
+                )
+            moved.append(_named_stop(found, self.budget))
+        return moved
+
+    def _plan(self, threads: int) -> SharedValue[Plan]:
+        """What all moves share."""
+        if threads not in self._plans:
+            task = self.grounds.stated.task
+            plan = Plan(
+                experiment=for_workers(task.experiment, task.system.source),
+                variant=task.system.variant,
+                combinations=self.stage.basis,
+                added_information=task.added_information,
+                threads=threads,
+            )
+            self._plans[threads] = SharedValue(uuid.uuid4().hex, plan)
+        return self._plans[threads]
+
+    @cached_property
+    def _plans(self) -> dict[int, SharedValue[Plan]]:
+        """Plans by the threads of each move."""
+        return {}
+
+
+def candidate_of(start: InitialControl) -> Candidate:
+    """The candidate of an initial control."""
+    return Candidate(
+        name=start.name, control=start.control, curves=start.basis, repeats=start.repeats
+    )
+
+
+def _named_stop(candidate: Candidate, budget: Budget) -> Candidate:
+    """A candidate whose status says that the search was stopped, where its descent had no end."""
+    if budget.stop.requested and candidate.status is None:
+        return replace(candidate, status=Status.INTERRUPTED)
+    return candidate
+
+
+def _is_bounded_by_weights(task: DesignTask) -> bool:
+    """Check whether weights on all controls may keep the limits without a barrier.
+
+    A barrier is needed for a boundary, a bandwidth, limits on control rates and a clearance.
+    """
+    limits = task.experiment.limits
+    needs_barrier = task.is_shaped or bool(limits.control_rate) or limits.clearance is not None
+    return not needs_barrier and bool((task.control_weight > 0.0).all())

@@ -1,1 +1,0 @@
-"""Parametric excitations that the design is compared with."""

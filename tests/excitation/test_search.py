@@ -1,0 +1,237 @@
+"""The anytime search: its result at any moment, its moves, and what happens when work is lost."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.excitation import search as search_module
+from mjfim.excitation.bandwidth import bandwidth_basis
+from mjfim.excitation.climb import Candidate, Move, tightened, without_jumps
+from mjfim.excitation.descent import Barrier, Ground
+from mjfim.excitation.design import design_task
+from mjfim.excitation.inside import InsideControl, InsideSearch, LimitedCost, largest_share
+from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.task import DesignTask
+from mjfim.excitation.verification import verify
+from mjfim.parallel import LostWorkError
+from mjfim.parallel.budget import Budget, StopToken
+from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
+from tests.support.limits import cart_inside
+from tests.support.stiff_servos import stiff_arm_task
+
+
+def cost_of(task: DesignTask) -> LimitedCost:
+    """The cost of a task within its limits."""
+    return LimitedCost(level=DescentLevel(task.relaxed(), None))
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> DesignTask:
+    """The cart-pendulum over one second under hard limits."""
+    return cart_inside(tmp_path)
+
+
+# ---- the result at any moment
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+@pytest.mark.parametrize("tables", [{}, {"limits": {}, "cost": {"control": 1e-3}}])
+def test_a_stop_at_any_iterate_leaves_the_best_that_was_seen(
+    count: int, tables: dict[str, Any], tmp_path: Path
+) -> None:
+    task, stop, seen = cart_inside(tmp_path, **tables), StopToken(), 0
+
+    def watch(event: object) -> None:
+        """Stop after some iterates."""
+        nonlocal seen
+        seen += isinstance(event, DesignEvent)
+        if seen > count:
+            stop.request()
+
+    design = design_task(task, callback=watch, budget=Budget(stop=stop))
+    assert design.status is Status.INTERRUPTED
+    assert design.final.cost <= design.initial.cost
+    assert verify(task, design.trajectory).is_feasible
+
+
+def test_a_stop_before_the_first_iterate_leaves_the_start(task: DesignTask) -> None:
+    stop = StopToken()
+    stop.request()
+    design = design_task(task, budget=Budget(stop=stop))
+    assert design.status is Status.INTERRUPTED
+    np.testing.assert_allclose(design.trajectory.ctrl, task.control, atol=1e-12)
+
+
+def test_a_start_outside_the_limits_is_scaled_and_improved(tmp_path: Path) -> None:
+    task = stiff_arm_task(tmp_path, descent={"max_iterations": 4})
+    assert not cost_of(task).keeps(task.control)
+    design = design_task(task)
+    assert design.scaled_start is not None
+    assert 0.0 < design.scaled_start.share < 1.0
+    assert design.final.cost <= design.scaled_start.cost
+    assert verify(task, design.trajectory).is_feasible
+
+
+def test_limits_that_nothing_keeps_end_as_infeasible(tmp_path: Path) -> None:
+    """The smallest force drives the cart out of its range."""
+    limits = {"control": {"force": [4.0, 5.0]}, "position": {"slide": [0.05, 0.15]}}
+    task = cart_inside(tmp_path, limits=limits, descent={"max_iterations": 5})
+    design = design_task(task)
+    assert design.status is Status.INFEASIBLE
+    assert min(design.limits.values()) < 0.0
+
+
+# ---- moves
+
+
+def test_the_largest_share_is_found_and_a_stop_ends_the_search_for_a_larger_one() -> None:
+    tried: list[float] = []
+
+    def keeps(share: float) -> bool:
+        """A limit at a share of 0.123."""
+        tried.append(share)
+        return share <= 0.123
+
+    assert 0.123 / 1.05 <= (largest_share(keeps, Budget()) or 0.0) <= 0.123
+    assert largest_share(lambda share: False, Budget()) is None
+    stopped = Budget()
+    stopped.stop.request()
+    assert 0.0 < (largest_share(keeps, stopped) or 0.0) <= 0.123
+
+
+@pytest.mark.parametrize("bandwidth", [None, 8.0])
+def test_random_changes_lower_the_cost_within_limits(
+    bandwidth: float | None, tmp_path: Path
+) -> None:
+    limits = {"control": {"force": [-5.0, 5.0]}, "position": {"slide": [-0.5, 0.5]}}
+    if bandwidth is not None:
+        limits["bandwidth"] = bandwidth  # type: ignore[assignment]
+    task = cart_inside(tmp_path, limits=limits)
+    cost = cost_of(task)
+    first = InsideSearch(cost, 0).scaled(task.control, Budget())
+    assert first is not None
+    found: list[InsideControl] = []
+    for each in InsideSearch(cost, 0).improvements(first, Budget(), patience=12):
+        found.append(each)
+        if len(found) == 3:
+            break
+    costs = [first.cost, *(each.cost for each in found)]
+    assert len(costs) > 1
+    assert costs == sorted(costs, reverse=True)
+    for each in found:
+        assert cost.keeps(each.control)
+        basis = bandwidth_basis(task, task.t)
+        if basis is not None:
+            fitted = basis @ np.linalg.lstsq(basis, each.deviation)[0]
+            np.testing.assert_allclose(fitted, each.deviation, atol=1e-9)
+
+
+def test_the_barrier_alone_steers_a_control_inside(tmp_path: Path) -> None:
+    """No share of the deviation helps where the centre itself violates a limit."""
+    limits = {"control": {"force": [-5.0, 5.0]}, "velocity": {"slide": [0.05, 3.0]}}
+    initial = {"qvel": (0.2, 0.0), "control": {"kind": "sine", "amplitude": 0.1, "frequency": 1.0}}
+    task = cart_inside(tmp_path, limits=limits, initial=initial, horizon=0.5).relaxed()
+    ground = Ground.of(DescentLevel(task, None))
+    outside = np.full_like(task.control, -0.8)
+    values = ground.values(outside)
+    assert values is not None
+    assert not ground.constraints.is_feasible(values)
+    inside = ground.begin(outside, Budget())
+    assert inside is not None
+    values = ground.values(inside)
+    assert values is not None
+    margins = ground.constraints.relative_margins(values)
+    assert min(margins.values()) > -1.0
+
+
+def test_the_weights_of_the_barrier_fall_from_the_first_to_the_last() -> None:
+    weights = Barrier(first=0.1, last=1e-4).weights
+    assert weights[0] == pytest.approx(0.1)
+    assert weights[-1] == pytest.approx(1e-4)
+    ratios = np.divide(weights[:-1], weights[1:])
+    np.testing.assert_allclose(ratios, ratios[0])
+    assert 2.0 < ratios[0] < 4.0
+
+
+def test_limits_are_tightened_where_violated_and_released_where_well_kept() -> None:
+    after = tightened({"control": 0.2, "position": 0.0}, {"control": 0.1, "position": -0.05})
+    assert after == {"control": pytest.approx(0.15), "position": pytest.approx(0.06)}
+    assert tightened(after, {"control": 1.0, "position": 0.0})["control"] == 0.0
+
+
+def test_a_control_of_long_samples_has_no_steps_where_its_rate_is_limited(tmp_path: Path) -> None:
+    limits = {"control": {"force": [-5.0, 5.0]}, "control_rate": {"force": 100.0}}
+    limited, free = cost_of(cart_inside(tmp_path, limits=limits)), cost_of(cart_inside(tmp_path))
+    steps = np.repeat(np.arange(25.0)[:, None], 4, axis=0)
+    smooth = without_jumps(limited, steps, 4)
+    np.testing.assert_allclose(np.diff(smooth[2:-2], axis=0), 0.25)
+    assert np.array_equal(without_jumps(free, steps, 4), steps)
+    assert np.array_equal(without_jumps(limited, smooth, 4), smooth)
+
+
+# ---- several starts, here and on workers
+
+
+@pytest.mark.slow
+def test_starts_on_workers_give_the_designs_of_one_process(tmp_path: Path) -> None:
+    task = cart_inside(tmp_path, descent={"max_iterations": 12, "starts": 3})
+    alone = design_task(task)
+    with ThreadPoolExecutor(2) as executor:
+        found = design_task(task, executor=executor)
+    assert found.final.cost == pytest.approx(alone.final.cost, rel=1e-6)
+    assert [s.name for s in found.starts] == [s.name for s in alone.starts]
+
+
+def test_a_lost_start_is_named_and_does_not_end_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    carry_out = search_module.move_in_worker
+
+    def losing(move: Move) -> Candidate:
+        """Lose the initial control each time."""
+        if move.candidate.name == "initial control":
+            raise CancelledError
+        return carry_out(move)
+
+    monkeypatch.setattr(search_module, "move_in_worker", losing)
+    tables = {"limits": {}, "cost": {"control": 1e-3}}
+    task = cart_inside(tmp_path, descent={"max_iterations": 3, "starts": 2}, **tables)
+    with ThreadPoolExecutor(1) as executor:
+        design = design_task(task, executor=executor)
+    assert [start.status is Status.LOST for start in design.starts] == [True, False]
+    assert design.found_by == "multisine 1 of 1"
+
+
+def test_a_design_all_of_whose_workers_are_lost_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def losing(move: Move) -> Candidate:
+        """Lose every start."""
+        raise CancelledError
+
+    monkeypatch.setattr(search_module, "move_in_worker", losing)
+    tables = {"limits": {}, "cost": {"control": 1e-3}}
+    task = cart_inside(tmp_path, descent={"starts": 2}, **tables)
+    monkeypatch.setattr("mjfim.excitation.search.Search.keeps_limits", lambda self, point: False)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(LostWorkError, match="every start"):
+        design_task(task, executor=executor)
+
+
+def test_starts_without_time_are_named(tmp_path: Path) -> None:
+    descent = {"starts": 5, "seconds": 0.01, "max_iterations": 10**6}
+    design = design_task(cart_inside(tmp_path, limits={}, cost={"control": 1e-3}, descent=descent))
+    assert any("were left out (multisine" in warning for warning in design.warnings)
+
+
+def test_a_start_that_diverges_does_not_end_the_others(tmp_path: Path) -> None:
+    task = cart_inside(tmp_path, limits={}, cost={"control": 1e-3})
+    diverging = np.full_like(task.control, np.nan)
+    with pytest.raises(mjfim.MjfimError):
+        design_task(task, initial_control=diverging)
