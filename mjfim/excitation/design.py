@@ -31,6 +31,9 @@ from mjfim.records.events import DesignCallback, DesignEvent, shown_progress
 
 T = TypeVar("T")
 
+# Largest number of candidates, stopped on a coarse level, that are compared at the stated rate.
+EVALUATED_STOPPED = 4
+
 
 def design(
     experiment: Experiment,
@@ -192,6 +195,8 @@ def _chosen(
     nothing = Candidate(
         name="initial control", control=search.stage.task.control, status=Status.INTERRUPTED
     )
+    if not is_limited:
+        results = _with_stops_evaluated(search.stage, results)
     best = min(results, key=lambda result: (result.cost, result.rank), default=nothing)
     point: DesignPoint | None = best.point
     if is_limited:
@@ -214,6 +219,18 @@ def _chosen(
             )
         raise SimulationDivergedError("the simulation diverges from every start")
     return best, begins[0]
+
+
+def _with_stops_evaluated(stage: DescentLevel, results: Sequence[Candidate]) -> list[Candidate]:
+    """Evaluate the best candidates that were stopped on a coarse level, at the stated rate."""
+    stopped = [each for each in results if each.best is None and each.history]
+    stopped = sorted(stopped, key=lambda each: each.history[-1].cost)[:EVALUATED_STOPPED]
+    found = list(results)
+    for each in stopped:
+        point = point_at_stated_rate(stage, each.over_horizon)
+        if point is not None:
+            found[found.index(each)] = each.improved(each.over_horizon, point)
+    return found
 
 
 def _without_time(

@@ -15,7 +15,7 @@ import pytest
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.parallel.budget import Budget, StopToken, measured_by
-from mjfim.plant.batch import StepCount
+from mjfim.plant import batch
 from mjfim.records.design import Status
 from mjfim.records.events import DesignEvent
 from tests.support.limits import cart_inside
@@ -49,14 +49,23 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[StepClock]:
     """The clock of all budgets."""
     clock = StepClock()
 
-    def read(count: Any) -> int:
-        return int(count.__dict__.get("counted", 0))
+    class Counted:
+        """Engine steps of one plant, which move the clock on."""
 
-    def write(count: Any, steps: int) -> None:
-        clock.steps += steps - read(count)
-        count.__dict__["counted"] = steps
+        def __init__(self, steps: int) -> None:
+            self._steps = steps
 
-    monkeypatch.setattr(StepCount, "steps", property(read, write), raising=False)
+        @property
+        def steps(self) -> int:
+            """Engine steps so far."""
+            return self._steps
+
+        @steps.setter
+        def steps(self, steps: int) -> None:
+            clock.steps += steps - self._steps
+            self._steps = steps
+
+    monkeypatch.setattr(batch, "SimpleNamespace", Counted)
     with measured_by(clock):
         yield clock
 

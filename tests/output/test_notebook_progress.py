@@ -55,7 +55,7 @@ def verbs() -> Iterator[tuple[str, Callable[..., Any]]]:
     """Yield short calls of verbs."""
     yield "designing: iteration   1", mjfim.design
     yield "checking", mjfim.check
-    yield "comparing", lambda e, **o: mjfim.compare(e, steps=3_000, methods=["multisine"], **o)
+    yield "comparing", lambda e, **o: mjfim.compare(e, seconds=0.5, methods=["multisine"], **o)
 
     def repeat(e: mjfim.Experiment, **options: Any) -> object:
         """Repeat the initial trajectory."""

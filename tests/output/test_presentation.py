@@ -74,7 +74,7 @@ def check(experiment: mjfim.Experiment) -> mjfim.Check:
 @pytest.fixture(scope="module")
 def comparison(experiment: mjfim.Experiment) -> mjfim.Comparison:
     """A multisine beside the design."""
-    return mjfim.compare(experiment, steps=3_000, methods=["multisine"])
+    return mjfim.compare(experiment, seconds=0.5, methods=["multisine"])
 
 
 @pytest.fixture
