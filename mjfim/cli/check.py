@@ -3,43 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 import mjfim
-from mjfim.cli.common import (
-    AsJson,
-    ExperimentFile,
-    Force,
-    OtherDesign,
-    Pictures,
-    Threads,
-    Verbose,
-    claim_folder,
-    draw_elsewhere,
-    print_result,
-    progress,
-    say_written,
-    verb,
-    writing,
-)
-from mjfim.cli.executors import (
-    LOCAL,
-    MAX_PARTS,
-    ExecutorPlace,
-    started_if_stated,
-    stated_executor,
-)
-from mjfim.output.picture_format import PictureFormat
-
-if TYPE_CHECKING:
-    pass
+from mjfim.cli.common import ExperimentFile, OtherDesign, Run, draw_elsewhere, verb
+from mjfim.cli.progress import progress
 
 
-@verb
+@verb(needs_folder=False)
 def check(
     experiment: ExperimentFile,
+    run: Run,
     recordings: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -47,23 +23,13 @@ def check(
         ),
     ] = None,
     design_file: OtherDesign = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", metavar="DIR", help="Folder for check.json, report.html and pictures."
-        ),
-    ] = None,
-    as_json: AsJson = False,
-    pictures: Pictures = PictureFormat.PNG,
-    verbose: Verbose = False,
-    force: Force = False,
-    threads: Threads = None,
-    executor: ExecutorPlace = LOCAL,
 ) -> None:
     """Say which parameters can be identified, how accurately, and which only in combination."""
-    if output is not None:
+    stated = mjfim.Experiment.from_file(experiment)
+    has_folder = bool(run.output)
+    if has_folder:
         draw_elsewhere()
-    from mjfim.excitation.task_parts import require_design_keys
+
     from mjfim.experiment.input_files import input_files
     from mjfim.experiment.system import System
     from mjfim.output import archive
@@ -71,29 +37,22 @@ def check(
     from mjfim.output.presentation import describe
     from mjfim.recordings.read import read_recording, recording_paths
 
-    place = stated_executor(executor)
-    stated = mjfim.Experiment.from_file(experiment)
-    system = System.resolve(stated, threads=threads)
+    system = System.resolve(stated, threads=run.threads)
     with progress("reading"):
-        logs = recording_paths(recordings or [], system.channels)
-        loaded = [read_recording(path, system.channels) for path in logs]
+        paths = recording_paths(recordings or [], system.channels)
+        loaded = [read_recording(path, system.channels) for path in paths]
     trajectory = None
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]
         archive.check_fits(design_file, trajectory, system)
-    if output is not None:
-        inputs = input_files(stated, [*(recordings or []), design_file])
-        claim_folder(output, pictures.files(CHECK_FILES), inputs, force=force)
+    if has_folder:
+        run.claim(CHECK_FILES, input_files(stated, [*(recordings or []), design_file]))
 
-    if not loaded and trajectory is None:
-        require_design_keys(system, "check without recordings")
-    with started_if_stated(place, MAX_PARTS) as workers, progress("checking"):
-        result = mjfim.check(stated, loaded, trajectory, threads=threads, executor=workers)
+    with run.workers() as workers, progress("checking"):
+        result = mjfim.check(stated, loaded, trajectory, threads=run.threads, executor=workers)
 
-    values = archive.summary_with_origin(result, system, output)
-    print_result(as_json, values, describe(result), verbose=verbose)
-    if output is not None:
-        with writing(output) as results:
-            results.write_result(output, result, system, pictures)
-        say_written(output)
+    if has_folder:
+        run.finish(result, system)
+    else:
+        run.print(result.summary(), describe(result))
     raise typer.Exit(0 if result.ok else 1)

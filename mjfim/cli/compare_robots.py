@@ -9,21 +9,8 @@ from typing import Annotated
 
 import typer
 
-from mjfim.cli.common import (
-    AsJson,
-    Folder,
-    Force,
-    Pictures,
-    Verbose,
-    claim_folder,
-    errors,
-    is_elsewhere,
-    print_result,
-    say_written,
-    verb,
-    writing,
-)
-from mjfim.output.picture_format import PictureFormat
+import mjfim
+from mjfim.cli.common import Run, verb
 
 # Files of an estimate.
 ESTIMATE_FILES = ("estimate.json", "estimate.npz")
@@ -32,7 +19,7 @@ ESTIMATE_FILES = ("estimate.json", "estimate.npz")
 ORIGINS = {"experiment": "experiment files", "model": "models"}
 
 
-@verb
+@verb(without=("threads", "executor"))
 def compare_robots(
     first: Annotated[
         Path, typer.Argument(metavar="DIR_A", help="Folder of `mjfim identify` of the first robot.")
@@ -44,11 +31,7 @@ def compare_robots(
             help="Folder of `mjfim identify` of the second robot, or of the first one later.",
         ),
     ],
-    output: Folder,
-    as_json: AsJson = False,
-    pictures: Pictures = PictureFormat.PNG,
-    verbose: Verbose = False,
-    force: Force = False,
+    run: Run,
 ) -> None:
     """Say which parameters of two robots differ, or what changed in one robot since.
 
@@ -58,22 +41,17 @@ def compare_robots(
 
     from mjfim.output.folders import ROBOT_FILES
     from mjfim.output.presentation import describe
-    from mjfim.records.estimate import Estimate
-    from mjfim.studies.robot_comparison import compare_estimates
 
-    estimates = [Estimate.load(folder) for folder in (first, second)]
+    estimates = [mjfim.Estimate.load(folder) for folder in (first, second)]
     inputs = [folder / name for folder in (first, second) for name in ESTIMATE_FILES]
-    claim_folder(output, pictures.files(ROBOT_FILES), inputs, force=force)
-    result = compare_estimates(*estimates, names=_names(first, second))
+    run.claim(ROBOT_FILES, inputs)
+    result = mjfim.compare_estimates(*estimates, names=_names(first, second))
     result = replace(result, remarks=(*result.remarks, *_differences_of_files(first, second)))
 
-    origin = {"first": _relative(first, output), "second": _relative(second, output)}
-    print_result(as_json, {**origin, **result.summary()}, describe(result), verbose=verbose)
-    with writing(output) as results:
-        results.write_result(output, result, None, pictures, origin)
-    say_written(output)
-    if is_elsewhere(as_json) and result.differs:
-        errors.print(f"mjfim: {result}", markup=False)
+    origin = {"first": _relative(first, run.output), "second": _relative(second, run.output)}
+    verdict = str(result) if result.differs else ""
+    run.print({**origin, **result.summary()}, describe(result), verdict)
+    run.write(result, None, origin)
     raise typer.Exit(1 if result.differs or not result.is_reliable else 0)
 
 

@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import Force, claim_file, claim_folder, errors, keep_result, progress, verb
+from mjfim.cli.common import Force, claim_file, claim_folder, keep_result, verb
+from mjfim.cli.progress import progress, say
 from mjfim.output.robots import TARGETS
 
 
-@verb
+@verb()
 def export(
     design_folder: Annotated[
         Path,
@@ -28,10 +29,6 @@ def export(
             "--output", "-o", metavar="PATH", help="File to write, or folder of a bag or dataset."
         ),
     ],
-    experiment: Annotated[
-        Path | None,
-        typer.Option(help="Experiment of the design; default: the one that design.json names."),
-    ] = None,
     positions: Annotated[
         str | None,
         typer.Option(
@@ -60,7 +57,7 @@ def export(
 
     require_options(to, positions, storage, unit)
     file = design_folder / "design.npz" if design_folder.is_dir() else design_folder
-    stated = mjfim.Experiment.from_file(experiment or find_experiment_file(file))
+    stated = mjfim.Experiment.from_file(find_experiment_file(file))
     inputs = input_files(stated, [design_folder])
     if is_folder(to):
         claim_folder(output, exported_files(to, output), inputs, force=force)
@@ -74,5 +71,5 @@ def export(
         remarks = write_export(plan, output, to, positions, storage, unit)
 
     for sentence in remarks:
-        errors.print(f"note: {sentence}", markup=False)
-    errors.print(f"wrote {output}{'/' if is_folder(to) else ''}", markup=False)
+        say(f"note: {sentence}")
+    say(f"wrote {output}{'/' if is_folder(to) else ''}")

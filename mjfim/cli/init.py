@@ -7,17 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mjfim.cli.common import Force, ModelFile, claim_file, errors, out, progress, verb
+from mjfim.cli.common import Force, ModelFile, claim_file, verb
+from mjfim.cli.progress import out, progress, say
 from mjfim.errors import ExperimentError
 from mjfim.files import replacing
-from mjfim.studies.first_experiment.groups import GROUPS, Group
+from mjfim.studies.first_experiment.wishes import GROUPS, Group
 
 if TYPE_CHECKING:
     from mjfim.studies.first_experiment.propose import Proposal
     from mjfim.studies.first_experiment.wishes import Wishes
 
 
-@verb
+@verb()
 def init(
     model: ModelFile,
     output: Annotated[
@@ -76,13 +77,13 @@ def init(
     if proposal.companion is not None:
         with replacing(companion) as temporary:
             temporary.write_text(proposal.companion, encoding="utf-8")
-        errors.print(f"wrote {companion}", markup=False)
+        say(f"wrote {companion}")
     with replacing(file) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
-    errors.print(f"wrote {file}", markup=False)
+    say(f"wrote {file}")
     for remark in proposal.remarks:
-        errors.print(remark, markup=False)
+        say(remark)
     out.print(f"next: mjfim check {file}", soft_wrap=True)
 
 

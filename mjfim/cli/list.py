@@ -14,7 +14,7 @@ from mjfim.errors import ExperimentError
 Kind = Literal["parameters", "outputs", "actuators", "keyframes", "limits", "terms"]
 
 
-@verb
+@verb()
 def list_(
     model: ModelFile,
     wanted: Annotated[

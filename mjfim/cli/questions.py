@@ -13,9 +13,9 @@ import typer
 
 from mjfim.errors import ExperimentError, listed
 from mjfim.studies.first_experiment.candidates import require_carrier
-from mjfim.studies.first_experiment.groups import GROUPS
 from mjfim.studies.first_experiment.propose import Proposal, wanted_times
 from mjfim.studies.first_experiment.wishes import (
+    GROUPS,
     Wishes,
     groups_of,
     require_keyframe,

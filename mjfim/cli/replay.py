@@ -10,12 +10,13 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import Force, claim_file, errors, verb
+from mjfim.cli.common import Force, claim_file, verb
+from mjfim.cli.progress import say
 from mjfim.errors import RecordingError
 from mjfim.files import replacing
 
 
-@verb
+@verb()
 def replay(
     source: Annotated[
         Path, typer.Argument(metavar="DIR | FILE.rrd | DESIGN.npz", help="What to show.")
@@ -23,10 +24,6 @@ def replay(
     save: Annotated[
         Path | None,
         typer.Option(metavar="FILE.rrd", help="Write a file instead of opening the viewer."),
-    ] = None,
-    experiment: Annotated[
-        Path | None,
-        typer.Option(help="Experiment of a DESIGN.npz that has no design.json beside it."),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -44,9 +41,7 @@ def replay(
         inputs = sorted(source.iterdir()) if source.is_dir() else [source]
         claim_file(save, inputs, force=force)
     if source.suffix == ".npz":
-        system = System.resolve(
-            mjfim.Experiment.from_file(experiment or find_experiment_file(source))
-        )
+        system = System.resolve(mjfim.Experiment.from_file(find_experiment_file(source)))
         named = archive.read_design(source)
         for trajectory in named.values():
             archive.check_fits(source, trajectory, system)
@@ -62,4 +57,4 @@ def replay(
     if save is None:
         rerun_log.show(target)
     else:
-        errors.print(f"wrote {target}")
+        say(f"wrote {target}")

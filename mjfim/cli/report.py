@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from mjfim.cli.common import Force, Pictures, claim_file, errors, keep_result, verb
+from mjfim.cli.common import Force, Pictures, claim_file, keep_result, verb
+from mjfim.cli.progress import say
 from mjfim.output.picture_format import PictureFormat
 from mjfim.output.report import is_report
 
 
-@verb
+@verb()
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of results of any verb.")],
     missing: Annotated[
@@ -44,4 +45,4 @@ def report(
     # From here on, files are there after Ctrl-C.
     keep_result(folder)
     for file in (*rewrite_reports(folder), *write_pictures(folder, drawn, pictures)):
-        errors.print(f"wrote {file}", markup=False)
+        say(f"wrote {file}")

@@ -13,7 +13,7 @@ from mjfim.cli.common import AsJson, Verbose, print_result, verb
 from mjfim.errors import ExperimentError
 
 
-@verb
+@verb()
 def validate(
     experiment: Annotated[
         Path | None, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")
@@ -26,15 +26,17 @@ def validate(
     verbose: Verbose = False,
 ) -> None:
     """Say whether an experiment file is correct, and what it states."""
-    from mjfim.experiment.schema import json_schema
-    from mjfim.output.summaries.stated_experiment import describe_experiment
-    from mjfim.studies.stated_experiment import stated_experiment
-
     if schema:
+        from mjfim.experiment.schema import json_schema
+
         typer.echo(json.dumps(json_schema(), indent=2, ensure_ascii=False))
         return
     if experiment is None:
         raise ExperimentError("validate needs an experiment file, or --schema")
+    read = mjfim.Experiment.from_file(experiment)
 
-    stated = stated_experiment(mjfim.Experiment.from_file(experiment))
+    from mjfim.output.summaries.stated_experiment import describe_experiment
+    from mjfim.studies.stated_experiment import stated_experiment
+
+    stated = stated_experiment(read)
     print_result(as_json, stated.summary(), describe_experiment(stated), verbose=verbose)

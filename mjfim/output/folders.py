@@ -181,7 +181,8 @@ def find_experiment_file(source: Path) -> Path:
 
     if not isinstance(experiment, str):
         raise RecordingError(
-            f"{source}: no usable design.json beside it; name the experiment with --experiment"
+            f"{source}: no usable design.json beside it, which names the experiment; give the "
+            "folder of a design"
         )
     return source.parent.resolve() / experiment
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import (
     ExperimentError,
     MjfimError,
@@ -29,6 +28,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.identify import identify_system
 from mjfim.parallel import ExecutorLike, Workers
+from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate

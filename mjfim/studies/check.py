@@ -5,50 +5,53 @@ It needs no fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import RecordingError, SimulationDivergedError, first_ones, shortened
-from mjfim.excitation.designable import require_evaluated
+from mjfim.errors import MjfimError, RecordingError, SimulationDivergedError
+from mjfim.excitation.designable import require_designable, require_evaluated
+from mjfim.excitation.evaluation import growth_along, growth_warning
+from mjfim.excitation.initial_controls import initial_controls_of
+from mjfim.excitation.levels import require_coarse_factor
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.release_space import ReleaseSpace
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.task_parts import require_design_keys
+from mjfim.excitation.verification import require_feasible_start
+from mjfim.excitation.violations import all_violations_of
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.stated_units import probable_degrees
 from mjfim.experiment.system import System
+from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.fit_workers import FitWorkers
 from mjfim.identification.segments import recorded_release
 from mjfim.identification.sensitivity_rows import sensitivity_rows
 from mjfim.identification.task import refuse_same_data
 from mjfim.information.fisher import FisherInformation
-from mjfim.information.identifiability import Identifiability, IdentifiabilityTest
+from mjfim.information.identifiability import Identifiability, IdentifiabilityTest, RowsAndError
 from mjfim.information.marginal import shared
 from mjfim.parallel import ExecutorLike, one_blas_thread
+from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
     CONFOUNDED_CORRELATION,
     Check,
     ConfoundedPair,
     ParameterCheck,
-    ParameterGroup,
-    SelfTest,
-    groups_in_words,
-    join_names,
 )
-from mjfim.records.design import CombinationAccuracy
+from mjfim.records.design import LimitViolation
 from mjfim.records.events import begin_stage, shown_progress
-from mjfim.records.trajectory import Recording, Trajectory
+from mjfim.records.trajectory import Recording, Sensitivity, Trajectory
+from mjfim.studies.check_verdict import verdict_of_check
 from mjfim.studies.derivative_test import self_test
-from mjfim.studies.design_outlook import DesignOutlook
-from mjfim.studies.probe_workers import ProbeWorkers
 from mjfim.studies.random_references import random_references
+from mjfim.studies.shared_work import SharedWork
 
 # Target standard deviation where none is stated, relative to the size of the parameter.
 DEFAULT_RELATIVE_STD = 0.05
@@ -95,7 +98,6 @@ def check(
         system = System.resolve(experiment, threads=threads)
         if recordings:
             return check_recordings(system, recordings, stop, executor)
-
         require_design_keys(system, "check without recordings")
         return check_task(DesignTask.of(system), trajectory, stop, executor)
 
@@ -109,42 +111,44 @@ def check_task(
 ) -> Check:
     """Check the initial control of a task, or the control of a trajectory.
 
-    See `check`.
+    Args:
+        task: Task without priors from other recordings.
+        trajectory: Trajectory whose control is checked; None for the initial control.
+        stop: Ends the check early, as Ctrl-C does.
+        executor: Where random motions are differentiated; None for this process.
+
+    Raises:
+        SimulationDivergedError: The trajectory cannot be simulated.
     """
     source = "the initial control" if task.controls else "the initial state"
-    if trajectory is not None:
-        task = replace(task.released_as(trajectory.state[0]), release=task.release)
     curve = task.initial
     if trajectory is not None:
+        task = replace(task.released_as(trajectory.state[0]), release=task.release)
         curve, source = task.plant.simulate(task.theta, trajectory.ctrl), "the given trajectory"
 
-    # A start that diverges is refused in the words of a design.
     begin_stage("simulating the motion and its sensitivities")
     problem, point = _evaluate(task, curve)
+    # A start that diverges is refused in the words of a design.
     if trajectory is None:
         require_evaluated(task, point)
-    if point.information is None or point.sensitivity is None:
-        raise SimulationDivergedError("the simulation diverges when the parameters change a little")
+    sensitivity, information = _known(point)
 
     # From here on, there is something to report when the check is stopped.
     with stop_on_interrupt(stop) as token:
-        stage = _Stages(token)
         test = _identifiability_test(task, executor, token)
-        identifiability = stage.identifiability(test.along, curve, point.sensitivity)
-        tested = stage.test_derivatives(task, problem, point, identifiability)
-        outlook = DesignOutlook()
-        if trajectory is None and not token.requested:
-            outlook = DesignOutlook.of(task, identifiability)
-        return _Assessment(
-            task=task,
-            source=source,
-            duration=float(curve.t[-1]),
-            identifiability=identifiability,
-            data=_common_information(task, [point.information - task.information.prior]),
-            tested=tested,
-            missing=tuple(stage.missing),
-            outlook=outlook,
-        ).check()
+        return _checked(
+            _Evidence(
+                task=task,
+                problem=problem,
+                point=point,
+                test=partial(test.along, curve, sensitivity),
+                data=_common_information(task, [information - task.information.prior]),
+                source=source,
+                duration=float(curve.t[-1]),
+                is_start=trajectory is None,
+            ),
+            token,
+        )
 
 
 @one_blas_thread()
@@ -156,7 +160,15 @@ def check_recordings(
 ) -> Check:
     """Check which parameters recordings identify; derivatives are tested along the longest one.
 
-    See `check`.
+    Args:
+        system: System to which the recordings belong.
+        recordings: The recordings.
+        stop: Ends the check early, as Ctrl-C does.
+        executor: Where the recordings are differentiated; None for this process.
+
+    Raises:
+        RecordingError: Recordings are unusable.
+        SimulationDivergedError: A recording cannot be simulated.
     """
     refuse_same_data(recordings, ())
     begin_stage("simulating the recordings")
@@ -165,30 +177,78 @@ def check_recordings(
         fit = fit.on_workers(FitWorkers(executor))
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     task = _task_along(recorded_release(system, longest), system, longest.ctrl[:MAX_TESTED_SAMPLES])
-
     problem, point = _evaluate(task, task.initial)
-    if point.information is None or point.sensitivity is None:
-        raise SimulationDivergedError("the simulation diverges when the parameters change a little")
+    _known(point)
 
     # Rows of G at the times of the measurements, and the error of their finite differences.
     recorded = sensitivity_rows(fit, fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
     count = len(recordings)
-
     # From here on, there is something to report when the check is stopped.
     with stop_on_interrupt(stop) as token:
-        stage = _Stages(token)
         test = _identifiability_test(task, executor, token)
-        identifiability = stage.identifiability(test.of_rows, task.initial, J, error)
-        return _Assessment(
-            task=task,
-            source=f"{count} recording{'s' if count > 1 else ''}",
-            duration=float(sum(recording.t[-1] for recording in fit.recordings)),
-            identifiability=identifiability,
-            data=_common_information(task, [rows.T @ rows for rows, _ in recorded]),
-            tested=stage.test_derivatives(task, problem, point, identifiability),
-            missing=tuple(stage.missing),
-        ).check()
+        return _checked(
+            _Evidence(
+                task=task,
+                problem=problem,
+                point=point,
+                test=partial(test.of_rows, task.initial, J, error),
+                data=_common_information(task, [rows.T @ rows for rows, _ in recorded]),
+                source=f"{count} recording{'s' if count > 1 else ''}",
+                duration=float(sum(recording.t[-1] for recording in fit.recordings)),
+            ),
+            token,
+        )
+
+
+# ---- what is looked at
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Evidence:
+    """What a check is computed from.
+
+    Attributes:
+        task: The task.
+        problem: Its cost about the motion along which derivatives are tested.
+        point: This motion.
+        test: Test of identifiability; it gets a function that says whether to stop.
+        data: (p, p) information of the data alone.
+        source: What is checked, in words.
+        duration: Duration of the data [s].
+        is_start: Whether it is the initial control, at which a design begins.
+    """
+
+    task: DesignTask
+    problem: DesignProblem
+    point: DesignPoint
+    test: Callable[[Callable[[], bool]], Identifiability]
+    data: Array
+    source: str
+    duration: float
+    is_start: bool = False
+
+
+def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
+    """The cost of a task, evaluated along a trajectory."""
+    running = replace(task.problem.running, desired_state=curve.state)
+    problem = replace(task.problem, running=running)
+    return problem, problem.point(curve, CENTRAL_DIFFERENCES)
+
+
+def _known(point: DesignPoint) -> tuple[Sensitivity, Array]:
+    """Sensitivities and information of a motion. Raises SimulationDivergedError without them."""
+    if point.information is None or point.sensitivity is None:
+        raise SimulationDivergedError("the simulation diverges when the parameters change a little")
+    return point.sensitivity, point.information
+
+
+def _task_along(start: Array, system: System, control: Array) -> DesignTask:
+    """Task along a recorded control: (N, nu), from the release: (ns,) of the recording."""
+    if not system.experiment.initial.free:
+        return DesignTask.along(system, control)
+    task = DesignTask.along(system.released(start), control)
+    return replace(task, release=ReleaseSpace.of(system, task.limits))
 
 
 def _identifiability_test(
@@ -200,404 +260,190 @@ def _identifiability_test(
         test = replace(test, probes=partial(random_references, task))
     if executor is None:
         return test
-    workers = ProbeWorkers(executor=executor, task=task, stop=stop)
-    return replace(test, differentiated=workers.differentiated)
+
+    def make(threads: int) -> Callable[[], IdentifiabilityTest]:
+        """Return what makes the test in a worker."""
+        system = SystemOrder.of(task.system, threads)
+        return partial(_made_test, system, test.theta, test.earlier)
+
+    def differentiated(probes: Iterable[Trajectory]) -> Iterator[RowsAndError | None]:
+        """Differentiate motions on the workers."""
+        work = SharedWork(own=test, make=make, executor=executor, stop=stop)
+        return work.results(_rows_along, list(probes))
+
+    return replace(test, differentiated=differentiated)
 
 
-def _task_along(start: Array, system: System, control: Array) -> DesignTask:
-    """Task along a recorded control: (N, nu), from the release: (ns,) of the recording."""
-    if not system.experiment.initial.free:
-        return DesignTask.along(system, control)
-
-    task = DesignTask.along(system.released(start), control)
-    return replace(task, release=ReleaseSpace.of(system, task.limits))
-
-
-def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
-    """The cost of a task, evaluated along a trajectory.
-
-    The tracking term of the cost refers to that trajectory.
-    """
-    stated = task.problem
-    running = replace(stated.running, desired_state=curve.state)
-    problem = replace(stated, running=running)
-    return problem, problem.point(curve, CENTRAL_DIFFERENCES)
+def _made_test(system: SystemOrder, theta: Array, earlier: Array) -> IdentifiabilityTest:
+    """Make a test in a worker, which has no random motions of its own."""
+    made = system.system()
+    return IdentifiabilityTest(
+        plant=made.plant,
+        parameters=made.parameters,
+        noise=made.noise,
+        theta=theta,
+        earlier=earlier,
+        probes=lambda count: iter(()),
+    )
 
 
-def evaluate_and_test(task: DesignTask) -> None:
-    """Do the main work of a check along the initial control of a task, to measure its duration.
-
-    Args:
-        task: The task.
-
-    Raises:
-        SimulationDivergedError: The simulation diverges.
-    """
-    problem, point = _evaluate(task, task.initial)
-    self_test(task, problem, point)
-
-
-class _Stages:
-    """Stages of a check that are left out after a request to stop.
-
-    Attributes:
-        missing: What was left out, in words.
-    """
-
-    def __init__(self, stop: StopToken) -> None:
-        self.missing: list[str] = []
-        self._stop = stop
-
-    def identifiability(
-        self, test: Callable[..., Identifiability], *arguments: object
-    ) -> Identifiability:
-        """Test identifiability; random controls are tried only where there is a doubt.
-
-        Args:
-            test: The test, which asks before every random control whether it has to stop.
-            *arguments: Its arguments.
-        """
-        begin_stage("testing which parameters can be told apart")
-        found = test(*arguments, self._is_stopped)
-        if found.along_trajectory.count and self._is_stopped():
-            self.missing.append("what other controls would show")
-        return found
-
-    def test_derivatives(
-        self,
-        task: DesignTask,
-        problem: DesignProblem,
-        point: DesignPoint,
-        identifiability: Identifiability,
-    ) -> SelfTest:
-        """Test the derivatives at a point, with a criterion of the identifiable combinations."""
-        information = replace(problem.information, basis=identifiability.basis)
-        visible = replace(problem, information=information)
-        tested = self_test(task, visible, visible.reevaluated(point), self._is_stopped)
-        if not tested.finished:
-            self.missing.append("the test of the derivatives")
-        return tested
-
-    def _is_stopped(self) -> bool:
-        """Whether a stop is requested."""
-        return self._stop.requested
+def _rows_along(test: IdentifiabilityTest, probe: Trajectory, _: StopToken) -> RowsAndError | None:
+    """Differentiate one motion."""
+    return test.rows_along(probe)
 
 
 def _common_information(task: DesignTask, matrices: Sequence[Array]) -> Array:
-    """(p, p) sum of information matrices about the parameters that all recordings share.
-
-    Parameters with a separate value for each recording are marginalised out.
-    """
+    """(p, p) sum of information matrices about the parameters that all recordings share."""
     p = task.parameters
-    total = np.zeros_like(task.prior)
-    for each in matrices:
-        total = total + shared(each, p.prior_information, p.recording_specific)
-    return np.asarray(total)
+    every = [shared(each, p.prior_information, p.recording_specific) for each in matrices]
+    return np.asarray(sum(every, np.zeros_like(task.prior)))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Assessment:
-    """Everything that a check is computed from.
+# ---- what is found
 
-    Attributes:
-        task: Task that holds the parameters and the criterion.
-        source: Name of the checked data for sentences.
-        duration: Duration of the checked data [s].
-        identifiability: Combinations that can be identified.
-        data: (p, p) information of the checked data [1 / theta-unit^2], without priors.
-        tested: Test of the derivatives.
-        missing: What was left out after a request to stop, in words.
-        outlook: What a design would say about the initial control.
-    """
 
-    task: DesignTask
-    source: str
-    duration: float
-    identifiability: Identifiability
-    data: Array
-    tested: SelfTest
-    missing: tuple[str, ...]
-    outlook: DesignOutlook = field(default_factory=DesignOutlook)
+def _checked(evidence: _Evidence, stop: StopToken) -> Check:
+    """The record for the user; what a request to stop leaves out is named in it."""
+    task = evidence.task
+    missing = []
 
-    def check(self) -> Check:
-        """The record for the user."""
-        task, found = self.task, self.identifiability
-        information = self._information()
-        total = self.data + task.prior
+    def is_stopped() -> bool:
+        """Whether a stop is requested."""
+        return stop.requested
 
-        # Standard deviations of the wanted parameters. They are infinite where a parameter cannot
-        # be identified individually.
-        covariance = information.covariance(total)
-        spread = np.sqrt(np.diag(covariance))
-        std = np.full(len(task.parameters), np.inf)
-        std[task.parameters.interest] = np.nan_to_num(spread, nan=np.inf)
-        correlation = covariance / np.outer(spread, spread)
+    # Random controls are tried only where there is a doubt.
+    begin_stage("testing which parameters can be told apart")
+    found = evidence.test(is_stopped)
+    here, everywhere = found.along_trajectory, found.along_all
+    if here.count and stop.requested:
+        missing.append("what other controls would show")
+    # The slope is that of a criterion of the identifiable combinations.
+    visible = replace(
+        evidence.problem, information=replace(evidence.problem.information, basis=found.basis)
+    )
+    tested = self_test(task, visible, visible.reevaluated(evidence.point), is_stopped)
+    if not tested.finished:
+        missing.append("the test of the derivatives")
+    refused: tuple[str, ...] = ()
+    violations: tuple[LimitViolation, ...] = ()
+    warning = ""
+    # Without actuators there is no control that a design could begin with.
+    if evidence.is_start and task.controls and task.release is None and not stop.requested:
+        refused, violations = _refusals(task, found)
+        warning = growth_warning(growth_along(task, task.initial)) or ""
 
-        # Eigenvalues of the criterion, without combinations that no experiment can identify.
-        criterion = replace(task.information, basis=found.basis)
-        eigenvalues = criterion.evaluate(self.data + criterion.prior).eigenvalues
+    # Standard deviations of the wanted parameters. They are infinite where a parameter cannot be
+    # identified individually.
+    basis = here.basis if here.count else None
+    information = replace(task.information, prior=task.prior, basis=basis)
+    total = evidence.data + task.prior
+    covariance = information.covariance(total)
+    spread = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(spread, spread)
+    std = np.full(len(task.parameters), np.inf)
+    std[task.parameters.interest] = np.nan_to_num(spread, nan=np.inf)
 
-        rows = self._rows(information, std)
-        confounded = _confounded_pairs(found.names, correlation)
-        not_excited = self._not_excited()
-        combined: tuple[CombinationAccuracy, ...] = ()
-        if not not_excited:
-            values = task.theta[task.parameters.interest]
-            combined = found.combinations(information, values, total, total)
+    # Eigenvalues of the criterion, without combinations that no experiment can identify.
+    criterion = replace(task.information, basis=found.basis)
+    eigenvalues = criterion.evaluate(evidence.data + criterion.prior).eigenvalues
+    # Groups that the checked data do not separate, although another control would.
+    never = {str(group) for group in found.groups_along_all}
+    groups = found.groups_along_trajectory if here.count > everywhere.count else ()
+    not_excited = tuple(group for group in groups if str(group) not in never)
+    values = task.theta[task.parameters.interest]
 
-        verdict = _Verdict(
-            rows=rows,
-            not_separable=found.groups_along_all,
-            not_excited=not_excited,
-            confounded=confounded,
-            tested=self.tested,
-            source=self.source,
-            missing=self.missing,
+    check = Check(
+        source=evidence.source,
+        horizon=evidence.duration,
+        rows=tuple(_rows(evidence, information, std)),
+        wanted=found.names,
+        information=total,
+        eigenvalues=np.maximum(eigenvalues, 0.0),
+        correlation=correlation,
+        confounded=_confounded_pairs(found.names, correlation),
+        not_separable=found.groups_along_all,
+        not_excited=not_excited,
+        self_test=tested,
+        verdict=(),
+        combined=() if not_excited else found.combinations(information, values, total, total),
+        missing=tuple(missing),
+        refused=refused,
+        violations=violations,
+    )
+    degrees = probable_degrees(task.experiment, task.system.source)
+    warnings = [warning] if warning else []
+    return replace(check, verdict=(*warnings, *verdict_of_check(check), *degrees))
+
+
+def _refusals(
+    task: DesignTask, identifiability: Identifiability
+) -> tuple[tuple[str, ...], tuple[LimitViolation, ...]]:
+    """Why a design refuses its initial control, in its own words, and the limits it violates."""
+    refused: list[str] = []
+    is_kept = True
+    for require in (
+        lambda: require_feasible_start(task),
+        lambda: require_coarse_factor(task),
+        lambda: initial_controls_of(task, None),
+        lambda: require_designable(task, identifiability),
+    ):
+        try:
+            require()
+        except MjfimError as error:
+            # A start that cannot be kept says all about the limits.
+            is_kept = is_kept and bool(refused)
+            refused.append(str(error))
+    return tuple(refused), all_violations_of(task, task.initial) if is_kept else ()
+
+
+def _rows(
+    evidence: _Evidence, information: FisherInformation, std: Array
+) -> Iterator[ParameterCheck]:
+    """Predicted accuracy of every parameter; std: (p,) [theta-unit]."""
+    p, theta = evidence.task.parameters, evidence.task.theta
+    for j, (parameter, size) in enumerate(zip(p.parameters, p.sizes(theta).tolist(), strict=True)):
+        wanted = parameter.wanted or DEFAULT_RELATIVE_STD * size
+        repetitions = 0
+        if not parameter.nuisance:
+            repetitions = _repetitions(evidence, information, j, wanted)
+        yield ParameterCheck(
+            name=parameter.name,
+            unit=parameter.unit,
+            value=float(theta[j]),
+            nuisance=parameter.nuisance,
+            size=size,
+            std=float(std[j]),
+            relative=float(std[j] / size),
+            wanted=wanted,
+            stated=parameter.wanted is not None,
+            repetitions=repetitions,
+            seconds=repetitions * evidence.duration,
         )
-        return Check(
-            source=self.source,
-            horizon=self.duration,
-            rows=rows,
-            wanted=found.names,
-            information=total,
-            eigenvalues=np.maximum(eigenvalues, 0.0),
-            correlation=correlation,
-            confounded=confounded,
-            not_separable=found.groups_along_all,
-            not_excited=not_excited,
-            self_test=self.tested,
-            verdict=(
-                *self.outlook.sentences(),
-                *verdict.sentences(),
-                *_probable_degrees(task),
-            ),
-            combined=combined,
-            missing=self.missing,
-            refused=self.outlook.refused,
-            violations=self.outlook.violations,
-        )
-
-    def _information(self) -> FisherInformation:
-        """Criterion and covariances of the combinations that the checked data can identify."""
-        here = self.identifiability.along_trajectory
-        basis = here.basis if here.count else None
-        return replace(self.task.information, prior=self.task.prior, basis=basis)
-
-    def _not_excited(self) -> tuple[ParameterGroup, ...]:
-        """Groups that the checked data do not separate, although another control would."""
-        found = self.identifiability
-        if found.along_trajectory.count <= found.along_all.count:
-            return ()
-
-        never_shown = {str(group) for group in found.groups_along_all}
-        return tuple(g for g in found.groups_along_trajectory if str(g) not in never_shown)
-
-    def _rows(self, information: FisherInformation, std: Array) -> tuple[ParameterCheck, ...]:
-        """Predicted accuracy of every parameter; std: (p,) [theta-unit]."""
-        p = self.task.parameters
-        sizes = p.sizes(self.task.theta)
-        rows = []
-        for j, parameter in enumerate(p.parameters):
-            value = float(self.task.theta[j])
-
-            size = float(sizes[j])
-            wanted = parameter.wanted or DEFAULT_RELATIVE_STD * size
-
-            repetitions = 0
-            if not parameter.nuisance:
-                repetitions = self._repetitions(information, j, wanted)
-
-            row = ParameterCheck(
-                name=parameter.name,
-                unit=parameter.unit,
-                value=value,
-                nuisance=parameter.nuisance,
-                size=size,
-                std=float(std[j]),
-                relative=float(std[j] / size),
-                wanted=wanted,
-                stated=parameter.wanted is not None,
-                repetitions=repetitions,
-                seconds=repetitions * self.duration,
-            )
-            rows.append(row)
-
-        return tuple(rows)
-
-    def _repetitions(self, information: FisherInformation, parameter: int, wanted: float) -> int:
-        """Smallest number of repetitions that reaches the wanted standard deviation.
-
-        Args:
-            information: Gives the covariance of an information matrix.
-            parameter: Index of the parameter.
-            wanted: Wanted standard deviation [theta-unit].
-
-        Returns:
-            The number; 0 where no number of repetitions suffices.
-        """
-        interest = information.interest
-        if interest is None:
-            interest = np.arange(len(self.data))
-        place = int(np.flatnonzero(interest == parameter)[0])
-
-        def suffices(repetitions: int) -> bool:
-            """Whether this number of repetitions reaches the wanted standard deviation."""
-            total = repetitions * self.data + self.task.prior
-            variance = information.covariance(total)[place, place]
-            return bool(variance <= wanted**2)
-
-        # Double the number until it suffices, then bisect.
-        low, high = 0, 1
-        while not suffices(high):
-            low, high = high, 2 * high
-            if high > MAX_REPETITIONS:
-                return 0
-
-        while high - low > 1:
-            middle = (low + high) // 2
-            if suffices(middle):
-                high = middle
-            else:
-                low = middle
-        return high
 
 
-def _probable_degrees(task: DesignTask) -> tuple[str, ...]:
-    """Warnings about angles of the experiment that look like degrees."""
-    return probable_degrees(task.experiment, task.system.source)
+def _repetitions(
+    evidence: _Evidence, information: FisherInformation, parameter: int, wanted: float
+) -> int:
+    """Smallest number of repetitions that reaches the wanted standard deviation; 0 for none."""
+    interest = evidence.task.parameters.interest
+    place = int(np.flatnonzero(interest == parameter)[0])
+
+    def suffices(repetitions: int) -> bool:
+        """Whether this number of repetitions reaches the wanted standard deviation."""
+        covariance = information.covariance(repetitions * evidence.data + evidence.task.prior)
+        return bool(covariance[place, place] <= wanted**2)
+
+    if suffices(1):
+        return 1
+    found = bisect_left(range(MAX_REPETITIONS + 1), True, lo=2, key=suffices)
+    return found if found <= MAX_REPETITIONS else 0
 
 
 def _confounded_pairs(names: Sequence[str], correlation: Array) -> tuple[ConfoundedPair, ...]:
-    """Confounded pairs of parameters, in descending order of their correlation.
-
-    Args:
-        names: Names of the t parameters.
-        correlation: (t, t) correlation of their estimates.
-    """
+    """Confounded pairs of parameters, in descending order of their correlation."""
     strong = np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)
-    pairs = []
-    for i, j in np.argwhere(strong).tolist():
-        pair = ConfoundedPair(
-            first=names[i],
-            second=names[j],
-            correlation=float(correlation[i, j]),
-        )
-        pairs.append(pair)
-
+    pairs = [
+        ConfoundedPair(first=names[i], second=names[j], correlation=float(correlation[i, j]))
+        for i, j in np.argwhere(strong).tolist()
+    ]
     return tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation)))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Verdict:
-    """Findings of a check, from which sentences for the user are made.
-
-    Attributes:
-        rows: Accuracy of every parameter.
-        not_separable: Groups whose members no control can separate.
-        not_excited: Groups that the checked data do not separate, although another control would.
-        confounded: Strongly correlated pairs.
-        tested: Test of the derivatives.
-        source: Name of the checked data.
-        missing: What was left out after a request to stop, in words.
-    """
-
-    rows: Sequence[ParameterCheck]
-    not_separable: Sequence[ParameterGroup]
-    not_excited: Sequence[ParameterGroup]
-    confounded: Sequence[ConfoundedPair]
-    tested: SelfTest
-    source: str
-    missing: Sequence[str]
-
-    def sentences(self) -> Iterator[str]:
-        """Sentences for the user, the most serious first."""
-        if self.missing:
-            yield f"interrupted, so this check is incomplete; it lacks {join_names(self.missing)}"
-        yield from self._about_derivatives()
-        yield from self._about_identifiability()
-
-        identifiable = [row for row in self.rows if not row.nuisance and np.isfinite(row.std)]
-        if not identifiable:
-            yield f"no parameter can be identified individually from {self.source}"
-            return
-
-        yield from self._about_accuracy(identifiable)
-        yield from self._about_correlation()
-
-    def _about_derivatives(self) -> Iterator[str]:
-        """Reason why the numbers of the check cannot be trusted, where the self-test failed."""
-        tested = self.tested
-        if tested.roughness is not None:
-            yield f"{tested.roughness}"
-        elif tested.finished and not tested.passed:
-            yield (
-                f"the derivatives do not agree (psi recursion {tested.recursion:.1e}, slope "
-                f"{tested.slope:.1e}); {tested.likely_cause}. Shorten horizon or timestep, or "
-                "smooth what switches, before you trust these numbers"
-            )
-
-    def _groups_left_to_priors(self) -> tuple[list[ParameterGroup], list[ParameterGroup]]:
-        """Inseparable groups that remain unknown, and those that priors alone resolve."""
-        known = {row.name for row in self.rows if np.isfinite(row.std)}
-        unknown, resolved = [], []
-        for group in self.not_separable:
-            if set(group.members) <= known:
-                resolved.append(group)
-            else:
-                unknown.append(group)
-
-        return unknown, resolved
-
-    def _about_identifiability(self) -> Iterator[str]:
-        """Combinations that cannot be identified, and advice for the user."""
-        unknown, resolved = self._groups_left_to_priors()
-        if unknown:
-            yield (
-                "not identifiable separately from this initial state, with any tested control: "
-                f"{groups_in_words(unknown)}. Remove or fix one parameter of each group, give it "
-                "a prior, or measure another output; a design uses the identifiable combinations"
-            )
-        if resolved:
-            names = first_ones([group.short_names for group in resolved], "; ")
-            yield f"separated by priors only, not by data: {names}"
-        if self.not_excited:
-            yield (
-                f"not excited by {self.source}, but another control would show: "
-                f"{groups_in_words(self.not_excited)}. Move those joints more"
-            )
-
-    def _about_accuracy(self, identifiable: Sequence[ParameterCheck]) -> Iterator[str]:
-        """Comparison of the predicted standard deviations with the wanted ones."""
-        missed = [row for row in identifiable if row.repetitions != 1]
-        unknown, _ = self._groups_left_to_priors()
-
-        if missed:
-            worst = max(identifiable, key=lambda row: row.std / row.wanted)
-            needed = "no number of repetitions reaches"
-            if worst.repetitions:
-                needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"
-            wanted = f"{worst.wanted:.3g} {worst.unit}".rstrip()
-            yield (
-                f"{len(missed)} of {len(identifiable)} parameters miss the wanted σ with "
-                f"{self.source} alone; the worst is {worst.name}: {needed} {wanted}. A designed "
-                "excitation (`mjfim design`) needs fewer"
-            )
-        elif self.tested.passed and not self.missing and not unknown and not self.not_excited:
-            yield (
-                f"every identifiable parameter reaches its wanted σ with {self.source}: "
-                "nothing more is needed"
-            )
-
-    def _about_correlation(self) -> Iterator[str]:
-        """Confounded pairs of parameters."""
-        if not self.confounded:
-            return
-
-        pairs = [
-            f"{shortened(pair.first)} / {shortened(pair.second)} ({pair.correlation:+.3f})"
-            for pair in self.confounded
-        ]
-        yield (
-            f"confounded pairs (correlation of the estimates): {first_ones(pairs)}; "
-            "fixing one parameter of a pair makes the other more accurate"
-        )

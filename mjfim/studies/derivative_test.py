@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -56,31 +57,35 @@ def self_test(
         raise SimulationDivergedError("the trajectory diverges when the parameters change a little")
 
     model = task.system.model_at(task.theta)
-    tested = SelfTest(roughness=None, recursion=np.nan, slope=np.nan, finished=False)
-    if stop():
-        return tested
-    begin_stage("testing the derivatives: two step sizes", 0, 3)
-    rough = roughness(
-        task.plant, task.system.noise, model, task.theta, trajectory, point.sensitivity
-    )
-    tested = replace(tested, roughness=rough)
-    if stop():
-        return tested
+    sensitivity = point.sensitivity
 
-    # A state does not show what control laws remember, so that there is no recursion and no slope.
-    if task.plant.laws is not None:
-        return replace(tested, recursion=0.0, slope=0.0, finished=True)
-    begin_stage("testing the derivatives: recursion", 1, 3)
-    tested = replace(tested, recursion=recursion_error(task, trajectory, point.sensitivity))
-    if stop():
-        return tested
-    begin_stage("testing the derivatives: slope", 2, 3)
-    try:
-        slope = slope_error(task, problem, point)
-    except np.linalg.LinAlgError:
-        # The motion is so unstable that no direction of descent can be computed.
-        slope = np.inf
-    tested = replace(tested, slope=slope, finished=True)
+    def slope() -> float:
+        """The error of the slope; infinite where a motion is too unstable for a direction."""
+        try:
+            return slope_error(task, problem, point)
+        except np.linalg.LinAlgError:
+            return np.inf
+
+    tests: dict[str, tuple[str, Callable[[], Any]]] = {
+        "roughness": (
+            "two step sizes",
+            lambda: roughness(
+                task.plant, task.system.noise, model, task.theta, trajectory, sensitivity
+            ),
+        ),
+        "recursion": ("recursion", lambda: recursion_error(task, trajectory, sensitivity)),
+        "slope": ("slope", slope),
+    }
+    tested = SelfTest(roughness=None, recursion=np.nan, slope=np.nan, finished=False)
+    for number, (key, (name, error)) in enumerate(tests.items()):
+        if stop():
+            return tested
+        # A state does not show what control laws remember: there is no recursion and no slope.
+        is_possible = task.plant.laws is None or key == "roughness"
+        begin_stage(f"testing the derivatives: {name}", number, len(tests))
+        found: dict[str, Any] = {key: error() if is_possible else 0.0}
+        tested = replace(tested, **found)
+    tested = replace(tested, finished=True)
 
     # The result of the roughness test names its cause. The likely cause of any other failure is the
     # first constraint that acts.

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import NORMAL_95, Array
-from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
@@ -27,6 +26,7 @@ from mjfim.identification.search import FitSearch
 from mjfim.identification.task import FitTask, with_length
 from mjfim.model.terms.base import AXES
 from mjfim.parallel import one_blas_thread
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import begin_stage, shown_progress
 from mjfim.records.payload import PayloadEstimate

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Playback
@@ -110,28 +109,3 @@ class PlannedController:
             measured[q : q + 4] /= np.linalg.norm(measured[q : q + 4])
 
         return self.space.minus(planned, measured)
-
-
-def sensed_entries(task: DesignTask) -> np.ndarray:
-    """(ns,) index of the output that measures each entry of the state; -1 where there is none."""
-    model, space = task.system.model, task.space
-    position = int(mujoco.mjtSensor.mjSENS_JOINTPOS)
-    velocity = int(mujoco.mjtSensor.mjSENS_JOINTVEL)
-
-    # Entry of the state that each sensor of a joint measures, by the address of the sensor.
-    encoders = {}
-    for i in range(model.nsensor):
-        kind = int(model.sensor_type[i])
-        joint = int(model.sensor_objid[i])
-        address = int(model.sensor_adr[i])
-        if kind == position:
-            encoders[address] = int(model.jnt_qposadr[joint])
-        elif kind == velocity:
-            encoders[address] = space.nq + int(model.jnt_dofadr[joint])
-
-    found = np.full(space.nq + space.nv + space.na, -1)
-    for i, output in enumerate(task.system.outputs.outputs):
-        entry = output.state if output.sensor is None else encoders.get(output.sensor)
-        if entry is not None:
-            found[entry] = i
-    return found

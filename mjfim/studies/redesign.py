@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import StopToken
 from mjfim.errors import MjfimError, SimulationDivergedError
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.evaluation import criterion_of
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import ExecutorLike
+from mjfim.parallel.budget import StopToken
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback

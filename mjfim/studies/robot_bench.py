@@ -13,6 +13,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import scipy
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
@@ -26,11 +27,12 @@ from mjfim.identification.identify import identify_system
 from mjfim.information.marginal import standard_deviations
 from mjfim.model.coordinates import tangent_names
 from mjfim.plant.batch import BatchSimulator
+from mjfim.plant.outputs import outputs_by_state
 from mjfim.recordings.control_table import read_playback
 from mjfim.records.estimate import Estimate
 from mjfim.records.robustness import RobotConditions, RobotRun
 from mjfim.records.trajectory import Recording
-from mjfim.studies.planned_controller import PlannedController, sensed_entries
+from mjfim.studies.planned_controller import PlannedController
 
 # Largest number of attempts to draw a robot whose bodies are physical.
 MAX_DRAWS = 500
@@ -38,16 +40,6 @@ MAX_DRAWS = 500
 # Largest acceleration of a robot that counts as standing still, relative to the size of each
 # coordinate over the square of the horizon.
 MAX_REST_MOVE = 1e-4
-
-# Largest number of Newton steps in the search for the equilibrium.
-MAX_REST_STEPS = 50
-
-# Length of a Newton step, relative to the sizes of the states, below which the search for the
-# equilibrium ends.
-REST_STEP_TOLERANCE = 1e-12
-
-# Perturbation of the state for the derivative of the acceleration, relative to its sizes.
-REST_PERTURBATION = 1e-6
 
 # Delays at which further fits start where the first fit ends in a misfit [s].
 FURTHER_DELAYS = (2e-3, 4e-3, 8e-3, 16e-3)
@@ -137,7 +129,7 @@ class RobotBench:
             space=self.stated.space,
             bounds=self.constraints.control.bounds,
             rest=self._rest_control(),
-            sensed=sensed_entries(self.stated),
+            sensed=_sensed_entries(self.stated),
             steps_per_row=self.steps_per_row,
             late_steps=self.late_steps,
             feedback=conditions.feedback,
@@ -288,55 +280,39 @@ class RobotBench:
         )
 
     def _equilibrium(self, model: Any, controller: PlannedController) -> tuple[Array, float, float]:
-        """Find an equilibrium of a robot by Newton's method.
+        """Find an equilibrium of a robot near the initial state of the model.
 
         Args:
             model: Model of the robot.
-            controller: The controller.
+            controller: Controller, whose first gain acts on the state with feedback.
 
         Returns:
-            (ns,) state with the smallest acceleration, its largest acceleration there [unit of the
-            coordinate / s²], and how far it moves within the horizon, relative to the sizes.
+            (ns,) state, the largest acceleration that is left, and the same relative to the size of
+            its coordinate over the square of the horizon.
         """
-        space = self.stated.space
+        space, sizes = self.stated.space, self.stated.plant.sizes
         data = mujoco.MjData(model)
-        state = np.array(self.stated.plant.nominal_initial_state)
-
+        nominal = np.array(self.stated.plant.nominal_initial_state)
         # Positions and activations may change by multiples of their sizes; velocities stay zero.
-        sizes = self.stated.plant.sizes
-        every = np.diag(sizes.state)
-        directions = np.delete(every, np.arange(space.nv, 2 * space.nv), axis=0)
-
-        # Sizes of accelerations and of rates of activations.
+        directions = np.delete(np.diag(sizes.state), np.arange(space.nv, 2 * space.nv), axis=0)
         time = self.stated.horizon
         rates = np.concatenate([sizes.position / time**2, sizes.activation / time])
 
-        def acceleration(x: Array) -> Array:
-            """Accelerations and rates of the activations at a state."""
-            qpos, qvel, act = space.split(x)
-            data.qpos[:] = qpos
-            data.qvel[:] = qvel
-            data.act[:] = act
-            data.ctrl[:] = controller.before_start(x)
+        def relative_rates(move: Array) -> Array:
+            """Accelerations and rates of the activations after a move, relative to their sizes."""
+            state = space.plus(nominal, move @ directions)
+            data.qpos[:], data.qvel[:], data.act[:] = space.split(state)
+            data.ctrl[:] = controller.before_start(state)
             mujoco.mj_forward(model, data)
-            return np.concatenate([data.qacc, data.act_dot])
+            return np.asarray(np.concatenate([data.qacc, data.act_dot]) / rates)
 
-        for _ in range(MAX_REST_STEPS):
-            current = acceleration(state)
-            columns = []
-            for direction in directions:
-                ahead = acceleration(space.plus(state, REST_PERTURBATION * direction))
-                behind = acceleration(space.plus(state, -REST_PERTURBATION * direction))
-                columns.append(ahead - behind)
-
-            slope = np.stack(columns, 1) / (2.0 * REST_PERTURBATION) / rates[:, None]
-            step = np.linalg.lstsq(slope, -current / rates, rcond=1e-9)[0]
-            state = space.plus(state, step @ directions)
-            if np.abs(step).max(initial=0.0) < REST_STEP_TOLERANCE:
-                break
-
-        found = np.abs(acceleration(state))
-        return state, float(found.max(initial=0.0)), float((found / rates).max(initial=0.0))
+        still = np.zeros(len(directions))
+        move = scipy.optimize.least_squares(
+            relative_rates, still, jac="3-point", xtol=1e-14, ftol=1e-15, gtol=1e-15, max_nfev=50
+        ).x
+        found = np.abs(relative_rates(move))
+        state = space.plus(nominal, move @ directions)
+        return state, float((found * rates).max(initial=0.0)), float(found.max(initial=0.0))
 
     # ---- one robot
 
@@ -561,6 +537,14 @@ class RobotBench:
 
         J = task.system.noise.whitened_rows(found[1])
         return standard_deviations(J.T @ J + task.parameters.prior_information)
+
+
+def _sensed_entries(task: DesignTask) -> np.ndarray:
+    """(ns,) index of the output that measures each entry of the state; -1 where there is none."""
+    found = np.full(task.space.nq + task.space.nv + task.space.na, -1)
+    for entry, output in outputs_by_state(task.system.model, task.system.outputs).items():
+        found[entry] = output
+    return found
 
 
 def _assessed_limits(task: DesignTask, constraints: ConstraintSet) -> tuple[Limit, ...]:

@@ -8,7 +8,6 @@ statistic of Wald. The p-values are corrected for the number of tests by the met
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -75,70 +74,49 @@ def compare_estimates(
         )
 
     compared = [name for name in common if not _why_not_compared(name, first, second, names)]
-    scatter = _Scatter.pooled(_Scatter.of(first, compared), _Scatter.of(second, compared))
-    robots = _Robot.of(first, compared, scatter), _Robot.of(second, compared, scatter)
-    tests = _Tests.of(*robots, scatter)
+    both = (first, second)
+    index = [[each.parameters.index(name) for name in compared] for each in both]
+    values = np.array([each.theta[place] for each, place in zip(both, index, strict=True)])
+    is_single = [(each.sizes == np.abs(each.theta))[k] for each, k in zip(both, index, strict=True)]
+
+    # Both robots scatter alike: few recordings of one say little about it.
+    tau2, freedom, numbers = np.stack([_scatter(each, compared) for each in both], axis=1)
+    total = freedom.sum(axis=0)
+    between = (freedom * tau2).sum(axis=0) / np.maximum(total, 1.0) / numbers
+    honest = [honest_std(each)[place] for each, place in zip(both, index, strict=True)]
+    std = np.sqrt(np.array(honest) ** 2 + between)
+
+    # The scatter between recordings is known from few of them.
+    difference = values[1] - values[0]
+    width = np.hypot(*std)
+    known = np.where(width > 0.0, width, 1.0)
+    degrees = satterthwaite(between.sum(axis=0) / known**2, MANY, total)
+    p = 2.0 * scipy.special.stdtr(degrees, -np.abs(difference) / known)
+    t = scipy.special.stdtrit(degrees, 0.975)
+    found = scipy.special.stdtrit(degrees, 1.0 - 0.5 * LEVEL / (len(compared) + 1))
+    covariance = sum(_covariance(*each) for each in zip(both, index, std, strict=True))
+    middle = float(np.median(degrees)) if compared else MANY
+    corrected = holm(np.append(p, f_tail(*_wald(difference, np.asarray(covariance)), middle)))
+
     return RobotComparison(
         names=names,
         recordings=(len(first.recordings), len(second.recordings)),
         parameters=tuple(compared),
-        units=robots[0].units,
-        is_single=np.array(robots[0].is_single & robots[1].is_single, dtype=np.float64),
-        values=np.array([robot.values for robot in robots]),
-        std=np.array([robot.std for robot in robots]),
-        interval=tests.interval,
-        p=tests.p,
-        detectable=tests.detectable,
-        joint_p=tests.joint_p,
+        units=tuple(first.units[j] for j in index[0]),
+        is_single=np.array(is_single[0] & is_single[1], dtype=np.float64),
+        values=values,
+        std=std,
+        interval=np.column_stack([difference - t * width, difference + t * width]),
+        p=corrected[:-1],
+        detectable=(found + scipy.special.stdtrit(degrees, POWER)) * width,
+        joint_p=float(corrected[-1]),
         level=LEVEL,
         remarks=tuple(_remarks(first, second, names, common)),
-        is_reliable=all(estimate.success and not estimate.misfit for estimate in (first, second)),
+        is_reliable=all(estimate.success and not estimate.misfit for estimate in both),
     )
 
 
 # ---- what is known about each robot
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Robot:
-    """Estimates of q parameters of one robot.
-
-    Attributes:
-        units: Their units; may be empty.
-        is_single: (q,) True for single numbers, False for entries of vectors and tensors.
-        values: (q,) estimates [theta-unit].
-        std: (q,) standard deviations, with the scatter between recordings [theta-unit].
-        between: (q,) part of the variances that is due to this scatter [squares of theta-units].
-        covariance: (q, q) covariance of the estimates, with these standard deviations.
-    """
-
-    units: tuple[str, ...]
-    is_single: np.ndarray
-    values: Array
-    std: Array
-    between: Array
-    covariance: Array
-
-    @staticmethod
-    def of(estimate: Estimate, parameters: Sequence[str], scatter: _Scatter) -> _Robot:
-        """Evidence of an estimate about some of its parameters.
-
-        Args:
-            estimate: The estimate.
-            parameters: Names of parameters that it determines.
-            scatter: Scatter between recordings of both robots.
-        """
-        index = [estimate.parameters.index(name) for name in parameters]
-        between = scatter.tau2 / _effective_numbers(estimate, parameters)
-        std = np.sqrt(honest_std(estimate)[index] ** 2 + between)
-        return _Robot(
-            units=tuple(estimate.units[j] for j in index),
-            is_single=(estimate.sizes == np.abs(estimate.theta))[index],
-            values=estimate.theta[index],
-            std=std,
-            between=between,
-            covariance=_covariance(estimate, index, std),
-        )
 
 
 def honest_std(estimate: Estimate) -> Array:
@@ -181,118 +159,33 @@ def _covariance(estimate: Estimate, index: Sequence[int], std: Array) -> Array:
     return stretched_formal_covariance(estimate, complete)[place]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Scatter:
-    """Scatter of q parameters between recordings.
+def _scatter(estimate: Estimate, parameters: Sequence[str]) -> Array:
+    """Scatter of q parameters between the recordings of one robot.
 
-    Attributes:
-        tau2: (q,) variances between recordings [squares of theta-units].
-        freedom: (q,) their degrees of freedom; 0 where nothing is known.
+    Returns:
+        (3, q) variances between recordings [theta-unit²], degrees of freedom with which they are
+        known, and effective numbers of recordings of the weighted means, at least 1.
     """
-
-    tau2: Array
-    freedom: np.ndarray
-
-    @staticmethod
-    def of(estimate: Estimate, parameters: Sequence[str]) -> _Scatter:
-        """Scatter between the recordings of one robot.
-
-        Args:
-            estimate: Its estimate.
-            parameters: Names of the parameters.
-        """
-        tau2, freedom = np.zeros(len(parameters)), np.zeros(len(parameters), dtype=int)
-        comparison = estimate.recording_comparison
-        if comparison is None:
-            return _Scatter(tau2=tau2, freedom=freedom)
-
-        found = between_variance(comparison.values, comparison.std**2)
-        for j, name in enumerate(parameters):
-            if name in comparison.parameters:
-                k = comparison.parameters.index(name)
-                tau2[j] = found[k]
-                freedom[j] = max(int(np.isfinite(comparison.values[:, k]).sum()) - 1, 0)
-        return _Scatter(tau2=tau2, freedom=freedom)
-
-    @staticmethod
-    def pooled(first: _Scatter, second: _Scatter) -> _Scatter:
-        """Scatter of two robots that scatter alike. Few recordings of one say little about it.
-
-        Args:
-            first: Scatter of the first robot.
-            second: Scatter of the second robot.
-        """
-        freedom = first.freedom + second.freedom
-        total = first.freedom * first.tau2 + second.freedom * second.tau2
-        return _Scatter(tau2=total / np.maximum(freedom, 1), freedom=freedom)
-
-
-def _effective_numbers(estimate: Estimate, parameters: Sequence[str]) -> Array:
-    """(q,) effective numbers of recordings of a weighted mean, at least 1."""
-    numbers = np.ones(len(parameters))
+    found = np.zeros((3, len(parameters)))
+    found[2] = 1.0
     comparison = estimate.recording_comparison
     if comparison is None:
-        return numbers
-
+        return found
+    variance = between_variance(comparison.values, comparison.std**2)
     for j, name in enumerate(parameters):
         if name not in comparison.parameters:
             continue
-        std = comparison.std[:, comparison.parameters.index(name)]
+        k = comparison.parameters.index(name)
+        found[0, j] = variance[k]
+        found[1, j] = max(int(np.isfinite(comparison.values[:, k]).sum()) - 1, 0)
+        std = comparison.std[:, k]
         weights = std[np.isfinite(std) & (std > 0.0)] ** -2.0
         if weights.size:
-            numbers[j] = np.sum(weights) ** 2 / np.sum(weights**2)
-    return numbers
+            found[2, j] = np.sum(weights) ** 2 / np.sum(weights**2)
+    return found
 
 
 # ---- tests
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Tests:
-    """Tests of the differences of q parameters.
-
-    Attributes:
-        interval: (q, 2) 95 % intervals of the differences [theta-unit].
-        p: (q,) p-values, corrected for the number of tests.
-        detectable: (q,) differences that would have been found [theta-unit].
-        joint_p: p-value of all parameters together, corrected likewise.
-    """
-
-    interval: Array
-    p: Array
-    detectable: Array
-    joint_p: float
-
-    @staticmethod
-    def of(first: _Robot, second: _Robot, scatter: _Scatter) -> _Tests:
-        """Test whether two robots are equal.
-
-        Args:
-            first: The first robot.
-            second: The second robot.
-            scatter: Scatter between recordings of both robots.
-        """
-        count = len(first.values)
-        difference = second.values - first.values
-        std = np.hypot(first.std, second.std)
-
-        # The scatter between recordings is known from few of them.
-        share = (first.between + second.between) / np.where(std > 0.0, std**2, 1.0)
-        freedom = satterthwaite(share, MANY, scatter.freedom)
-        p = 2.0 * scipy.special.stdtr(freedom, -np.abs(difference) / np.where(std > 0.0, std, 1.0))
-
-        t = scipy.special.stdtrit(freedom, 0.975)
-        found = scipy.special.stdtrit(freedom, 1.0 - 0.5 * LEVEL / (count + 1))
-        covariance = first.covariance + second.covariance
-        middle = float(np.median(freedom)) if count else MANY
-        squares, rank = _wald(difference, covariance)
-        corrected = holm(np.append(p, f_tail(squares, rank, middle)))
-        return _Tests(
-            interval=np.column_stack([difference - t * std, difference + t * std]),
-            p=corrected[:-1],
-            detectable=(found + scipy.special.stdtrit(freedom, POWER)) * std,
-            joint_p=float(corrected[-1]),
-        )
 
 
 def holm(p: Array) -> Array:

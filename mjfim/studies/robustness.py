@@ -6,10 +6,8 @@ identified from its recording.
 
 from __future__ import annotations
 
-import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,16 +15,13 @@ import numpy as np
 import scipy
 from threadpoolctl import threadpool_limits
 
-from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import (
-    NoResultError,
-)
+from mjfim.errors import NoResultError
 from mjfim.excitation.limits import Limit
 from mjfim.experiment.packing import for_workers
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.parallel import ExecutorLike, pool_stop_token, results_or_here
-from mjfim.parallel.kept import KeptPerThread
+from mjfim.parallel import ExecutorLike
+from mjfim.parallel.budget import StopToken, stop_on_interrupt
 from mjfim.records.events import Callback, StudyEvent, shown_progress
 from mjfim.records.robustness import (
     CONFIDENCE,
@@ -37,6 +32,7 @@ from mjfim.records.robustness import (
     Robustness,
 )
 from mjfim.studies.robot_bench import RobotBench
+from mjfim.studies.shared_work import SharedWork
 
 
 def assess_robustness(
@@ -88,8 +84,16 @@ def assess_robustness(
         stop_on_interrupt(stop) as token,
         shown_progress("playing the design", callback, progress) as show,
     ):
-        study = partial(_RobotStudy.of, experiment, bench, table)
-        for run in _play_all(bench, study, runs, executor, token):
+
+        def make(threads: int) -> Callable[[], RobotBench]:
+            """Return what makes the bench in a process, which needs no file of this one."""
+            packed = for_workers(experiment, bench.stated.system.source, [table])
+            return partial(RobotBench, packed, table, bench.conditions)
+
+        work = SharedWork(own=bench, make=make, executor=executor, stop=token)
+        for run in work.results(_run_until_stopped, range(runs)):
+            if run is None:
+                continue
             found.append(run)
             if show is None:
                 continue
@@ -201,81 +205,8 @@ def _covered(runs: Sequence[RobotRun], selected: np.ndarray) -> int:
     return int(sum(run.squared_distance(indices) <= threshold for run in runs))
 
 
-# ---- several robots
-
-
-@dataclass(frozen=True, kw_only=True)
-class _RobotStudy:
-    """Order from which a worker process makes the bench of a study; it can be pickled.
-
-    Attributes:
-        key: Unique text by which a worker recognises the study, so that it makes one bench only.
-        experiment: The experiment of the design.
-        table: The design.csv.
-        conditions: Differences between the robots and the model.
-    """
-
-    key: str
-    experiment: Experiment
-    table: Path
-    conditions: RobotConditions
-
-    @classmethod
-    def of(cls, experiment: Experiment, bench: RobotBench, table: Path) -> _RobotStudy:
-        """The study of a bench, for processes that need no file of this one."""
-        return cls(
-            key=uuid.uuid4().hex,
-            experiment=for_workers(experiment, bench.stated.system.source, [table]),
-            table=table,
-            conditions=bench.conditions,
-        )
-
-
-# The latest bench of a worker, by the key of its study.
-_worker_benches: KeptPerThread[RobotBench] = KeptPerThread(1)
-
-
-def _run_in_worker(study: _RobotStudy, number: int) -> RobotRun | None:
-    """Play one robot in a worker process."""
-    bench = _worker_benches.get(
-        study.key, lambda: RobotBench(study.experiment, study.table, study.conditions)
-    )
-    return _run_until_stopped(bench, number, pool_stop_token())
-
-
 def _run_until_stopped(bench: RobotBench, number: int, stop: StopToken) -> RobotRun | None:
-    """Play one robot, with one thread.
-
-    A request to stop also ends the fit of the robot early. Its estimate is then not used, and the
-    result is None.
-    """
+    """Play one robot, with one thread; None after a request to stop."""
     with threadpool_limits(1), stop_on_interrupt(stop):
         run = bench.run(number)
-
     return None if stop.requested else run
-
-
-def _play_all(
-    bench: RobotBench,
-    study: Callable[[], _RobotStudy],
-    count: int,
-    executor: ExecutorLike | None,
-    stop: StopToken,
-) -> Iterator[RobotRun]:
-    """Play all robots until a stop is requested, and yield the results in their order.
-
-    Without an executor, one robot is played after another in this process.
-    """
-    if executor is not None:
-        play = partial(_run_in_worker, study())
-        here = partial(_run_until_stopped, bench, stop=stop)
-        for finished in results_or_here(executor, play, range(count), Budget(stop=stop), here):
-            if finished is not None:
-                yield finished
-        return
-
-    for number in range(count):
-        run = _run_until_stopped(bench, number, stop)
-        if run is None:
-            return
-        yield run

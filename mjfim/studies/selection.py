@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError, listed
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
@@ -31,6 +30,7 @@ from mjfim.identification.terms import TermTests, find_missing_terms
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import InterruptedPassError
 from mjfim.parallel import ExecutorLike, one_blas_thread
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import begin_stage, shown_progress
 from mjfim.records.terms import (

@@ -335,8 +335,3 @@ def test_all_verbs_with_much_work_state_where_it_is_done(
 
     words = (verb, study, *(tmp_path / name for name in files), "-o", tmp_path / "out")
     misused(run(*words, "--executor", "cluster"), "state local, local:N")
-
-
-def test_robustness_has_processes_in_one_place(study: Path, tmp_path: Path) -> None:
-    words = ("robustness", study, "-o", tmp_path / "out", "--jobs", 2, "--executor", "local:3")
-    misused(run(*words), "--jobs states processes of this computer")

@@ -41,16 +41,13 @@ def test_missing_inputs(study: Path, archived: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     misused(
         run("design", tmp_path / "gone.toml", "-o", out),
-        "gone.toml",
-        "cannot read the experiment file",
+        "gone.toml: no such file",
     )
     misused(
         run("simulate", study, tmp_path / "gone.npz", "-o", out / "r.csv"),
-        "gone.npz: no such design file",
+        "gone.npz: no such file",
     )
-    misused(
-        run("montecarlo", study, tmp_path / "gone.npz", "-o", out), "gone.npz: no such design file"
-    )
+    misused(run("montecarlo", study, tmp_path / "gone.npz", "-o", out), "gone.npz: no such file")
     misused(run("identify", study, tmp_path / "gone.csv", "-o", out), "gone.csv: no such file")
     misused(run("replay", tmp_path / "gone", "--save", out / "x.rrd"), "no such file or folder")
     (tmp_path / "notes.txt").touch()
@@ -62,11 +59,6 @@ def test_missing_inputs(study: Path, archived: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").unlink()
     misused(run("replay", tmp_path / "gone.rrd", "--save", out / "x.rrd"), "gone.rrd: no such file")
     misused(run("replay", tmp_path, "--save", out / "x.rrd"), "no design.rrd or estimate.rrd")
-    misused(
-        run("identify", study, archived, "-o", out, "--method", "magic"),
-        "'magic'",
-        "least_squares, newton",
-    )
     assert names(tmp_path) == set()
 
 
@@ -110,7 +102,7 @@ def test_output_is_a_file(study: Path, archived: Path, recorded: Path, tmp_path:
 
 
 def test_design_of_another_model(archived: Path, tmp_path: Path) -> None:
-    """The verbs simulate, montecarlo and replay refuse a design of another model."""
+    """The verbs simulate and montecarlo refuse a design of another model."""
     path = write_experiment(tmp_path)
     xml = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
     more = '<body name="rider"><joint name="ride"/><geom size=".1" mass="1"/></body></worldbody>'
@@ -120,9 +112,6 @@ def test_design_of_another_model(archived: Path, tmp_path: Path) -> None:
     said = ("design.npz: made for (nq, nv, nu) = (2, 2, 1)", "(3, 3, 1)")
     misused(run("simulate", path, archived, "-o", tmp_path / "out" / "r.csv"), *said)
     misused(run("montecarlo", path, archived, "-o", tmp_path / "out"), *said)
-    misused(
-        run("replay", archived, "--experiment", path, "--save", tmp_path / "out" / "x.rrd"), *said
-    )
     assert "out" not in names(tmp_path)
 
 
@@ -164,7 +153,7 @@ def test_version() -> None:
     [
         ("check", "study.toml", "--threads", "1000000"),
         ("design", "study.toml", "-o", "out", "--starts", "1000000000"),
-        ("robustness", "study.toml", "--runs", "1000000000"),
+        ("robustness", "study.toml", "made", "-o", "x", "--runs", "1000000000"),
     ],
     ids=["threads", "starts", "runs"],
 )

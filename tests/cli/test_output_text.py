@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from mjfim.cli.common import errors, out, replace_unencodable_characters
+from mjfim.cli.common import replace_unencodable_characters
+from mjfim.cli.progress import errors, out
 from mjfim.output.summary_parts import Row, Summary, SummaryTable, columns
 from mjfim.output.text import render
 from tests.support.cli import PROCESS, loads, misused, run, write_experiment
@@ -22,7 +23,7 @@ NAME = "run [bold]1[/] [/red] :smile:"
 
 def test_brackets_in_messages(tmp_path: Path) -> None:
     """A message shows the path of a missing file as it is."""
-    misused(run("check", tmp_path / f"{NAME}.toml"), f"{NAME}.toml: cannot read")
+    misused(run("check", tmp_path / f"{NAME}.toml"), f"{NAME}.toml: no such file")
 
 
 def test_brackets_in_the_path_of_results(study: Path, archived: Path, tmp_path: Path) -> None:
@@ -58,12 +59,6 @@ def test_streams_that_are_not_utf8(encoding: str, monkeypatch: pytest.MonkeyPatc
     stream.flush()
     printed = stream.buffer.getvalue().decode(encoding)
     assert printed == ("? of [/?]: ?_min\n" if encoding == "ascii" else "? of [/é]: ?_min\n")
-
-
-def test_paths_that_are_not_utf8(tmp_path: Path) -> None:
-    """A path that libraries cannot open is refused before the work."""
-    result = run("check", write_experiment(tmp_path), "-o", tmp_path / "caf\udce9")
-    misused(result, "not UTF-8 in the present locale", "LC_ALL=C.UTF-8")
 
 
 @pytest.mark.slow

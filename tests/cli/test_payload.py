@@ -57,10 +57,10 @@ def test_misuse_is_one_message(tmp_path: Path) -> None:
     robot = write_experiment(tmp_path)
     log, out = tmp_path / "log.csv", tmp_path / "out"
     log.write_text("t\n0\n", encoding="utf-8")
-    misused(run("payload", robot, log, "-o", out), "--body: name the body", "valid: ")
-    misused(run("payload", robot, log, "-o", out, "--body", "bib"), "--body: unknown body 'bib'")
-    misused(run("payload", robot, log, "-o", out, "--body", "world"), "--body: 'world'", "move")
-    misused(run("payload", robot, log, "-o", out, "--body", "bob", "--size", "-1"), "--size: -1")
+    misused(run("payload", robot, log, "-o", out), "body: name the body", "valid: ")
+    misused(run("payload", robot, log, "-o", out, "--body", "bib"), "body: unknown body 'bib'")
+    misused(run("payload", robot, log, "-o", out, "--body", "world"), "body: 'world'", "move")
+    misused(run("payload", robot, log, "-o", out, "--body", "bob", "--size", "-1"), "size: -1")
     gone = tmp_path / "gone"
     misused(run("payload", robot, log, "-o", out, "--from", gone), f"{gone}: no such file")
     misused(run("payload", robot, log, "-o", out, "--without", f"{gone}.csv"), "gone.csv: no such")

@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.cli.reserve import tightened
 from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design_task
@@ -572,27 +571,6 @@ def test_a_quadrotor_flies_inside_its_box_speeds_and_tilt(tmp_path: Path) -> Non
     ]
     assert any(title.startswith("tilt: smallest margin") for title in titles)
     assert any(title.startswith("angular velocity: smallest margin") for title in titles)
-
-
-def test_a_reserve_narrows_boxes_speeds_and_tilt(tmp_path: Path) -> None:
-    """The file keeps its box; the ranges of the coordinates are narrower."""
-    box = ((-0.4, 0.4), (-0.4, 0.4), (0.7, 1.3))
-    limits = {"position": {"float": box}, "velocity": 0.8, "tilt": {"float": 0.3}}
-    task = flight(tmp_path, limits=limits)
-
-    narrower = tightened(task.experiment, {"position": 0.1, "velocity": 0.25, "tilt": 0.5})
-    found = {
-        (limit.kind, limit.name): (limit.lower, limit.upper)
-        for limit in DesignTask.resolve(narrower).limits
-        if limit.kind != "control"
-    }
-    assert found == {
-        ("position", "float.x"): pytest.approx((-0.36, 0.36)),
-        ("position", "float.y"): pytest.approx((-0.36, 0.36)),
-        ("position", "float.z"): pytest.approx((0.73, 1.27)),
-        ("velocity", "float"): pytest.approx((0.0, 0.6)),
-        ("tilt", "float"): pytest.approx((0.0, 0.15)),
-    }
 
 
 def test_a_file_that_is_validated_shows_every_limit_with_its_unit(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from mjfim.output.plots.convergence import convergence
 from mjfim.output.plots.design import trajectories
 from mjfim.parallel.budget import Budget, StopToken
 from mjfim.records.design import Status
-from mjfim.studies.monte_carlo import monte_carlo_system
+from mjfim.studies.monte_carlo import monte_carlo
 from tests.support.cli import run
 from tests.support.paths import MODELS
 from tests.support.swing_down import swing_down
@@ -230,7 +230,7 @@ def test_estimates_of_a_designed_release_reach_the_cramer_rao_bound(tmp_path: Pa
     experiment = short(tmp_path)
     design = mjfim.design(experiment)
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = monte_carlo_system(System.resolve(experiment), curves, trials=100, seed=3)
+    study = monte_carlo(experiment, curves, trials=100, seed=3)
     for name, evaluation in (("initial", design.initial), ("final", design.final)):
         found = study.sets[name]
         assert found.failed == 0

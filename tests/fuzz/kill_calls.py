@@ -71,10 +71,6 @@ CALLS = {
     "robustness": Call(
         words=("robustness", "study.toml", "made", *FOLDER, "--runs", "3"), has_workers=True
     ),
-    "robustness of a new design": Call(
-        words=("robustness", "limited.toml", *FOLDER, "--runs", "2", "--jobs", "1"),
-        has_workers=True,
-    ),
     "campaign": Call(
         words=("campaign", "guess.toml", *FOLDER, "--wanted", "0.0055", "--seed", "5"),
         again=("--resume",),

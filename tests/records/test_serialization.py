@@ -37,7 +37,7 @@ from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.robustness import Robustness
 from mjfim.records.trajectory import Recording, Trajectory
 from mjfim.studies.check import check_task
-from mjfim.studies.monte_carlo import monte_carlo_system
+from mjfim.studies.monte_carlo import monte_carlo
 from tests.support.paths import MODELS
 
 SAVED: tuple[type[SavedRecord], ...] = (
@@ -260,7 +260,7 @@ def test_a_check_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
 def test_a_study_is_loaded_as_it_was(task: DesignTask, design: Design, tmp_path: Path) -> None:
     """With all estimates."""
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    round_trip(monte_carlo_system(task.system, curves, trials=3), tmp_path)
+    round_trip(monte_carlo(task.experiment, curves, trials=3), tmp_path)
 
 
 def test_a_comparison_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:

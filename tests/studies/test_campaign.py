@@ -17,8 +17,7 @@ from typer.testing import Result
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.budget import StopToken
-from mjfim.cli.campaign_run import with_target_accuracies
+from mjfim.cli.campaign import with_target_accuracies
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
@@ -32,6 +31,7 @@ from mjfim.output.campaign_folder import (
     require_same_settings,
 )
 from mjfim.output.manifest import MANIFEST
+from mjfim.parallel.budget import StopToken
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.trajectory import Recording

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import segment_simulation
-from mjfim.information.identifiability import Identifiability
-from mjfim.studies.probe_workers import ProbeWorkers
+from mjfim.studies.check import check_task
 from tests.support.executors import LosingThreads
 from tests.support.paths import MODELS
 
@@ -28,27 +23,16 @@ def at_rest() -> DesignTask:
     return DesignTask.resolve(still, threads=1)
 
 
-def found_by(task: DesignTask, **options: Any) -> Identifiability:
-    """What the test of the task finds along its initial control."""
-    sensitivity = task.plant.derivatives.sensitivity(task.theta, task.initial)
-    assert sensitivity is not None
-    test = replace(task.identifiability_test, **options)
-    return test.along(task.initial, sensitivity)
-
-
 def test_random_motions_are_the_same_although_tasks_are_lost() -> None:
     task = at_rest()
-    alone = found_by(task)
-
+    alone = check_task(task)
     with LosingThreads() as threads:
-        workers = ProbeWorkers(executor=threads, task=task, stop=StopToken())
-        found = found_by(task, differentiated=workers.differentiated)
+        found = check_task(task, executor=threads)
 
     # Nothing moves along the initial control; the random motions show everything.
     assert threads.submitted > 3
-    assert alone.along_trajectory.count > 0
-    assert alone.along_all.count == 0
-    assert found.along_all.smallest == alone.along_all.smallest
+    assert alone.not_excited and not alone.not_separable
+    assert found.verdict == alone.verdict
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -18,7 +17,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.studies.check import check
 from mjfim.studies.first_experiment.document import experiment_text
 from mjfim.studies.first_experiment.propose import Proposal, propose_experiment
-from mjfim.studies.first_experiment.selection import identifiable, separable
+from mjfim.studies.first_experiment.selection import identifiable
 from mjfim.studies.first_experiment.start import _candidates, choose_start
 from mjfim.studies.first_experiment.time_scale import RATE_RANGE, _rate, reach, time_scale
 from mjfim.studies.first_experiment.wishes import Wishes
@@ -291,25 +290,8 @@ def test_parameters_are_chosen_until_one_spoils_the_others() -> None:
     units = np.array([1e-6, 1e6, 1e3])
     assert identifiable((G.T @ G) / np.outer(units, units), sizes * units) == [0, 2]
 
-    # What a test cannot tell apart makes room for a later parameter.
-    def told_apart(members: Sequence[int]) -> Sequence[int]:
-        """Members without the second parameter."""
-        return [i for i in members if i != 1]
-
-    assert identifiable(1e4 * np.eye(3), sizes, told_apart, most=2) == [0, 2]
-
     # Where nothing is known well, the best known parameter remains.
     assert identifiable(1e-6 * np.diag([1.0, 3.0, 2.0]), sizes) == [1]
-
-
-def test_the_last_parameter_of_each_direction_without_effect_is_left_out() -> None:
-    # Mass, first moment and inertia of a pendulum are known but for one combination; the friction
-    # between them is known. A parameter without any effect is left out itself.
-    assert separable(np.array([[1.0], [0.3], [0.0], [0.05]])) == [0, 1, 2]
-    assert separable(np.array([[0.0], [2.0], [0.0]])) == [0, 2]
-    both = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
-    assert separable(both) == [0, 1]
-    assert separable(np.zeros((3, 0))) == [0, 1, 2]
 
 
 ARM = """

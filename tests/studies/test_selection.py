@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import StopToken
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
+from mjfim.parallel.budget import StopToken
 from mjfim.records.terms import Decision
 from mjfim.records.trajectory import Recording
 from mjfim.studies import selection as selection_study

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.budget import Budget
 from mjfim.identification.held_out_losses import Reduction
 from mjfim.identification.terms import TermTests
+from mjfim.parallel.budget import Budget
 from mjfim.records.terms import Decision, SelectionStep, Term, TermNumber
 from mjfim.studies import selection
 from mjfim.studies.selection import EQUAL_COST, INTERRUPTED, _Selector

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import StopToken
 from mjfim.excitation.task import DesignTask
+from mjfim.parallel.budget import StopToken
 from mjfim.records.events import StudyEvent
 from mjfim.studies import monte_carlo as studies
 from tests.support.executors import KINDS, LosingThreads, move_to, processes
@@ -67,21 +67,6 @@ def test_the_estimates_do_not_depend_on_the_executor_nor_on_lost_tasks(
         assert same(estimates(experiment, final, executor=threads), alone)
 
     assert threads.submitted == 3
-
-
-@pytest.mark.parametrize("smallest", [1, 6])
-@pytest.mark.slow
-def test_the_estimates_do_not_depend_on_the_division_into_chunks(
-    smallest: int,
-    experiment: mjfim.Experiment,
-    curves: dict[str, mjfim.Trajectory],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    final = {"final": curves["final"]}
-    expected = estimates(experiment, final)
-    monkeypatch.setattr(studies, "MIN_CHUNK", smallest)
-
-    assert same(estimates(experiment, final), expected)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
-from mjfim.studies.monte_carlo import monte_carlo_system
+from mjfim.studies.monte_carlo import monte_carlo
 from tests.support.cli import run
 from tests.support.swing_down import (
     CENTRE,
@@ -51,7 +51,7 @@ def test_a_check_predicts_the_standard_deviations_of_the_closed_form(tmp_path: P
 @pytest.mark.slow
 def test_estimates_reach_the_cramer_rao_bound(tmp_path: Path) -> None:
     task = DesignTask.resolve(swing_down(tmp_path, 0.1))
-    study = monte_carlo_system(task.system, {"initial": task.initial}, trials=120, seed=1)
+    study = monte_carlo(task.experiment, {"initial": task.initial}, trials=120, seed=1)
     found = study.sets["initial"]
     assert found.failed == 0
     assert (found.efficiency_interval[:, 0] < 1.0).all()

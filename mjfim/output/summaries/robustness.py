@@ -131,7 +131,7 @@ def robustness_sentences(result: Robustness) -> Iterator[str]:
         needed = " ".join(f"{kind}={share:g}" for kind, share in reserve.items())
         yield (
             "such robots keep the limits if the design stays away from them by these shares of "
-            f"half of each range: {needed} (make such a design with --reserve {needed})"
+            f"half of each range: {needed} (state limits that are tighter by it, and design again)"
         )
 
 

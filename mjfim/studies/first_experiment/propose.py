@@ -24,24 +24,24 @@ from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.sizes import position_sizes
 from mjfim.model.urdf_sources import is_urdf
 from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
-from mjfim.records.trajectory import Sensitivity
-from mjfim.studies.first_experiment.candidates import Candidate, candidates
-from mjfim.studies.first_experiment.excitation import (
+from mjfim.studies.first_experiment.candidates import (
+    Candidate,
+    ProposedNoise,
+    candidates,
+    proposed_noise,
+)
+from mjfim.studies.first_experiment.first_motion import (
+    FIRST_SHARE,
     SHRINKING,
     TRIALS,
+    ProposedRelease,
     first_amplitudes,
     largest_feasible,
-    rounded,
-)
-from mjfim.studies.first_experiment.outputs import ProposedNoise, proposed_noise
-from mjfim.studies.first_experiment.release import (
-    FIRST_SHARE,
-    ProposedRelease,
     propose_release,
+    rounded,
 )
 from mjfim.studies.first_experiment.selection import (
     identifiable,
-    separable,
 )
 from mjfim.studies.first_experiment.start import Start, choose_start, influence_of_controls
 from mjfim.studies.first_experiment.time_scale import TimeScale, reach, time_scale
@@ -137,6 +137,10 @@ class Proposal:
             if self.start.act.any():
                 initial["act"] = self.start.act.tolist()
 
+        limits = {
+            "control": {name: list(both) for name, both in self.control_limits.items()},
+            "velocity": self.velocity_limits,
+        }
         values: dict[str, Any] = {
             "model": self.model,
             "rate": self.times.rate,
@@ -144,22 +148,17 @@ class Proposal:
             "initial": initial,
             "parameters": {each.name: each.table() for each in self.chosen},
             "noise": {each.key: each.sigma for each in self.noise},
-            "descent": {"seconds": SECONDS},
         }
         if self.release is None:
             initial["control"] = self.control()
-            values["cost"] = {"control": 0.0}
         else:
             values["nuisance"] = {"initial": dict.fromkeys(self.release.free, True)}
-        limits: dict[str, Any] = {}
-        if self.control_limits:
-            limits["control"] = {name: list(both) for name, both in self.control_limits.items()}
-        if self.velocity_limits:
-            limits["velocity"] = dict(self.velocity_limits)
-        if limits:
-            values["limits"] = limits
+        values["limits"] = {key: table for key, table in limits.items() if table}
         if self.rest:
             values["boundary"] = {"start": "rest"}
+        if self.release is None:
+            values["cost"] = {"control": 0.0}
+        values["descent"] = {"seconds": SECONDS}
         return values
 
     def control(self) -> dict[str, Any]:
@@ -538,41 +537,12 @@ class _Refinement:
         system = System.resolve(self._experiment(draft), source=self.source)
         task = self._task(system, draft)
         point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-        if point.information is None or point.sensitivity is None:
+        if point.information is None:
             raise SimulationDivergedError(
                 "the simulation diverges when the parameters change a little"
             )
-        sensitivity = point.sensitivity
         F = np.asarray(point.information - task.information.prior)
-
         # The error of a release is a further unknown.
         n = len(draft.chosen)
         hidden = F[:n, n:] @ np.linalg.pinv(F[n:, n:], hermitian=True) @ F[n:, :n]
-
-        def told_apart(members: Sequence[int]) -> Sequence[int]:
-            """The members that a check tells apart along this motion."""
-            part = replace(draft, chosen=[draft.chosen[i] for i in members])
-            columns = [*members, *range(n, len(task.parameters))]
-            kept = self._told_apart(part, sensitivity.of_parameters(columns))
-            return [members[i] for i in kept]
-
-        return identifiable(F[:n, :n] - hidden, task.parameters.scale[:n], told_apart)
-
-    def _told_apart(self, draft: Proposal, sensitivity: Sensitivity) -> Sequence[int]:
-        """Indices of the parameters of a draft that a check tells apart.
-
-        Dry friction and contacts make derivatives inaccurate, so that parameters seem to differ
-        that never do. The test of a check knows the error of the derivatives, and looks at single
-        steps as well.
-
-        Args:
-            draft: The draft.
-            sensitivity: Sensitivities to its parameters along its motion.
-        """
-        system = System.resolve(self._experiment(draft), source=self.source)
-        task = self._task(system, draft)
-
-        # Other controls need not be tried, because this one has to show every parameter.
-        found = task.identifiability_test.along(task.initial, sensitivity, lambda: True)
-        sizes = task.parameters.magnitude[task.parameters.interest]
-        return separable(found.along_trajectory.directions / sizes[:, None])
+        return identifiable(F[:n, :n] - hidden, task.parameters.scale[:n])

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.studies.first_experiment.groups import GROUPS, Group
+
+Group = Literal["payload", "friction", "inertia", "motors"]
+
+# Groups of parameters, in the order of preference.
+GROUPS: tuple[Group, ...] = ("payload", "friction", "inertia", "motors")
+
 
 # Largest deviation of a sample period from a whole number of timesteps, relative to a timestep.
 STEP_TOLERANCE = 1e-6
