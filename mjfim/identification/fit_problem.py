@@ -15,7 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget
+from mjfim.parallel.budget import Budget
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import AlignedRecording, align, on_grid_of

@@ -19,7 +19,7 @@ from typing import Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
 
-from mjfim.budget import Budget, StopToken
+from mjfim.parallel.budget import Budget, StopToken
 from mjfim.experiment.system import System
 from mjfim.experiment.system_order import SystemOrder
 from mjfim.identification.aligned_recording import AlignedRecording

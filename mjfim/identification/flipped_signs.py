@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.budget import Budget
+from mjfim.parallel.budget import Budget
 from mjfim.errors import RecordingError
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.task import FitTask

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.parallel.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import StopToken
+from mjfim.parallel.budget import StopToken
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system

@@ -10,7 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.budget import Budget, StopToken
+from mjfim.parallel.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.fit_problem import FitProblem

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import Budget, StopToken
+from mjfim.parallel.budget import Budget, StopToken
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import (

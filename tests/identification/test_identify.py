@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 import mjfim
-from mjfim.budget import StopToken
+from mjfim.parallel.budget import StopToken
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.budget import Budget
+from mjfim.parallel.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System

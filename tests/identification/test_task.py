@@ -11,7 +11,7 @@ import pytest
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.budget import StopToken
+from mjfim.parallel.budget import StopToken
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_task
