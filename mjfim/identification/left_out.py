@@ -16,7 +16,6 @@ from typing import TypeVar
 import numpy as np
 
 from mjfim.arrays import Array, evenly_spread_indices, freeze
-from mjfim.parallel.budget import Budget
 from mjfim.identification.fit_problem import FitProblem, ProblemWork
 from mjfim.identification.jackknife import jackknife_std
 from mjfim.optimize.levenberg_marquardt import (
@@ -26,6 +25,7 @@ from mjfim.optimize.levenberg_marquardt import (
     UnknownValues,
     minimise,
 )
+from mjfim.parallel.budget import Budget
 from mjfim.records.events import begin_stage
 
 T = TypeVar("T")

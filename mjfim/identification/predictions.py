@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.parallel.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.fit_problem import FitProblem
@@ -28,6 +27,7 @@ from mjfim.identification.left_out import (
 )
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.parallel import one_blas_thread
+from mjfim.parallel.budget import Budget
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.events import begin_stage
 from mjfim.records.trajectory import Recording

@@ -12,7 +12,6 @@ import numpy as np
 import scipy
 
 from mjfim.arrays import Array
-from mjfim.parallel.budget import Budget
 from mjfim.errors import first_ones, listed
 from mjfim.experiment.labels import labels_of_system
 from mjfim.experiment.stated_units import probable_degrees
@@ -39,6 +38,7 @@ from mjfim.identification.terms import TermTests, find_missing_terms
 from mjfim.information.null_space import NullSpace
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import Solution
+from mjfim.parallel.budget import Budget
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import (
     MAX_NOMINAL_ROWS,

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.parallel.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification import left_out, predictions
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import identify_system, least_squares
+from mjfim.parallel.budget import Budget
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.trajectory import Recording
 from tests.support.dense_residuals import dense_residuals

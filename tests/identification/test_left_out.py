@@ -9,13 +9,13 @@ import pytest
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.parallel.budget import Budget
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.fit_problem import FitProblem
 from mjfim.identification.identify import least_squares
 from mjfim.identification.left_out import LeftOutPart, fit_without, left_out_parts
 from mjfim.optimize.levenberg_marquardt import SearchSettings, Solution
+from mjfim.parallel.budget import Budget
 from tests.support.paths import ROOT
 
 TIGHT = SearchSettings(tolerance=1e-6)
