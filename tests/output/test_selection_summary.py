@@ -26,7 +26,8 @@ from mjfim.records.terms import (
     Term,
     TermNumber,
 )
-from mjfim.studies.selected_models import possible_pools, selected_experiment
+from mjfim.studies.selected_models import selected_experiment
+from mjfim.studies.simplification import possible_pools
 from tests.support import results
 from tests.support.paths import ROOT
 from tests.support.results import SLIDE_FRICTION
